@@ -1,13 +1,13 @@
-"""From teleoperation to a policy: record reach episodes, clone their behaviour, run the network. About 20 s.
+"""From teleoperation to a policy: record reach episodes, clone their behaviour, run the network. Takes about 20 s.
 
     pip install -e '.[teleop,gym,onnx,train]'
     python examples/clone_behaviour.py                        # clone/reach.{mcap,onnx,toml,json}
     python examples/clone_behaviour.py --recording reach.mcap # from episodes of `urlab teleop --task urlab/Reach-v0`
 
-Nobody is needed: a script takes the operator's place. It moves the hand towards the target as an unsteady hand would,
-by the same inverse kinematics, and into the same recording, as `urlab teleop`. The network is a small one in NumPy,
-trained with Adam on the pairs of the episodes that were successes. Then it runs, as with `urlab evaluate` and
-`urlab run-policy`.
+The example needs no human operator: a script moves the hand unsteadily towards the target, with the same inverse
+kinematics and the same kind of recording as `urlab teleop`. A small NumPy network is trained with Adam on the
+observation-action pairs of the successful episodes. The example then runs it as `urlab evaluate` and
+`urlab run-policy` do.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from urlab_client.protocol.base import Floats
 __all__ = ["main"]
 
 HIDDEN = 32
-LEAST_SPREAD = 0.1  # rad or m: what varies less in the demonstrations is to have little influence
-LEAST_MOVE = 1e-3  # rad or m
+MIN_SPREAD = 0.1  # rad or m: limits the influence of values that hardly vary in the demonstrations
+MIN_MOVE = 1e-3  # rad or m
 
 DECLARATION = """\
-# What the network in reach.onnx sees: the observations of urlab/Reach-v0, in their order.
+# Inputs of the network in reach.onnx: the observations of urlab/Reach-v0, in the same order.
 robot = "arm"
 step_modes = ["direct"]
 timestep = 0.002
@@ -73,7 +73,7 @@ clip = [-3.2, 3.2]
 
 
 class UnsteadyOperator:
-    """Moves the hand to the target, with a speed that wanders."""
+    """Moves the hand to the target with a randomly varying velocity."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ class UnsteadyOperator:
 
 
 async def demonstrate(file: Path, episodes: int, seed: int) -> TeleopTally:
-    """Record episodes of the task's length, each of which the task judges at its end."""
+    """Record episodes of two seconds; the task decides at the end whether each is a success."""
     async with URLabClient(with_model_options(Reach.scene_address), step_mode="direct") as client:
         await client.discover()
         async with record(client, file, pose_hz=0, overwrite=True) as recorder:
@@ -99,7 +99,7 @@ async def demonstrate(file: Path, episodes: int, seed: int) -> TeleopTally:
 
 
 def pairs(file: Path, task: Reach) -> tuple[Floats, Floats]:
-    """Return what the task observes in each state of a recording, and the action that followed."""
+    """Return the observation of each state of a recording, and the action that followed."""
     table = transitions_of(read_run(file), only="success")
     state = [table.columns[f"arm/{name}"].values for name in ("qpos", "qvel", "action")]
     qpos, qvel, action = state
@@ -109,18 +109,18 @@ def pairs(file: Path, task: Reach) -> tuple[Floats, Floats]:
 
 
 class Cloned:
-    """`action = present positions + network(a part of the observation)`: the network learns where to move from there.
+    """`action = current positions + network(part of the observation)`: the network learns the movement.
 
-    It sees the positions of the joints that move the hand, and the way that is left. Velocities it does not: they tell
-    what the operator did a moment ago, and a network that sees them learns to go on with that.
+    Its inputs are the positions of the joints that move the hand, and the remaining vector to the target. Velocities
+    are left out: they show what the operator just did, and a network that sees them learns to repeat that.
     """
 
     def __init__(self, observations: Floats, actions: Floats, driven: list[int], seen: list[int], seed: int) -> None:
         self.driven, self.seen, self.size = driven, seen, observations.shape[1]
         part = observations[:, seen]
-        self.mean, self.spread = part.mean(axis=0), np.maximum(part.std(axis=0), LEAST_SPREAD)
+        self.mean, self.spread = part.mean(axis=0), np.maximum(part.std(axis=0), MIN_SPREAD)
         moves = actions - observations[:, driven]
-        self.move_mean, self.move_spread = moves.mean(axis=0), np.maximum(moves.std(axis=0), LEAST_MOVE)
+        self.move_mean, self.move_spread = moves.mean(axis=0), np.maximum(moves.std(axis=0), MIN_MOVE)
         rng = np.random.default_rng(seed)
         sizes = [len(seen), HIDDEN, HIDDEN, actions.shape[1]]
         self.weights = [rng.normal(size=(a, b)) / np.sqrt(a) for a, b in itertools.pairwise(sizes)]
@@ -130,7 +130,7 @@ class Cloned:
         self.rng = rng
 
     def train(self, epochs: int, batch: int = 64, rate: float = 2e-3) -> list[float]:
-        """Fit by Adam to the mean squared error, with a rate that falls to zero; return the error of each epoch."""
+        """Minimise the mean squared error by Adam, with a learning rate that decays to 0; return each epoch's error."""
         parameters = [*self.weights, *self.biases]
         first, second = [np.zeros_like(p) for p in parameters], [np.zeros_like(p) for p in parameters]
         errors: list[float] = []
@@ -207,7 +207,7 @@ class Cloned:
 
 
 async def distances(policy_file: Path, goals: Floats) -> list[float]:
-    """Run the policy as `urlab run-policy --goal` does; return how far from each goal the hand is after 2 s, metres."""
+    """Run the policy as `urlab run-policy --goal` does; return the hand's distance from each goal after 2 s, metres."""
     found: list[float] = []
     policy = load(policy_file)
     async with URLabClient(with_model_options("sim://arm"), step_mode="direct") as client:
@@ -220,7 +220,7 @@ async def distances(policy_file: Path, goals: Floats) -> list[float]:
 
 
 class Options(argparse.Namespace):
-    """What the command line says."""
+    """Command-line options."""
 
     output: Path
     recording: Path | None
@@ -231,14 +231,14 @@ class Options(argparse.Namespace):
 
 
 def main(arguments: list[str] | None = None) -> dict[str, object]:
-    """Go round the whole circle, print its figures, and return them."""
+    """Run all stages; print and return the figures."""
     parser = argparse.ArgumentParser(description="Clone the behaviour of teleoperated reach episodes.")
-    parser.add_argument("--output", type=Path, default=Path("clone"), help="folder for what is made (default: clone)")
-    parser.add_argument("--recording", type=Path, help="episodes that are there already (default: a script's)")
+    parser.add_argument("--output", type=Path, default=Path("clone"), help="output folder (default: clone)")
+    parser.add_argument("--recording", type=Path, help="existing recording of episodes (default: record scripted ones)")
     parser.add_argument("--episodes", type=int, default=50, help="demonstrations (default: 50)")
-    parser.add_argument("--evaluated", type=int, default=200, help="episodes of the evaluation (default: 200)")
-    parser.add_argument("--epochs", type=int, default=20, help="times that each pair is seen (default: 20)")
-    parser.add_argument("--seed", type=int, default=1, help="of starts, targets, operator and network (default: 1)")
+    parser.add_argument("--evaluated", type=int, default=200, help="episodes in the evaluation (default: 200)")
+    parser.add_argument("--epochs", type=int, default=20, help="training epochs (default: 20)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of all random numbers (default: 1)")
     options = parser.parse_args(arguments, namespace=Options())
     options.output.mkdir(parents=True, exist_ok=True)
     figures: dict[str, object] = {}
@@ -290,7 +290,7 @@ def main(arguments: list[str] | None = None) -> dict[str, object]:
 
 
 def _driven_by(batch: URLabBatchEnv, actuator: str) -> str:
-    """Return the joint of an actuator, by its short name."""
+    """Return the short name of the joint that an actuator drives."""
     model = batch.model
     return model.joint(model.actuator(f"arm_{actuator}").trnid[0]).name.removeprefix("arm_")
 

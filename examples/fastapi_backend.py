@@ -1,4 +1,4 @@
-"""A robot behind FastAPI: one client for all requests, states to many browsers, events, a restart underneath.
+"""A robot behind FastAPI: one client serves all requests, state streams and events, and survives a server restart.
 
 Run: uvicorn fastapi_backend:app --app-dir examples --timeout-graceful-shutdown 3
 """
@@ -18,7 +18,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.protocol.descriptions import ArticulationDescription, SceneDescription
 
 address = os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused")
-watched = os.environ.get("URLAB_WATCH")  # a file with what /handshake of the worker that drives answers
+watched = os.environ.get("URLAB_WATCH")  # file with the response of /handshake from the controlling worker
 hello = Path(watched).read_bytes() if watched else None
 client = URLabClient(address, keep_session=hello is None, read_only=hello is not None)
 
@@ -57,7 +57,7 @@ async def move(robot: str, joints: dict[str, float]) -> Moved:
 @app.websocket("/states")
 async def states(browser: WebSocket) -> None:
     await browser.accept()
-    with suppress(WebSocketDisconnect):  # a slow browser gets fewer states, and none is queued for it
+    with suppress(WebSocketDisconnect):  # a slow browser gets fewer states; nothing queues up
         async for snapshot in client.state_stream("latest", max_rate=60):
             await browser.send_text(snapshot.to_json())
 

@@ -1,4 +1,4 @@
-"""A Gymnasium environment over a simulated server: a proportional controller for the arm, and a picture of the end."""
+"""A Gymnasium environment over a simulated server: the arm moves to a joint target, and a picture shows the result."""
 
 import gymnasium
 import numpy as np

@@ -1,14 +1,14 @@
-"""A policy that pushes a block which it sees in pictures alone: cloned from a script that is told where the block is.
+"""A policy that pushes a block it sees only in pictures, cloned from a script that knows the block's position.
 
     pip install -e '.[gym,onnx,train,demo]' torch onnxscript
     python examples/push_by_sight.py            # sight/push.{onnx,json,png}
     urlab evaluate sight/push.onnx --task urlab/PushPictures-v0
 
-This is imitation, not reinforcement learning. A script that reads the block's position from the simulation shows how
-to push. One part of the network learns in a batch, without pictures, what the script does with a block at some place;
-it drives, and the script says what it would have done in each state that this led to (DAgger: Ross, Gordon and Bagnell,
-2011). The other part learns on servers where a block is that it sees. Together they see joint positions, the target and
-a picture.
+This is imitation, not reinforcement learning. A script that reads the block's position from the simulation
+demonstrates pushing. One part of the network learns in a batch, without pictures, to act like the script for a given
+block position: the network controls the arm, and the script labels each visited state with its own action (DAgger:
+Ross, Gordon and Bagnell, 2011). The other part learns on servers to locate the block in pictures. The complete network
+uses joint positions, the target and a picture.
 """
 
 from __future__ import annotations
@@ -37,44 +37,44 @@ __all__ = ["main"]
 MOVING = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
 CAMERA = "arm/overview"
 ROWS, COLUMNS = slice(20, 68), slice(32, 88)
-"""The part of a picture, of 72 by 96 pixels, where the block can be."""
+"""The part of a picture of 72 by 96 pixels in which the block can be."""
 
 OPEN_M = 0.02
-"""Opening of each finger: the block, whichever way it is turned, rests between the two."""
+"""Opening of each finger; the block fits between the fingers in any orientation."""
 
 HEIGHT_M, CLEAR_M, DONE_M, STEP_M = 0.03, 0.095, 0.012, 0.025
-"""Of the script: height of the hand, way round the block, distance at which it rests, and its largest step."""
+"""For the script: height of the hand, clearance around the block, distance at which it stops, and largest step."""
 
 LEAD_RAD = 0.05
-"""How far a set-point is ahead of its joint, roughly: what the network predicts is a multiple of that."""
+"""Unit of the network's output: typical distance of a set-point ahead of its joint."""
 
 BLOCK_M = 0.05
-"""The unit of the block's position, likewise."""
+"""Unit of the block's position in the network."""
 
 CENTRE_M = (0.5, 0.0)
 
 ACTIONS = 100
-"""Length of an episode that is shown: by then the script is done."""
+"""Length of a training episode: enough for the script to finish."""
 
 BATCH = 64
 FIRST_SEED = 1_000_000
-"""Of episodes that are shown, far from those of the evaluation."""
+"""First seed of training episodes, far from the seeds of the evaluation."""
 
 MISJUDGED_M = 0.004
-"""By how much the part that acts takes the block to be elsewhere while it learns (standard deviation)."""
+"""Standard deviation of the error added to the block's position while the acting part learns."""
 
 SHARP = 5.0
-"""How much more a place counts than the others where a channel is larger by 1."""
+"""Sharpness (inverse temperature) of the spatial softmax."""
 
 
-class PushTold(PushPictures):
-    """`PushPictures` in which the block's state is observed, too: for the script."""
+class PushWithBlockState(PushPictures):
+    """`PushPictures` whose observations include the block's state, for the script."""
 
     articulations = None
 
 
 class Script:
-    """Pushes a block whose position it is told: round it, and on along the line to the target."""
+    """Pushes a block with a known position: moves behind it, then pushes along the line to the target."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -89,7 +89,7 @@ class Script:
         Args:
             joints: Positions of the six joints, rad.
             block: x and y of the block, metres, world frame.
-            target: x and y of the target, likewise.
+            target: x and y of the target, metres, world frame.
         """
         self.data.qpos[self.positions] = joints
         mujoco.mj_kinematics(self.model, self.data)
@@ -122,10 +122,10 @@ class Script:
 
 
 class Sight(nn.Module):
-    """From a picture, joint positions and target to set-points. In between it says where it takes the block to be.
+    """Network from a picture, joint positions and target to set-points. In between, it estimates the block's position.
 
-    Convolutions end in the mean place of each channel (a spatial softmax: Finn et al., 2016). A network that is
-    `blind` has no picture, and a constant in its stead.
+    The convolutions end in the mean position of each channel (a spatial softmax: Finn et al., 2016). A `blind` network
+    uses a learned constant instead of the picture.
     """
 
     def __init__(self, *, blind: bool) -> None:
@@ -146,14 +146,14 @@ class Sight(nn.Module):
         self.register_buffer("centre", torch.tensor(CENTRE_M))
 
     def located(self, part: torch.Tensor) -> torch.Tensor:
-        """Return where the block is, in units of `BLOCK_M` from `CENTRE_M`, from what `pixels` returns."""
+        """Return the block's position, in units of `BLOCK_M` from `CENTRE_M`, given the result of `pixels`."""
         if self.blind:
             return self.guess.expand(part.shape[0], 2)
         weights = torch.softmax(SHARP * self.look(part).flatten(2), -1)
         return self.where((weights @ self.grid).flatten(1))
 
     def leads(self, joints: torch.Tensor, target: torch.Tensor, block: torch.Tensor) -> torch.Tensor:
-        """Return how far set-points are ahead, in units of `LEAD_RAD`, for a block as `located` has it."""
+        """Return how far set-points are ahead, in units of `LEAD_RAD`, given a block position as from `located`."""
         hand, turned = hand_of(joints)
         at = BLOCK_M * block + self.centre
         beside, way = (hand[:, :2] - at) / BLOCK_M, (target - at) / BLOCK_M
@@ -163,7 +163,7 @@ class Sight(nn.Module):
         return self.act(torch.cat(seen, 1))
 
     def forward(self, qpos: torch.Tensor, task: torch.Tensor, picture: torch.Tensor | None = None) -> torch.Tensor:
-        """Return actions, shape (n, 7), for what the task observes."""
+        """Return actions, shape (n, 7), for the task's observations."""
         joints = qpos[:, : len(MOVING)]
         part = joints if picture is None else pixels(picture[:, ROWS, COLUMNS])
         lead = LEAD_RAD * self.leads(joints, task, self.located(part))
@@ -171,7 +171,7 @@ class Sight(nn.Module):
 
 
 def hand_of(joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return where the hand is, metres, shape (n, 3), and how it is turned, shape (n, 3, 3): the arm's kinematics."""
+    """Return the hand's position, metres, shape (n, 3), and rotation, shape (n, 3, 3), from the arm's kinematics."""
 
     def along(x: float, z: float) -> torch.Tensor:
         return torch.tensor([[x], [0.0], [z]])
@@ -200,8 +200,8 @@ def hand_of(joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @dataclass
-class Shown:
-    """States, and what the script would have done in each; entries that are lists of arrays, a row per episode."""
+class Samples:
+    """States and the script's action in each, as lists of arrays with one row per episode."""
 
     joints: list[np.ndarray] = field(default_factory=list)
     target: list[np.ndarray] = field(default_factory=list)
@@ -222,11 +222,11 @@ class Shown:
         return {name: torch.tensor(v if name == "part" else np.float32(v)) for name, v in found.items()}
 
 
-def practise(envs: Any, script: Script, shown: Shown, *, seed: int, driver: Sight | None, rng: Any) -> float:
-    """Run an episode in each environment, and keep what the script says of each state; return the share of successes.
+def collect(envs: Any, script: Script, samples: Samples, *, seed: int, driver: Sight | None, rng: Any) -> float:
+    """Run an episode in each environment and store the script's action for each state; return the success rate.
 
-    A network drives that is told where the block is, and misjudges it a little; without one the script, unsteadily.
-    Pictures are kept where the environments have them.
+    The `driver` acts, given the block's position with a small error; without a driver, the script acts with added
+    noise. Pictures are stored if the environments have them.
     """
     seen, _ = envs.reset(seed=seed)
     wander, misjudged = np.zeros((envs.num_envs, 6)), rng.normal(scale=MISJUDGED_M, size=(envs.num_envs, 2))
@@ -237,14 +237,14 @@ def practise(envs: Any, script: Script, shown: Shown, *, seed: int, driver: Sigh
         pictures = {}
         if "cameras" in seen:
             pictures["part"] = seen["cameras"][CAMERA][:, ROWS, COLUMNS]
-        shown.add(joints=joints, target=target, block=block, lead=wanted[:, :6] - joints, **pictures)
+        samples.add(joints=joints, target=target, block=block, lead=wanted[:, :6] - joints, **pictures)
         wander = 0.8 * wander + rng.normal(scale=0.012, size=wander.shape)
         driven = wanted[:, :6] + wander
         if driver is not None:
             at = (block + misjudged - CENTRE_M) / BLOCK_M
             with torch.no_grad():
-                told = driver.leads(*(torch.tensor(np.float32(each)) for each in (joints, target, at)))
-            driven = joints + LEAD_RAD * told.numpy()
+                leads = driver.leads(*(torch.tensor(np.float32(each)) for each in (joints, target, at)))
+            driven = joints + LEAD_RAD * leads.numpy()
         actions = np.hstack([driven, np.full((envs.num_envs, 1), OPEN_M)])
         seen, _, _, _, infos = envs.step({"arm": np.clip(actions, space.low, space.high).astype(np.float32)})
         success = infos["success"]
@@ -252,7 +252,7 @@ def practise(envs: Any, script: Script, shown: Shown, *, seed: int, driver: Sigh
 
 
 def learn_to_act(network: Sight, data: dict[str, torch.Tensor], *, updates: int) -> float:
-    """Fit to what the script does, for a block that is misjudged a little; return the error, rad."""
+    """Fit the acting part to the script, with a small error in the block's position; return the error, rad."""
 
     def error(rows: torch.Tensor) -> torch.Tensor:
         block = data["block"][rows]
@@ -267,7 +267,7 @@ def learn_to_act(network: Sight, data: dict[str, torch.Tensor], *, updates: int)
 
 
 def learn_to_look(network: Sight, data: dict[str, torch.Tensor], *, updates: int) -> float:
-    """Fit to where the block was; return the error, metres."""
+    """Fit the locating part to the block's position; return the error, metres."""
 
     def error(rows: torch.Tensor) -> torch.Tensor:
         return network.located(pixels(data["part"][rows])) - data["block"][rows]
@@ -279,7 +279,7 @@ def learn_to_look(network: Sight, data: dict[str, torch.Tensor], *, updates: int
 def fit(
     error: Callable[[torch.Tensor], torch.Tensor], parameters: list[nn.Parameter], count: int, updates: int
 ) -> float:
-    """Make errors small by AdamW, with a rate that rises and falls; return the root of their mean square at the end."""
+    """Minimise the squared error by AdamW with a one-cycle learning rate; return the final root mean square error."""
     optimiser = torch.optim.AdamW(parameters, lr=3e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=updates)
     last: list[float] = []
@@ -294,12 +294,12 @@ def fit(
 
 
 def pixels(part: torch.Tensor) -> torch.Tensor:
-    """Return parts of pictures, bytes of shape (n, rows, columns, 3), as the convolutions take them."""
+    """Convert parts of pictures, bytes of shape (n, rows, columns, 3), to the input of the convolutions."""
     return part.permute(0, 3, 1, 2).float() / 255.0 - 0.5
 
 
 def save(network: Sight, file: Path) -> None:
-    """Write the network as ONNX; its inputs have the names of what the task observes."""
+    """Write the network as ONNX; its inputs are named after the entries of the task's observations."""
     seen = {
         "arm/qpos": torch.zeros(2, 8),
         "task": torch.zeros(2, 2),
@@ -320,13 +320,13 @@ def save(network: Sight, file: Path) -> None:
     )
     model = onnx.load(file)
     for part in (model, model.graph, *model.graph.node, *model.graph.value_info, *model.graph.initializer):
-        del part.metadata_props[:]  # where in which file of this machine each line of the network is
+        del part.metadata_props[:]  # paths and line numbers on this machine
         part.doc_string = ""
     onnx.save(model, file)
 
 
 def evaluated(envs: URLabVectorEnv | URLabBatchEnv, network: Any, episodes: int) -> dict[str, Any]:
-    """Return how good a network is in episodes that no training saw, as `urlab evaluate` has it."""
+    """Evaluate a network in episodes outside the training, as `urlab evaluate` does."""
     found = evaluate_in(envs, network, episodes=episodes, seed=0)
     rate = found.success_rate
     return {
@@ -337,7 +337,7 @@ def evaluated(envs: URLabVectorEnv | URLabBatchEnv, network: Any, episodes: int)
 
 
 def draw(envs: URLabVectorEnv, network: OnnxDictNetwork, rounds: list[dict[str, float]], file: Path) -> None:
-    """Draw what the network sees in an episode that it drives, and how it learned to push."""
+    """Plot the pictures that the network sees in an episode, and its success rate during training."""
     seen, _ = envs.reset(seed=0)
     strip = []
     for step in range(61):
@@ -361,7 +361,7 @@ def draw(envs: URLabVectorEnv, network: OnnxDictNetwork, rounds: list[dict[str, 
 
 
 class Options(argparse.Namespace):
-    """What the command line says."""
+    """Command-line options."""
 
     output: Path
     rounds: int
@@ -374,21 +374,21 @@ class Options(argparse.Namespace):
 
 
 def parsed(arguments: list[str] | None) -> Options:
-    """Return what the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description="Clone a scripted pusher with a network that sees pictures.")
-    parser.add_argument("--output", type=Path, default=Path("sight"), help="folder for what is made (default: sight)")
-    parser.add_argument("--rounds", type=int, default=8, help="times of practising in a batch (default: 8)")
-    parser.add_argument("--episodes", type=int, default=50, help="episodes of such a round (default: 50)")
+    parser.add_argument("--output", type=Path, default=Path("sight"), help="output folder (default: sight)")
+    parser.add_argument("--rounds", type=int, default=8, help="training rounds in a batch (default: 8)")
+    parser.add_argument("--episodes", type=int, default=50, help="episodes per round (default: 50)")
     parser.add_argument("--looks", type=int, default=50, help="episodes with pictures (default: 50)")
-    parser.add_argument("--updates", type=int, default=1500, help="updates of a round, and of the eyes (default: 1500)")
-    parser.add_argument("--evaluated", type=int, default=100, help="episodes of an evaluation (default: 100)")
+    parser.add_argument("--updates", type=int, default=1500, help="updates per round and for locating (default: 1500)")
+    parser.add_argument("--evaluated", type=int, default=100, help="episodes per evaluation (default: 100)")
     parser.add_argument("--servers", type=int, default=2, help="simulated servers (default: 2)")
-    parser.add_argument("--seed", type=int, default=1, help="of starts, targets and networks (default: 1)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of starts, targets and networks (default: 1)")
     return parser.parse_args(arguments, namespace=Options())
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Show, learn, evaluate; print the figures, and return them."""
+    """Demonstrate, train and evaluate; print and return the figures."""
     options = parsed(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
@@ -397,48 +397,48 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     disabled = AutoresetMode.DISABLED
     batch = URLabBatchEnv(
         Push.scene_address, options.episodes, task=Push(), space_mode="dict", autoreset_mode=disabled
-    )  # the same physics as on servers, bit for bit, and fast: it draws no pictures
+    )  # same physics as on servers, bit for bit, but faster because it draws no pictures
     script = Script(batch.model)
     figures: dict[str, Any] = {"rounds": []}
     seeing, blind = Sight(blind=False), Sight(blind=True)
-    shown, began = Shown(), time.perf_counter()
+    samples, began = Samples(), time.perf_counter()
     for number in range(options.rounds):
         seed = FIRST_SEED * options.seed + 1000 * number
-        rate = practise(batch, script, shown, seed=seed, driver=seeing if number else None, rng=rng)
-        error = learn_to_act(seeing, shown.tensors(), updates=options.updates)
+        rate = collect(batch, script, samples, seed=seed, driver=seeing if number else None, rng=rng)
+        error = learn_to_act(seeing, samples.tensors(), updates=options.updates)
         figures["rounds"].append({"success_rate": round(rate, 3), "error_rad": round(error, 5)})
         print(figures["rounds"][-1], flush=True)
-    learn_to_act(seeing, shown.tensors(), updates=4 * options.updates)
-    learn_to_act(blind, shown.tensors(), updates=2 * options.updates)
+    learn_to_act(seeing, samples.tensors(), updates=4 * options.updates)
+    learn_to_act(blind, samples.tensors(), updates=2 * options.updates)
     figures["practising_s"] = round(time.perf_counter() - began)
 
     began = time.perf_counter()
     envs = URLabVectorEnv(
-        PushTold.scene_address,
+        PushWithBlockState.scene_address,
         options.servers,
-        task=PushTold(),
+        task=PushWithBlockState(),
         autoreset_mode=disabled,
-        step_timeout=60.0,  # the first picture takes its time where a processor draws
+        step_timeout=60.0,  # with software rendering the first picture is slow
     )
-    looked = Shown()
+    picture_samples = Samples()
     for first in range(0, options.looks, options.servers):
         seed = FIRST_SEED * options.seed + 500_000 + first
         driver = None if first < options.looks // 3 else seeing
-        practise(envs, script, looked, seed=seed, driver=driver, rng=rng)
-    figures["pictures"] = len(looked.part) * options.servers
+        collect(envs, script, picture_samples, seed=seed, driver=driver, rng=rng)
+    figures["pictures"] = len(picture_samples.part) * options.servers
     figures["drawing_s"] = round(time.perf_counter() - began)
     began = time.perf_counter()
-    figures["error_of_sight_m"] = round(learn_to_look(seeing, looked.tensors(), updates=options.updates), 5)
+    figures["error_of_sight_m"] = round(learn_to_look(seeing, picture_samples.tensors(), updates=options.updates), 5)
     figures["learning_to_look_s"] = round(time.perf_counter() - began)
     for name, network in {"push": seeing, "blind": blind}.items():
         save(network, options.output / f"{name}.onnx")
 
-    def told(seen: dict[str, Any]) -> np.ndarray:
+    def scripted(seen: dict[str, Any]) -> np.ndarray:
         return script(seen["arm"]["qpos"][:6], seen["block"]["qpos"][:2], seen["task"])
 
     unseeing = OnnxDictNetwork(options.output / "blind.onnx", batch.single_observation_space, 7)
     seeing_now = OnnxDictNetwork(options.output / "push.onnx", envs.single_observation_space, 7)
-    figures["script"] = evaluated(batch, told, options.evaluated)
+    figures["script"] = evaluated(batch, scripted, options.evaluated)
     figures["without pictures"] = evaluated(batch, unseeing, options.evaluated)
     batch.close()
     figures["policy"] = evaluated(envs, seeing_now, options.evaluated)

@@ -1,4 +1,4 @@
-"""Rollouts on a Ray cluster, here one of this machine alone: two workers, each with a simulated server of its own."""
+"""Rollouts on a Ray cluster, here only this machine: two workers, each with its own simulated server."""
 
 import os
 import tempfile
@@ -6,7 +6,7 @@ import tempfile
 import matplotlib.pyplot as plt
 import numpy as np
 
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray will do by default, and warns of
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's future default, about which it warns
 import ray
 
 from urlab_client.cluster import rollouts

@@ -1,4 +1,4 @@
-"""A run of the arm recorded with pictures and contacts, read back, made into a video and a plot."""
+"""Record a run of the arm with pictures and contacts, read it back, and make a video and a plot from it."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ print(f"{recorder.stats.states} states, {recorder.stats.frames} pictures, {recor
 
 run = read_run(path)
 table = run.table()
-print("read back to the bit:", np.array_equal(table.columns["arm/qpos"].values[-1], last))
-print(f"run.mp4 shows {export.write_mp4(run, Path('run.mp4'), 'arm/overview')} pictures")
+print("read back bit for bit:", np.array_equal(table.columns["arm/qpos"].values[-1], last))
+print(f"run.mp4 contains {export.write_mp4(run, Path('run.mp4'), 'arm/overview')} pictures")
 urlab(["info", str(path)])
 urlab(["plot", str(path), "--joints", "shoulder_*", "elbow", "-o", "run.png"])

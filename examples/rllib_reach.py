@@ -1,7 +1,7 @@
-"""RLlib's PPO on the reach task, each runner with a simulated server of its own; then episodes of what it learned.
+"""RLlib's PPO on the reach task, with one simulated server per runner, followed by episodes of the trained policy.
 
-Needs `pip install 'urlab-client[ray]' 'ray[rllib]' torch`. A few updates do not make it reach well; this shows how the
-parts fit: runners and workers share one Ray cluster, of this machine alone here.
+Needs `pip install 'urlab-client[ray]' 'ray[rllib]' torch`. A few updates are not enough for accurate reaching; the
+example shows how the parts fit together. Runners and workers share one Ray cluster, which here is only this machine.
 """
 
 import argparse
@@ -11,7 +11,7 @@ import tempfile
 import gymnasium
 import numpy as np
 
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray will do by default, and warns of
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's future default, about which it warns
 import ray
 import torch
 from ray.rllib.algorithms.ppo import PPOConfig
@@ -22,7 +22,7 @@ from urlab_client.integrations.gym import Reach
 
 
 def make(_):
-    import urlab_client.integrations.gym  # in the runner's process, too  # noqa: F401, PLC0415
+    import urlab_client.integrations.gym  # also in the runner's process  # noqa: F401, PLC0415
 
     return gymnasium.make("urlab/Reach-v0")
 
@@ -41,7 +41,7 @@ class Mean:
 
 
 def score(module, workers):
-    """Return the mean return of eight episodes, which are the same ones each time."""
+    """Return the mean return of eight fixed episodes."""
     options = {"task": Reach(), "n_substeps": Reach.n_substeps}
     episodes = rollouts(
         Mean(module), "sim://arm", 8, seed=1, max_episode_steps=100, env_options=options, workers=workers
@@ -51,7 +51,7 @@ def score(module, workers):
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--iterations", type=int, default=5, help="updates of PPO, of 2000 steps each")
-parser.add_argument("--runners", type=int, default=2, help="remote runners, each with a server and a processor")
+parser.add_argument("--runners", type=int, default=2, help="remote runners, each with its own server and processor")
 arguments = parser.parse_args()
 
 with tempfile.TemporaryDirectory(prefix="ray") as scratch:

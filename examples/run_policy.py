@@ -1,4 +1,4 @@
-"""The trained quadruped walks, turns and side-steps on command: frames of the walk, its path, and how it learned."""
+"""The trained quadruped walks, turns and side-steps on command. Plots frames of the walk, its path and the training."""
 
 import asyncio
 import json
@@ -12,7 +12,7 @@ from urlab_client.integrations.policy import PolicyRun, load, run
 from urlab_client.integrations.record import read_run, record
 
 NETWORK = Path(__file__).parent / "policies/quadruped.onnx"
-COMMANDS = {  # from a time on, seconds: vx, vy (m/s), yaw rate (rad/s)
+COMMANDS = {  # start time in seconds: vx, vy (m/s), yaw rate (rad/s)
     0.0: (0.5, 0.0, 0.0),
     4.0: (0.4, 0.0, 0.5),
     8.0: (0.3, 0.15, 0.0),
@@ -20,7 +20,7 @@ COMMANDS = {  # from a time on, seconds: vx, vy (m/s), yaw rate (rad/s)
 
 
 async def walk(recording: Path) -> tuple[PolicyRun, np.ndarray]:
-    """Walk for twelve seconds; return what came of it and the base's path."""
+    """Walk for twelve seconds; return the result and the path of the base."""
     policy = load(NETWORK)
     way = []
     async with URLabClient("sim://quadruped?controller=quadruped=pd&camera-size=320x240", step_mode="direct") as client:

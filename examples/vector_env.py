@@ -1,4 +1,4 @@
-"""The same task on two servers in lockstep and on a batch of 64 without a wire: random shooting for the best target."""
+"""The same task on a batch of 64 without a wire and on two servers in lockstep: random shooting for the best target."""
 
 import gymnasium
 import numpy as np
@@ -7,7 +7,7 @@ import urlab_client.integrations.gym  # registers the environments  # noqa: F401
 
 
 def scores(envs: gymnasium.vector.VectorEnv, targets: np.ndarray, steps: int = 20) -> np.ndarray:
-    """Hold each environment's target and add up its rewards."""
+    """Hold the target of each environment and return the sum of its rewards."""
     envs.reset(seed=0)
     return sum(envs.step(targets)[1] for _ in range(steps))
 

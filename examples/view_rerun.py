@@ -1,4 +1,4 @@
-"""The quadruped falls into its stance, seen by Rerun: into a file here, in a window with rerun_view(client)."""
+"""Show the quadruped in Rerun as it drops into its stance. Saves a file; rerun_view(client) opens a window instead."""
 
 from urlab_client import URLabClient
 from urlab_client.integrations.view import rerun_view
@@ -9,4 +9,4 @@ with URLabClient("sim://quadruped?play", step_mode="direct") as client:
     with rerun_view(client, save="quadruped.rrd", sensors=True) as view:
         for _ in range(500):
             client.step()
-print(f"quadruped.rrd: {view.stats.states} states shown, {view.stats.dropped_states} left out; open it with: rerun")
+print(f"quadruped.rrd: {view.stats.states} states shown, {view.stats.dropped_states} dropped; open it with: rerun")

@@ -1,4 +1,4 @@
-"""Debug drawing in the viewport of a simulated server: the picture in docs/simulated-server.md."""
+"""Debug drawing in the viewport of a simulated server. Makes the picture in docs/simulated-server.md."""
 
 import math
 
@@ -31,4 +31,4 @@ with (
     client.debug.set_overlay_text(f"t = {client.sim_time:.2f} s")
     client.viewport.set_camera((1.8, -1.1, 1.2), rotation_euler=(0.0, -24.0, -128.0), fov=60.0)
     Image.fromarray(server.snapshot((960, 540))).save("viewport.png")
-print("viewport.png shows where the grip went")
+print("viewport.png shows the path of the grip")

@@ -1,13 +1,13 @@
-"""The arm pushes a block that it sees in pictures, for LeRobot's EnvHub: the file that a repository on the hub has.
+"""The `env.py` of a repository on LeRobot's EnvHub: the arm pushes a block that it sees in pictures.
 
-Whoever loads it needs `pip install 'urlab-client[gym]'`; each environment starts a simulated server of its own.
+Loading it needs `pip install 'urlab-client[gym]'`. Each environment starts its own simulated server.
 """
 
 from urlab_client.integrations.gym.envhub import vector_env
 
 
 def make_env(n_envs=1, use_async_envs=False, cfg=None):
-    """Return the environments as LeRobot asks for them: by the name of the suite and the number of the task."""
+    """Return the environments in LeRobot's format: by suite name and task number."""
     envs = vector_env(
         "urlab/PushPictures-v0",
         n_envs,

@@ -1,7 +1,7 @@
 """Python clients for URLab, the Unreal plugin that embeds MuJoCo.
 
-`URLabClient` here is the blocking one; its async twin is `urlab_client.aio.URLabClient`.
-Names are loaded when they are first asked for, so that the import alone costs nothing.
+`URLabClient` in this package is the blocking client; the async client is `urlab_client.aio.URLabClient`.
+Names are loaded on first access, so importing the package is cheap.
 """
 
 from importlib import import_module

@@ -111,7 +111,7 @@ async def test_no_picture_is_an_error_that_names_the_camera(
     await camera.subscribed(TOPIC)
     await until(lambda: beta.streaming.get("arm_a/wrist", (False, False))[0])
     pass_time(40)
-    with pytest.raises(PictureTimeout, match=r"no picture of 'wrist' came in time.*OpenGL") as caught:
+    with pytest.raises(PictureTimeout, match=r"no picture of 'wrist' arrived in time.*OpenGL") as caught:
         await task
     assert caught.value.cameras == ["wrist"]
     assert (await client.step()).step == 1

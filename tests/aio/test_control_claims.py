@@ -248,7 +248,7 @@ async def test_explain_tells_who_controls_what(beta: ScriptedBeta) -> None:
         async def told(about: str) -> str:
             return " ".join(f.text for f in (await client.explain()).findings if f.subject == about)
 
-        assert "the first write claims it" in await told("arm_a")
+        assert "The first write claims it" in await told("arm_a")
         mine.set_ctrl({"m": 0.5})
         assert "articulation.claim()" in await told("arm_a")
         await mine.claim()

@@ -123,7 +123,7 @@ async def test_silence_between_steps_is_no_sign_of_death(served: SimulatedServer
             assert row.owner in {"rover", "rover_1"}
             with pytest.raises(URLabTimeoutError, match="state") as caught:
                 await states.receive(timeout=0.01)
-            assert "in live mode only" in str(caught.value.hint)
+            assert "only in live mode" in str(caught.value.hint)
 
 
 async def test_a_snapshot_of_another_world_is_counted(rover: Path) -> None:

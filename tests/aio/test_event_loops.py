@@ -31,7 +31,7 @@ async def elsewhere(call: Callable[[], Awaitable[object]]) -> None:
 async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
     async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
         await client.discover()
-        with pytest.raises(URLabError, match=r"This client belongs to another event loop\. Make one per loop"):
+        with pytest.raises(URLabError, match=r"This client belongs to another event loop\. Create one per loop"):
             await elsewhere(client.discover)
 
 
@@ -106,5 +106,5 @@ def test_anyios_asyncio_backend_is_a_loop_like_any_other(scripted: Any) -> None:
 
 def test_without_any_loop_it_says_so() -> None:
     client = URLabClient("tcp://127.0.0.1", step_port=1)
-    with pytest.raises(URLabError, match="but no event loop runs here"):
+    with pytest.raises(URLabError, match="but no event loop is running"):
         client.runtime.forward().send(None)  # as an event loop of somebody else's would

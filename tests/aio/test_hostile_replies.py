@@ -360,12 +360,12 @@ BOT = ("per_articulation", "bot")
     ("place", "value", "problem"),
     [
         (("time",), float("nan"), "the simulation time is nan"),
-        ((*BOT, "qpos"), [0.0] * 7, "qpos of articulation 'bot' has 7 values, its model has 8"),
-        ((*BOT, "actuator_force"), [0.0] * 3, "actuator_force of articulation 'bot' has 3 values, its model has 2"),
-        ((*BOT, "sensors"), {"tip": [0.0]}, "sensor 'tip' of articulation 'bot' has 1 values, its model has 3"),
+        ((*BOT, "qpos"), [0.0] * 7, "qpos of articulation 'bot' has 7 values, but its model has 8"),
+        ((*BOT, "actuator_force"), [0.0] * 3, "actuator_force of articulation 'bot' has 3 values, but its model has 2"),
+        ((*BOT, "sensors"), {"tip": [0.0]}, "sensor 'tip' of articulation 'bot' has 1 values, but its model has 3"),
         (("entities", "crate", "qvel"), [0.0] * 7, "qvel of entity 'crate' has 7 values, not 6"),
-        (("perturbation", "body_id"), 1e9, "a perturbation of body 1000000000"),
-        (("perturbation", "xfrc"), [float("nan")] * 6, "a perturbation of body 1 by"),
+        (("perturbation", "body_id"), 1e9, "invalid perturbation of body 1000000000"),
+        (("perturbation", "xfrc"), [float("nan")] * 6, "invalid perturbation of body 1 by"),
         (("cameras", "sky", "width"), -2.0, "pictures of -2x1 pixels"),
         (("cameras", "sky", "data"), b"", "0 bytes, expected 8"),
         (("cameras", "sky", "dtype"), "float32", "a frame of real camera 'sky' has dtype 'float32'"),
@@ -388,20 +388,20 @@ EYE = ("articulations", 0, "camera_topics", "eye")
 @pytest.mark.parametrize(
     ("place", "value", "problem"),
     [
-        ((*CRATE, "id"), 1000.0, "entity 'crate' is body 1000, and the bodies of its model are 1 to 4"),
+        ((*CRATE, "id"), 1000.0, "entity 'crate' is body 1000, but the bodies of its model are 1 to 4"),
         ((*CRATE, "id"), -1.0, "entity 'crate' is body -1"),
         ((*CRATE, "id"), 1.0, "entity 'crate' has joint and offsets"),
         ((*CRATE, "qpos_offset"), 15.0, "entity 'crate' has joint and offsets"),
         ((*CRATE, "qvel_offset"), -6.0, "entity 'crate' has joint and offsets"),
         ((*CRATE, "free_joint_id"), 77.0, "entity 'crate' has joint and offsets"),
-        (("entities", "door", "has_free_base"), True, "entity 'door' has a free base, its model says otherwise"),
+        (("entities", "door", "has_free_base"), True, "entity 'door' has a free base, unlike its model"),
         ((*EYE, "resolution"), [-2.0, -1.0], "camera 'eye' of articulation 'bot': pictures of -2x-1 pixels"),
         ((*EYE, "resolution"), [1e9, 1e9], "each side has 1 to 16384"),
         (("global_cameras", "sky", "resolution"), [0.0, 1.0], "camera 'sky' of the scene: pictures of 0x1"),
-        (("articulations", 0, "prefix"), "", "keys are not empty"),
+        (("articulations", 0, "prefix"), "", "keys must be unique and not empty"),
         (("instance",), {"state_port": 70000.0}, "its state stream is on port 70000"),
         (("articulations", 0, "controller", "params", "kp"), [1.0], "kp of the controller of 'bot'"),
-        (("articulations", 0, "controller", "schema", "kp", "min"), "low", "as the least kp"),
+        (("articulations", 0, "controller", "schema", "kp", "min"), "low", "the minimum of kp"),
     ],
 )
 def test_what_is_wrong_with_a_handshake_is_said(
@@ -574,7 +574,7 @@ def test_positions_that_nobody_can_have_written(direct: Session, count: int) -> 
     ask = direct.client.runtime.set_qpos
     error = direct.ask("set_qpos", {**written, "qpos": [1.0] * count}, lambda: ask("bot", [1.0] * 8, by_name=True))
     assert isinstance(error, ProtocolError)
-    assert f"qpos of articulation 'bot' has {count} values, its model has 8" in str(error)
+    assert f"qpos of articulation 'bot' has {count} values, but its model has 8" in str(error)
     assert same(before, look(direct.client))
 
 

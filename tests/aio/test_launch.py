@@ -128,7 +128,7 @@ async def test_a_killed_server_is_noticed() -> None:
             await client.step(timeout=10)
         assert not client.connected
         await client._transport._process.wait()  # type: ignore[attr-defined]  # until the event loop knows, too
-        with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
+        with pytest.raises(ServerUnreachable, match=r"exited with code -9.*discover\(\)"):
             await client.step()
         await client.discover()
         assert (await client.step()).step == 1
@@ -170,7 +170,7 @@ async def test_a_call_that_waits_for_a_connection_to_a_killed_server_ends(monkey
         await until(lambda: client._transport._inner._waiting)  # type: ignore[attr-defined]
         processes[0].told.set()
         async with asyncio.timeout(DEADLINE_S):
-            with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
+            with pytest.raises(ServerUnreachable, match=r"exited with code -9.*discover\(\)"):
                 await step
 
 

@@ -336,7 +336,7 @@ async def test_defaults_rebind_every_joint(plugin: Any, connect: Any) -> None:
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        ({"kp": {"knee": 1.0}}, "kp: no actuator 'knee'; it drives: elbow, wrist"),
+        ({"kp": {"knee": 1.0}}, "kp: no actuator 'knee'; available: elbow, wrist"),
         ({"kp": 3.0}, "kp takes a mapping"),
         ({"default_kv": -1}, "default_kv must be at least 0"),
         ({"default_kv": float("nan")}, "default_kv must be at least 0"),
@@ -416,7 +416,7 @@ async def test_a_vector_of_the_wrong_length_spoils_the_whole_reply(plugin: Any, 
         broken["per_articulation"]["robot"]["qpos"][0] = 99.0
         broken["per_articulation"]["arm_C_0"]["qvel"].append(1.0)
         scripted.on("step", broken)
-        with pytest.raises(ProtocolError, match=r"qvel of articulation 'arm_C_0' has 9 values, its model has 8"):
+        with pytest.raises(ProtocolError, match=r"qvel of articulation 'arm_C_0' has 9 values, but its model has 8"):
             await client.step()
         assert client.articulations["robot"].qpos_array[0] == 0.0
 
@@ -428,7 +428,7 @@ async def test_keyframes_by_their_short_name(plugin: Any, connect: Any) -> None:
         assert plugin.requests[-1]["keyframe_name"] == "robot_2_squat"
         with pytest.raises(UnknownKeyframe, match="could mean robot_home, arm_C_0_home"):
             await client.reset(keyframe_name="home")
-        with pytest.raises(UnknownKeyframe, match="only: robot_home, arm_C_0_home, robot_2_squat"):
+        with pytest.raises(UnknownKeyframe, match="the keyframes are: robot_home, arm_C_0_home, robot_2_squat"):
             await client.reset(keyframe_name="sleep")
 
 

@@ -90,7 +90,7 @@ async def test_waiting_across_a_restart_says_that_the_server_was_started_again(
     if mode == "direct":
         waiting = asyncio.create_task(client.wait_until(lambda: False, timeout=5.0))
     async with SimulatedServer("arm", play=True, unpaused=True, **ports), client:
-        with pytest.raises(ServerRestarted, match=r"was started again.* Call discover\(\)") as info:
+        with pytest.raises(ServerRestarted, match=r"has restarted.* Call discover\(\)") as info:
             await waiting
         assert "another" not in str(info.value)
         assert "takes the server over" not in str(info.value)

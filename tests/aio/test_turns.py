@@ -216,7 +216,7 @@ async def test_a_handshake_lost_with_its_connection_is_named(client: URLabClient
     await until(lambda: cut.applied)
     await until(lambda: not client.connected, look=0)
     await cancelled(discovering)
-    with pytest.raises(SessionTakenOver, match=r"A handshake of this client .* Call discover\(\)"):
+    with pytest.raises(SessionTakenOver, match=r"An abandoned handshake of this client .* Call discover\(\)"):
         await client.step()
     await client.discover()
     assert (await client.step(3)).step == 3
@@ -263,7 +263,7 @@ async def test_a_cancelled_start_is_told(faults: Faults, served: tuple[Simulated
         await client.sim.stop()
         await cancelled(await sent(client, "begin_pie", client.sim.start(), faults))
         for call in (client.step(3), client.reset(), client.runtime.forward()):
-            with pytest.raises(NoSession, match=r"sim.start\(\) was broken off.*resync\(\)"):
+            with pytest.raises(NoSession, match=r"sim.start\(\) was interrupted.*resync\(\)"):
                 await call
         await client.sim.start()
         assert (await client.step(3)).step == client.step_count == 3

@@ -111,7 +111,7 @@ def test_a_server_that_is_pinned_to_steps_says_so(capsys: pytest.CaptureFixture[
     with SimulatedServer("arm", play=True, step_mode="direct") as server:
         address = f"{server.address}:{server.step_port}"
         assert main(["snapshot", address, "--camera", "arm/wrist"]) == 2
-    assert "Pictures come with steps here" in capsys.readouterr().err
+    assert "In this mode, pictures come with steps" in capsys.readouterr().err
 
 
 def test_a_picture_beside_the_client_that_drives(tmp_path: Path) -> None:

@@ -444,7 +444,7 @@ async def test_fewer_steps_than_there_can_be_are_refused(connect: Any, serve: An
     with serve("ball", play=True) as server:
         client = connect(server, step_mode=mode)
         await client.discover()
-        with pytest.raises(ValueError, match=rf"^step: n_steps is at least .* got {n_steps}"):
+        with pytest.raises(ValueError, match=rf"^step: n_steps must be at least .* got {n_steps}"):
             await client.step(n_steps)
         assert (await client.runtime.forward()).step == 0
 

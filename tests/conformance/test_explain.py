@@ -61,7 +61,7 @@ async def test_forgotten_set_points_then_healthy(connect: Any, serve: Any) -> No
         client = connect(server, step_mode="direct")
         await client.discover()
         text = str(await client.explain())
-        assert "step() was not called" in text
+        assert "step() has not been called" in text
         assert "All set-points are 0" in text
         (arm,) = client.articulations.values()
         arm.ctrl_array[:] = 0.1
@@ -95,7 +95,7 @@ async def test_another_client_changed_the_mode(connect: Any, serve: Any) -> None
         await client.discover()
         reply = await client.call(_live())
         assert reply.current_mode == "live"
-        assert "Time passes by itself" in problems(await client.explain())
+        assert "Time passes without steps" in problems(await client.explain())
 
 
 def _live() -> Any:

@@ -218,7 +218,7 @@ async def test_joints_that_do_not_arrive_are_named(connect: Any, server: Any) ->
     with pytest.raises(NotSettled, match=r"'knee' is .* rad away") as caught:
         await art.move_to({"knee": 1.0}, timeout=0.02)
     assert caught.value.remaining == {"knee": pytest.approx(1.0 - art.joints["knee"].position)}
-    assert "Still on the way: 'knee'" in str(caught.value)
+    assert "Still moving: 'knee'" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ async def client(connect: Any, server: SimulatedServer) -> Any:
         (NAN, ValueError, "actuator 'swing' of 'bot' takes a finite number, got nan"),
         (-INF, ValueError, "takes a finite number, got -inf"),
         (np.float32("nan"), ValueError, "takes a finite number, got nan"),
-        ([NAN], ValueError, "takes finite numbers, got nan at 0"),
+        ([NAN], ValueError, "takes finite numbers, got nan at index 0"),
         (None, TypeError, "actuator 'swing' of 'bot' takes a number, got None"),
         ("fast", TypeError, "takes numbers, got"),
         ([None], TypeError, r"takes numbers, got \[None\]"),
@@ -255,7 +255,7 @@ async def test_explain_names_set_points_that_cannot_be_right(client: Any) -> Non
     bot.ctrl_array[:] = [NAN, 0, 0]
     finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
     assert finding.verdict is Verdict.PROBLEM
-    assert "not finite, so that step() refuses them: 'swing' nan" in finding.text
+    assert "not finite, so step() refuses them: 'swing' nan" in finding.text
     bot.ctrl_array[:] = [5, 0, 0]
     await client.step()
     finding = next(f for f in (await client.explain()).findings if f.subject == "bot")

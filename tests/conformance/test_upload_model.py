@@ -85,7 +85,7 @@ async def test_a_spec_is_sent_and_progress_is_told(robot: Path) -> None:
 def test_the_alpha_takes_no_models(robot: Path) -> None:
     with SimulatedServer() as server, URLabClient(**server.client_options()) as client:
         client.discover()
-        with pytest.raises(UnknownOp, match=r"over the wire.*import_xml"):
+        with pytest.raises(UnknownOp, match=r"does not accept uploaded models.*import_xml"):
             client.scene.upload_model(robot)
         with pytest.raises(ImportFailed):
             client.scene.apply_scene("lab", [URLabAsset("crab", str(robot))])

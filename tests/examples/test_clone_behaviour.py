@@ -34,4 +34,4 @@ def test_recorded_episodes_become_a_policy_that_the_commands_run(
     assert main(["run-policy", network, "--goal", "0.35", "0.1", "0.4", "--seconds", "2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["policy"]["goal_error"] < 0.05
     assert main(["run-policy", network, "--goal", "0.35", "0.1"]) == 2
-    assert "a goal is from [0.25, -0.25, 0.25] to [0.45, 0.25, 0.5], not [0.35, 0.1]" in capsys.readouterr().err
+    assert "a goal must be from [0.25, -0.25, 0.25] to [0.45, 0.25, 0.5], not [0.35, 0.1]" in capsys.readouterr().err

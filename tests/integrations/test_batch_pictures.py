@@ -68,7 +68,7 @@ def test_a_batch_refuses_cameras_that_it_cannot_show(made: list[Any]) -> None:
             URLabBatchEnv(address, 1, space_mode="dict", cameras=["arm/nose"])
         with pytest.raises(KeyError, match="nose"):
             URLabBatchEnv(address, 1, render_mode="rgb_array", render_camera="arm/nose")
-        with pytest.raises(ValueError, match="images do not fit into a flat observation"):
+        with pytest.raises(ValueError, match="a flat observation cannot contain images"):
             URLabBatchEnv(address, 1, cameras=["arm/wrist"])
         batch = URLabBatchEnv(address, 1)
         made.append(batch)

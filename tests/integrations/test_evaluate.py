@@ -140,7 +140,7 @@ def test_a_network_that_sees_pictures_is_evaluated_on_servers(
             (
                 saved("arm/overview"),
                 7,
-                "its input 'arm/overview' is not an entry of the observation; there are: arm/qpos",
+                "its input 'arm/overview' is not an entry of the observation; the entries are: arm/qpos",
             ),
             (saved("cameras/arm/overview", width=64), 7, "must be tensor(uint8) of shape ['batch', 72, 96, 3]"),
             (saved("cameras/arm/overview", onnx.TensorProto.FLOAT), 7, "must be tensor(uint8) of shape"),
@@ -154,7 +154,10 @@ def test_a_network_that_sees_pictures_is_evaluated_on_servers(
         assert isinstance(failed.value, (URLabError, TimeoutError))
         env.close()
     assert main(["evaluate", str(NETWORK), "--episodes=1", "--task", "urlab/PushPictures-v0"]) == 2
-    assert "its input 'observation' is not an entry of the observation; there are: arm/qpos" in capsys.readouterr().err
+    assert (
+        "its input 'observation' is not an entry of the observation; the entries are: arm/qpos"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_command_states_rates_and_every_episode(capsys: pytest.CaptureFixture[str]) -> None:

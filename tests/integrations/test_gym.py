@@ -287,7 +287,7 @@ def test_stepping_or_drawing_before_a_reset_says_so(make_env: MakeEnv) -> None:
         env.step(np.zeros(19))
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.render()
-    with pytest.raises(ValueError, match="there is 'keyframe'"):
+    with pytest.raises(ValueError, match="the only option is 'keyframe'"):
         env.reset(options={"key": "home"})
 
 

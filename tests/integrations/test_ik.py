@@ -96,7 +96,7 @@ def test_a_target_out_of_reach_is_reported_with_the_nearest(ik: InverseKinematic
 @pytest.mark.parametrize(
     ("arguments", "options", "said"),
     [
-        (([0.4, math.nan, 0.4],), {}, "position takes finite numbers, got nan at 1"),
+        (([0.4, math.nan, 0.4],), {}, "position takes finite numbers, got nan at index 1"),
         (([0.4, 0.4],), {}, r"position takes 3 numbers, got an array of shape \(2,\)"),
         (([0.4, 0.0, 0.4], [0, 0, 0, 0]), {}, "quaternion is all zeros"),
         (([0.4, 0.0, 0.4], [math.inf, 0, 0, 0]), {}, "quaternion takes finite numbers"),
@@ -115,9 +115,9 @@ def test_bad_frames_are_refused(client: URLabClient, ik: InverseKinematics) -> N
         InverseKinematics(client, "arm", site="gripp")
     with pytest.raises(ValueError, match="either site=NAME or body=NAME"):
         InverseKinematics(client, "arm")
-    with pytest.raises(ValueError, match="no position servo of joint 'right_finger' moves site 'grip'"):
+    with pytest.raises(ValueError, match="joint 'right_finger' has no position servo that moves site 'grip'"):
         InverseKinematics(client, "arm", site="grip", joints=["right_finger"])
-    with pytest.raises(ValueError, match="nothing that is held at a position moves body 'base'"):
+    with pytest.raises(ValueError, match="no position-controlled joint moves body 'base'"):
         InverseKinematics(client, "arm", body="base")
     with pytest.raises(Exception, match="Name the articulation: the scene has arm, quadruped"):
         InverseKinematics(client, site="grip")

@@ -114,19 +114,19 @@ def arm() -> Iterator[URLabClient]:
         ('"clock"', '"clok"', r"observation\[0\].term: .*'clok'. Terms are .*gravity, .*clock"),
         ("[gains]", "[gain]", "unknown field `gain`. Its keys are robot, .*gains"),
         ("kp = 60\n", "", r"gains: .*missing required field `kp`. Its keys are kp, kv, torque_limit"),
-        ("kp = 60", "kp = -1", "gains: kp is 0 or more"),
+        ("kp = 60", "kp = -1", "gains: kp must be 0 or more"),
         ("[1.5, 2.5]", "[1.0, 2.0, 3.0]", "gains.kv has 3 numbers; it takes one, or one for each of the action's 2"),
         ("[0.5, 0.25]", "[0.5]", "action: scale has 1 numbers"),
-        ("[0.5, 0.25]", "nan", "action: scale holds NaN"),
+        ("[0.5, 0.25]", "nan", "action: scale contains NaN"),
         ("decimation = 10", "decimation = 10.5", "decimation: Expected `int`, got `float`"),
         ("decimation = 10", "decimation = 0", "decimation: Expected `int` >= 1"),
-        ('"direct", "live"', '"puppet"', "step_modes must be 'direct' and 'live', not 'puppet'"),
+        ('"direct", "live"', '"puppet"', "step_modes can contain 'direct' and 'live', not 'puppet'"),
         ('"direct", "live"', '"fast"', r"step_modes\[0\]: Invalid enum value 'fast'"),
-        ('via = "controller"', 'via = "client"', "step_modes cannot have 'live' with action.via = 'client'"),
-        ('via = "controller"', 'via = "actuators"', "'actuators' has no use for the table .gains."),
-        ('via = "controller"', 'via = "controller"\nkind = "torque"', "torques go via 'actuators'"),
-        ('"FL_thigh", "FR_thigh"', '"FL_thigh", "FL_thigh"', "joints names a joint twice"),
-        ("offset = 0.1", "clip = [1.0, -1.0]", r"clip is \[low, high\]"),
+        ('via = "controller"', 'via = "client"', "step_modes cannot contain 'live' with action.via = 'client'"),
+        ('via = "controller"', 'via = "actuators"', "'actuators' does not use the table .gains."),
+        ('via = "controller"', 'via = "controller"\nkind = "torque"', "kind = 'torque' requires via = 'actuators'"),
+        ('"FL_thigh", "FR_thigh"', '"FL_thigh", "FL_thigh"', "joints contains a joint twice"),
+        ("offset = 0.1", "clip = [1.0, -1.0]", r"clip must be \[low, high\]"),
         ("[gains]", '[[observation]]\nterm = "command"\n[gains]', r"need the table \[command\]"),
         (
             "[gains]",
@@ -339,7 +339,7 @@ def test_a_goal_and_the_way_to_it_are_observed_and_what_is_left_is_told(arm: URL
     assert found.goal_error == pytest.approx(np.linalg.norm(way), abs=1e-3)
     assert run_blocking(arm, policy_of(REACH), seconds=0.04).goal_error is None
     for bad in ([0.4, 0.2], [0.4, 0.2, 3.0], [0.4, 0.2, float("nan")]):
-        with pytest.raises(ValueError, match=r"a goal is from \[0.0, -1.0, 0.0\] to \[1.0, 1.0, 1.0\]"):
+        with pytest.raises(ValueError, match=r"a goal must be from \[0.0, -1.0, 0.0\] to \[1.0, 1.0, 1.0\]"):
             policy.goal = bad
     with pytest.raises(ValueError, match=r"it\.toml has no goal"):
         policy_of(REACH).goal = [0.0]
@@ -348,7 +348,7 @@ def test_a_goal_and_the_way_to_it_are_observed_and_what_is_left_is_told(arm: URL
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("high = [1.0, 1.0, 1.0]", "high = [1.0, 1.0]", "default, low and high need the same number of numbers"),
+        ("high = [1.0, 1.0, 1.0]", "high = [1.0, 1.0]", "default, low and high must have the same length"),
         ("high = [1.0, 1.0, 1.0]", "high = [0.2, 1.0, 1.0]", "default .* is not between low and high"),
         (GOAL.partition("[goal]")[2], "\n[action]", "missing required field `default`"),
         ('relative_to = "grip_position"', 'relative_to = "grip_orientation"', "has 4 numbers, the goal 3"),
@@ -368,7 +368,7 @@ def test_the_term_needs_a_goal() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (WALK.replace('"quadruped"', '"dog"'), r"no articulation is called 'dog'; there are: quadruped"),
+        (WALK.replace('"quadruped"', '"dog"'), r"no articulation is called 'dog'; the articulations are: quadruped"),
         (walk(('"direct", "live"', '"live"')), r"in 'direct' mode; step_modes requires 'live'.*step_mode='live'"),
         (walk(("0.002", "0.005")), r"timestep of 0.002 s; timestep requires 0.005 s.*set_sim_options\(timestep=0.005"),
         (walk(('"FR_thigh"', '"XX_thigh"')), r"action.joints\[1\]: .*no joint 'XX_thigh'; it has .*FR_thigh"),
@@ -381,7 +381,7 @@ def test_the_term_needs_a_goal() -> None:
         ),
         (
             walk(('via = "controller"', 'via = "client"'), ('"direct", "live"', '"direct"')),
-            r"has a controller in force; action.via = 'client' requires .*control_mode = 'raw'",
+            r"has an active controller; action.via = 'client' requires .*control_mode = 'raw'",
         ),
     ],
 )

@@ -133,8 +133,8 @@ def test_a_camera_that_does_not_fit_is_refused(old: str, new: str, said: str, ar
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('input = "numbers"\n', "", "each term of the observation needs its `input`"),
-        ('input = "numbers"', 'input = "eye"', "a picture needs an input of its own, but 'eye' is of several terms"),
+        ('input = "numbers"\n', "", "either every term of the observation has an `input`"),
+        ('input = "numbers"', 'input = "eye"', "a picture needs its own input, but several terms use 'eye'"),
         ("decimation = 50", "decimation = 50\nhistory = 2", "history must be 1 with the term 'picture'"),
         ("size = [48, 32]", "size = [48, 0]", r"observation\[1\].size\[1\]: Expected `int` >= 1"),
         (

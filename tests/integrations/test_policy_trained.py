@@ -87,7 +87,7 @@ def test_another_robot_or_another_size_is_refused(capsys: pytest.CaptureFixture[
     assert said.startswith("urlab run-policy: ")
     assert "requires a PD controller. Serve it with --controller quadruped=pd" in said
     assert urlab(["run-policy", str(NETWORK), "--step-mode", "live", "--command", "9", "0", "0"]) == 2
-    assert "--command: a command is vx, vy, yaw rate from" in capsys.readouterr().err
+    assert "--command: a command must be vx, vy, yaw rate from" in capsys.readouterr().err
 
     declaration = tmp_path / "smaller.toml"
     text = NETWORK.with_suffix(".toml").read_text()

@@ -99,7 +99,7 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
         settable = {"gravity", "position", "base_position", "base_yaw", "kp", "kv"}
         assert set(refused.value.quantities) == {vary.what for vary in EVERYTHING.vary} - settable
         assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)
-        with pytest.raises(urlab_client.URLabError, match="varies its scene in another way"):
+        with pytest.raises(urlab_client.URLabError, match="varies its scene differently"):
             URLabEnv.connect(where(second), randomise=Randomisation())
 
 
@@ -256,7 +256,7 @@ def test_late_lost_and_noisy_samples_are_seen_and_rewards_are_judged_without(mad
                 Randomisation(noise=(Noise(field="qpos", articulation="leg"),)),
                 "no observed articulation",
             ),
-            (Randomisation(push=(Push(body="arm/nose", force=(0, 1), every=(1, 1)),)), "no body 'arm/nose'"),
+            (Randomisation(push=(Push(body="arm/nose", force=(0, 1), every=(1, 1)),)), "unknown body 'arm/nose'"),
             (Randomisation(vary=(Vary(what="mass", on="arm/nose", scale=(1, 2)),)), "no body with a mass is called"),
         ):
             with pytest.raises(ValueError, match=reason):

@@ -264,7 +264,7 @@ def test_a_block_is_pushed_to_its_target_and_seen_in_pictures_alone(pushers: lis
 
 
 def test_what_a_task_settles_is_refused_beside_it(arms: list[str], made: list[Any]) -> None:
-    with pytest.raises(ValueError, match="a task settles reward_fn"):
+    with pytest.raises(ValueError, match="reward_fn cannot be given together with a task"):
         URLabVectorEnv(arms, task=Reach(), reward_fn=lambda *_: 0)
 
     class Wrong(Reach):

@@ -181,7 +181,7 @@ def test_an_environment_that_takes_long_to_come_back_holds_up_nobody(
     for count in (2, 3):
         *_, truncated, infos = env.step(action)
         assert truncated.tolist() == [True, False]
-        assert "environment 0 is still being started" in str(infos["error"][0])
+        assert "environment 0 is still starting" in str(infos["error"][0])
         assert infos["step_count"][1] == count
     ready.set()
     while "error" in infos:
@@ -227,7 +227,7 @@ def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:
 
 
 def test_environments_with_other_spaces_are_refused(servers: list[str]) -> None:
-    with pytest.raises(ValueError, match=r"environment 1 .* has other spaces"):
+    with pytest.raises(ValueError, match=r"environment 1 .* has different spaces"):
         URLabVectorEnv([servers[0], "sim://quadruped"])
 
 
@@ -235,7 +235,7 @@ def test_environments_with_other_spaces_are_refused(servers: list[str]) -> None:
     ("arguments", "options", "reason"),
     [
         (("sim://arm",), {}, "needs num_envs"),
-        (("tcp://127.0.0.1", 2), {}, "list the addresses"),
+        (("tcp://127.0.0.1", 2), {}, "list one address per environment"),
         ((["sim://arm"], 2), {}, "1 addresses"),
         (([],), {}, "0 addresses"),
         ((["sim://arm"],), {"step_timeout": 0.0}, "above 0"),

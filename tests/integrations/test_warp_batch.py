@@ -109,11 +109,11 @@ def test_episodes_start_with_the_same_bits_and_go_on_alike(address: str) -> None
 
 def test_what_warp_cannot_do_is_said_before_anything_is_stepped(address: str) -> None:
     heavy = Randomisation(vary=(Vary(what="mass", scale=(0.5, 2.0)),))
-    with pytest.raises(ValueError, match=r"all copies have one model: body_\w+ cannot vary"):
+    with pytest.raises(ValueError, match=r"all copies share one model: body_\w+ cannot vary"):
         URLabBatchEnv(address, 2, engine="warp", randomise=heavy)
-    with pytest.raises(ValueError, match="engine is 'mujoco' or 'warp', not 'mjx'"):
+    with pytest.raises(ValueError, match="engine must be 'mujoco' or 'warp', not 'mjx'"):
         URLabBatchEnv(address, 2, engine="mjx")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="engine_options of mujoco cannot have contacts"):
+    with pytest.raises(ValueError, match="engine_options of 'mujoco' must not contain contacts"):
         URLabBatchEnv(address, 2, engine_options={"contacts": 3})
     with SimulatedServer("quadruped", play=True) as server, URLabClient(**server.client_options()) as client:
         client.discover()

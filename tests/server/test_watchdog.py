@@ -112,7 +112,7 @@ def test_a_request_that_does_not_come_back_holds_up_nobody(
         assert holder.raw({"op": "meta"})["op"] == "meta_ok"
         assert holder.ask("pie_status")["state"] == "ready"
         code, message = holder.refusal("get_contacts")
-        assert (code, "has not come back" in message) == ("not_ready", True)
+        assert (code, "has not returned" in message) == ("not_ready", True)
         assert holder.refused("step") == "not_ready"
         assert other.hello()["manager_present"] is True
         assert len(other.ask("list_keyframes")["keyframes"]) >= 0
@@ -195,7 +195,7 @@ async def test_what_a_client_sees(
         await client.step()
         await client.step()
         stuck.at(server, "mj_step")
-        with pytest.raises(StepTimeout, match="MuJoCo has not come back"):
+        with pytest.raises(StepTimeout, match="MuJoCo has not returned"):
             await client.step()
         with pytest.raises(NotReady, match="stop_pie ends it"):
             await client.runtime.get_contacts()

@@ -237,7 +237,7 @@ def test_among_greenlets_a_client_says_at_once_that_it_cannot_be(
     monkeypatch: pytest.MonkeyPatch, module: str, asked: str, patched: str, who: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{asked: lambda name: name == patched}))
-    with pytest.raises(URLabError, match=rf"{who} has replaced in this process\. Use it in a process of its own"):
+    with pytest.raises(URLabError, match=rf"{who} has replaced in this process\. Use it in a separate process"):
         URLabClient()
     monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{asked: lambda name: False}))
     URLabClient().close()
@@ -662,7 +662,7 @@ class TestInterrupt:
         interrupt_when_ready(process)
         assert outcome(process) == (
             0,
-            ["closing", "The client was closed during this call. Make a new one."],
+            ["closing", "The client was closed during this call. Create a new one."],
             "",
         )
 

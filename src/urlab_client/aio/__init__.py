@@ -1,4 +1,4 @@
-"""The async core: `URLabClient` and everything it hands out."""
+"""The async core: `URLabClient` and the classes of the objects that it returns."""
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView

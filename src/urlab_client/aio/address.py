@@ -1,4 +1,4 @@
-"""What a client's address means: which transport leads where."""
+"""From a client's address to its transport."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def transport_to(address: str, step_port: int, keys: ClientKeys | None, *, shm: 
     """Return the transport to a server at an address.
 
     Args:
-        address: As users write it.
-        step_port: RPC port, where the address names none.
-        keys: What the server demands; None for nothing.
-        shm: Whether a server that is started here is to offer shared memory.
+        address: Address given by the user.
+        step_port: RPC port, if the address names none.
+        keys: CURVE keys for the server; None if it needs none.
+        shm: Whether a server that this process starts offers shared memory.
 
     Raises:
         ValueError: The address is malformed.

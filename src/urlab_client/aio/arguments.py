@@ -1,4 +1,4 @@
-"""Arguments of the wrong type, refused by the name of what they were given for, before anything is sent."""
+"""Type checks of arguments, made before anything is sent; the errors name the parameter."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ V = TypeVar("V")
 
 
 def require(what: str, value: object, kind: type, takes: str) -> None:
-    """Refuse what is of another kind.
+    """Check that an argument is an instance of a type.
 
     Args:
         what: The method and, if it has several, the parameter.
-        value: What it was given.
-        kind: What it must be an instance of.
-        takes: The same in words.
+        value: The argument.
+        kind: The required type.
+        takes: The required type in words.
 
     Raises:
-        TypeError: It is not.
+        TypeError: The argument has another type.
     """
     if not isinstance(value, kind):
         raise TypeError(f"{what} takes {takes}, got {value!r:.80}.")
 
 
 def mapping(what: str, value: Mapping[str, V], of: str) -> Mapping[str, V]:
-    """Return a mapping as it is.
+    """Return a mapping unchanged.
 
     Args:
         what: The method and, if it has several, the parameter.
-        value: What it was given.
-        of: What it takes, such as `actuator names to numbers`.
+        value: The argument.
+        of: The required contents, such as `actuator names to numbers`.
 
     Raises:
-        TypeError: It is not a mapping.
+        TypeError: The argument is not a mapping.
     """
     require(what, value, Mapping, f"a dictionary of {of}")
     return value
 
 
 def collection(what: str, values: Collection[V]) -> Collection[V]:
-    """Return several values as they are.
+    """Return a collection unchanged.
 
     Raises:
-        TypeError: It is one value, or a text, which would be taken for its letters.
+        TypeError: The argument is a single value, or a string, whose items would be its characters.
     """
     if isinstance(values, str):
         raise TypeError(f"{what} takes a collection, such as ({values!r:.80},), not one of its items.")
@@ -55,10 +55,10 @@ def collection(what: str, values: Collection[V]) -> Collection[V]:
 
 
 def integer(what: str, value: int) -> int:
-    """Return an integer as a plain one.
+    """Return an integer as a plain `int`.
 
     Raises:
-        TypeError: It is not an integer.
+        TypeError: The argument is not an integer.
     """
     try:
         return operator.index(value)
@@ -67,11 +67,11 @@ def integer(what: str, value: int) -> int:
 
 
 def numbers(what: str, values: Iterable[float], count: int) -> list[float]:
-    """Return so many numbers as a list.
+    """Return exactly `count` numbers as a list.
 
     Raises:
-        TypeError: They are not numbers, or not several.
-        ValueError: There are more or fewer, or a text that is not a number.
+        TypeError: The argument is not iterable or contains items that are not numbers.
+        ValueError: There are more or fewer items, or one is a string that is not a number.
     """
     try:
         found = [float(value) for value in values]
@@ -85,10 +85,10 @@ def numbers(what: str, values: Iterable[float], count: int) -> list[float]:
 
 
 def text(what: str, value: str) -> str:
-    """Return a text as it is.
+    """Return a string unchanged.
 
     Raises:
-        TypeError: It is not a text.
+        TypeError: The argument is not a string.
     """
-    require(what, value, str, "a text")
+    require(what, value, str, "a string")
     return value

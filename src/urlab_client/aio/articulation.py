@@ -41,8 +41,8 @@ _DOWN = np.array([0.0, 0.0, -1.0])
 class URLabEntity:
     """A dynamic body, or the root of an articulation.
 
-    State is that of the last reply. Arrays are fresh copies, yours to keep. Read from a thread other than the one
-    that steps, several values belong together only under `client._data_lock`.
+    The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread
+    other than the one that steps, hold `client._data_lock`.
     """
 
     def __init__(self, record: MirroredEntity) -> None:
@@ -55,12 +55,12 @@ class URLabEntity:
 
     @property
     def body_id(self) -> int:
-        """Global MuJoCo id of the (root) body; -1 for an articulation without a local model."""
+        """Global MuJoCo id of the body (of the root body for an articulation, -1 without a local model)."""
         return self._record.body_id
 
     @property
     def has_free_base(self) -> bool:
-        """True when the (root) body has a free joint; False for an articulation without a local model."""
+        """True if the body or root body has a free joint; False for an articulation without a local model."""
         return self._record.has_free_base
 
     @property
@@ -108,7 +108,7 @@ class URLabEntity:
 
     @property
     def projected_gravity_b(self) -> Floats:
-        """Unit vector of gravity's direction, shape (3,), body frame; (0, 0, -1) when upright."""
+        """Unit vector in the direction of gravity, shape (3,), body frame; (0, 0, -1) when upright."""
         with self._record.mirror.lock:
             model = self._record.mirror.model
             gravity = _DOWN if model is None else model.opt.gravity
@@ -139,7 +139,7 @@ class URLabEntity:
         return Pose(position=(x, y, z), quaternion=(qw, qx, qy, qz))
 
     def describe(self) -> EntityDescription | ArticulationDescription:
-        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
+        """Return name, kind and pose as of the last reply, in a form that encodes directly to JSON."""
         return EntityDescription(name=self.name, free_base=self.has_free_base, pose=self._place())
 
     def _pose(self) -> tuple[Floats, Floats]:
@@ -164,7 +164,7 @@ class URLabEntity:
     def _needs_model(self, what: str, source: str) -> URLabError:
         return URLabError(
             f"The {what} of {self.name!r} follows from joint {source}, which needs a local model.",
-            hint="Make the client with local_model=True and call discover() during play.",
+            hint="Create the client with local_model=True and call discover() during play.",
         )
 
     def __repr__(self) -> str:
@@ -174,8 +174,8 @@ class URLabEntity:
 class URLabArticulation(URLabEntity):
     """A robot imported from MJCF.
 
-    Dictionaries are keyed by short names, without the articulation's prefix; compiled names and original MJCF names
-    are found, too. Without a local model only actuators and cameras are known.
+    Dictionaries are keyed by short names, without the articulation's prefix. Lookups also accept compiled names and
+    original MJCF names. Without a local model only actuators and cameras are known.
     """
 
     _record: MirroredArticulation
@@ -196,17 +196,17 @@ class URLabArticulation(URLabEntity):
 
     @property
     def compiled_prefix(self) -> str:
-        """What its compiled names start with, before an underscore: the key, or the engine's name of the actor."""
+        """Prefix of its compiled names, without the underscore: the key, or the engine's name of the actor."""
         return self._record.info.compiled_prefix
 
     @property
     def user(self) -> dict[str, Any]:
-        """Values of the user channels that the level declares for it, by name; empty on servers without them."""
+        """Values of the user channels that the level declares for it, by name; empty if the server has none."""
         return dict(self._record.user)
 
     @property
     def actor_id(self) -> str:
-        """Stable id given when it was spawned; empty if none."""
+        """Stable id given when it was spawned; empty if none was given."""
         return self._record.info.actor_id
 
     @property
@@ -245,7 +245,7 @@ class URLabArticulation(URLabEntity):
 
     @property
     def controller(self) -> URLabController | None:
-        """The controller, or None for an articulation whose set-points go straight to its actuators."""
+        """The controller, or None if the set-points go directly to the actuators."""
         info = self._record.controller
         if info is None:
             return None
@@ -255,7 +255,7 @@ class URLabArticulation(URLabEntity):
 
     @property
     def control_mode(self) -> ControlMode:
-        """Whether the controller turns set-points into actuator signals. May be assigned before `step()`.
+        """Whether the controller turns set-points into actuator signals. Assign it before `step()`.
 
         Raises:
             ValueError: On assigning anything but `ue_controller` or `raw`.
@@ -274,10 +274,10 @@ class URLabArticulation(URLabEntity):
         Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
 
         Raises:
-            TypeError: On assigning what is not numbers.
-            ValueError: On assigning NaN, infinities or another number of values.
+            TypeError: On assigning values that are not numbers.
+            ValueError: On assigning NaN, infinities or the wrong number of values.
         """
-        self._record.drive()  # whoever takes the view may write to it at any time
+        self._record.drive()  # the caller may write to the view at any time
         return self._record.ctrl
 
     @ctrl_array.setter
@@ -288,7 +288,7 @@ class URLabArticulation(URLabEntity):
 
     @property
     def last_applied_ctrl(self) -> Floats:
-        """`mjData.ctrl` as the server applied it last, after any controller, shape (n_actuators,)."""
+        """`mjData.ctrl` that the server applied last, after any controller, shape (n_actuators,)."""
         return self._record.applied.copy()
 
     @property
@@ -303,7 +303,7 @@ class URLabArticulation(URLabEntity):
 
     @property
     def qvel_array(self) -> Floats:
-        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; of a free base linear world, angular body."""
+        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; a free base's linear in world, angular in body."""
         return self._record.qvel.copy()
 
     @property
@@ -346,13 +346,13 @@ class URLabArticulation(URLabEntity):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point; of an actuator with several inputs, the first.
-            out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
+            values: Actuator name to set-point; the first input of an actuator with several.
+            out_of_range: Handling of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
             KeyError: A name is unknown; nothing was set.
             TypeError: A value is not a number; nothing was set.
-            ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
+            ValueError: A value is NaN or infinite or, with `error`, out of range; nothing was set.
         """
         rule = OutOfRange(out_of_range)
         given = mapping("set_ctrl", values, "actuator names to numbers")
@@ -377,9 +377,9 @@ class URLabArticulation(URLabEntity):
         return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
 
     def describe(self) -> ArticulationDescription:
-        """Return its parts, its state and its set-points, as of the last reply.
+        """Return its parts, state and set-points as of the last reply.
 
-        `to_dict()` and `to_json()` of the result make plain data of it.
+        `to_dict()` and `to_json()` of the result return plain data.
         """
         controller = self._record.controller
         with self._record.mirror.lock:
@@ -401,12 +401,12 @@ class URLabArticulation(URLabEntity):
             )
 
     def resolve_joint(self, name: str) -> str | None:
-        """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
+        """Return the live key of a joint for its live, compiled or original MJCF name, or None."""
         joint = self.joints.get(name)
         return None if joint is None else joint.name
 
     def resolve_actuator(self, name: str) -> str | None:
-        """Return the live key of an actuator given its live, compiled or original MJCF name, or None."""
+        """Return the live key of an actuator for its live, compiled or original MJCF name, or None."""
         actuator = self.actuators.get(name)
         return None if actuator is None else actuator.name
 
@@ -415,8 +415,8 @@ class URLabArticulation(URLabEntity):
     ) -> None:
         """Buffer a wrench on one of its bodies for the next `step()`, which clears it.
 
-        It acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where the
-        server ignores wrenches.
+        The wrench acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where
+        the server ignores wrenches.
 
         Args:
             body: Short body name; the root body if empty.
@@ -426,7 +426,7 @@ class URLabArticulation(URLabEntity):
         Raises:
             KeyError: The articulation has no such body.
             TypeError: A component is not a number.
-            ValueError: A vector does not have three finite components, or the body must be named.
+            ValueError: A vector does not have three finite components, or `body` is empty and the root is not known.
         """
         bodies = self.bodies
         if body and bodies:
@@ -434,55 +434,55 @@ class URLabArticulation(URLabEntity):
         elif not body:
             body = next((name for name, handle in bodies.items() if handle.id == self.body_id), "")
         if not body:
-            raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
+            raise ValueError(f"{self.prefix}: the root body is not known without a local model; name the body")
         self._record.apply_wrench(body, _wrench(force, torque))
         self._record.drive()
 
     async def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
-        """Move joints to positions with their position servos, and return when they have settled there.
+        """Move joints to positions with their position servos, and return when they have settled.
 
-        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        Sets the set-points immediately, without an intermediate path, and then steps in `direct` and `puppet` or waits
         in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
         Other set-points do not change, and the new ones stay in force afterwards.
 
         Args:
             targets: Joint name to position, radians or metres.
-            tolerance: How far from its target a joint may be, in its unit.
+            tolerance: Largest distance of a joint from its target, in the unit of the joint.
             timeout: Seconds of simulation time after which to give up.
 
         Returns:
-            Seconds of simulation time that it took.
+            Simulation time that passed, seconds.
 
         Raises:
-            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
-                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
+            NotSettled: The joints did not settle in time; `.remaining` has the remaining distance of each joint, and
+                the message contains the findings of `explain()`. A servo that works against gravity may need a larger
+                tolerance.
             KeyError: The articulation has no such joint; nothing was set.
-            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
-                joint at a position; nothing was set.
-            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
+            ValueError: A target is not finite or outside the range of its joint or actuator, or the joint has no
+                position servo; nothing was set.
+            URLabTimeoutError: Simulation time does not advance, for example while paused in live mode.
         """
         return await self._motion.move_to(self, targets, tolerance, timeout)
 
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
         """Become the only client that controls the articulation, before the first write does so automatically.
 
-        A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
-        server whose robots have no owner this does nothing.
+        The client renews the claim until `release()` or `close()`. Does nothing on a server whose robots have no owner.
 
         Args:
-            force: Take it from the client that controls it; that one's next write is refused.
-            ttl: Seconds after which the claim ends when this process is gone; 0 for never.
+            force: Take the articulation from the client that controls it; the next write of that client is refused.
+            ttl: Seconds after which the claim expires if this process has died; 0 for never.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` names it.
+            ControlClaimed: Another client controls the articulation; `.owner` names that client.
             ValueError: `ttl` is negative or not a number.
         """
         await self._session.control.claim(self.prefix, force=force, ttl=finite("claim: ttl", ttl), timeout=timeout)
         self._record.drive()
 
     async def release(self, *, timeout: Timeout = DEFAULT) -> None:
-        """Let others control the articulation. The next write claims it again.
+        """Let other clients control the articulation. The next write claims it again.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -492,9 +492,9 @@ class URLabArticulation(URLabEntity):
 
     @property
     def control_owner(self) -> str | None:
-        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it: `HOST/PROCESS/…` for this process, otherwise the name of the other client.
 
-        None if no client controls it, if it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if the owner is not known, and on servers whose robots have no owner.
         """
         return self._session.control.owner_of(self.prefix)
 
@@ -516,12 +516,12 @@ def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
 
 
 def _to_world(quat: Floats, vector: Floats) -> Floats:
-    """Rotate a vector of the body frame into the world frame; `quat` is (w, x, y, z)."""
+    """Rotate a vector from the body frame into the world frame; `quat` is (w, x, y, z)."""
     w, x, y, z = quat.tolist()
     a, b, c = vector.tolist()
     return np.array(rotate((x, y, z, w), (a, b, c)))
 
 
 def _to_body(quat: Floats, vector: Floats) -> Floats:
-    """Rotate a vector of the world frame into the body frame; `quat` is (w, x, y, z)."""
+    """Rotate a vector from the world frame into the body frame; `quat` is (w, x, y, z)."""
     return _to_world(quat * _CONJUGATE, vector)

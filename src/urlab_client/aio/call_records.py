@@ -1,4 +1,4 @@
-"""What `observe=` is told: one record of each request, when it is over."""
+"""Records for `observe=`: one for each request, after it has finished."""
 
 from __future__ import annotations
 
@@ -27,18 +27,16 @@ _QUEUED: ContextVar[float] = ContextVar("seconds that this task's next request h
 
 
 class CallRecords:
-    """Measures the requests of one session, which has one of them under way at a time, and tells the user's function.
+    """Measures the requests of one session, of which one is in progress at a time, and calls the user's function.
 
-    A session without an observer has none of this: its requests go straight to the transport.
+    A session without an observer does not use this class: its requests go directly to the transport.
     """
 
     def __init__(self, observe: Observe, transport: RequestTransport) -> None:
         if not callable(observe):
             raise TypeError(f"observe= takes a function of one argument, a CallRecord, not {observe!r}")
         if inspect.iscoroutinefunction(observe) or inspect.iscoroutinefunction(getattr(observe, "__call__", None)):  # noqa: B004
-            raise TypeError(
-                "observe= takes a plain function, not an async one: it is called in the middle of a request"
-            )
+            raise TypeError("observe= takes a plain function, not an async one, because it is called during a request")
         self._observe = observe
         self._transport = transport
         self._sent_bytes = 0
@@ -48,7 +46,7 @@ class CallRecords:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """Send a request as the transport does, and measure it."""
+        """Send a request over the transport, and measure it."""
         self._sent_bytes += len(frame)
         began = time.perf_counter()
         try:
@@ -59,7 +57,7 @@ class CallRecords:
         return answer
 
     async def queued(self, op: Op, waiting: Awaitable[None]) -> None:
-        """Let a request wait for others, and tell it if that is all that becomes of it."""
+        """Let a request wait for others, and record it if it fails or is cancelled while waiting."""
         began = time.perf_counter()
         try:
             await waiting
@@ -71,7 +69,7 @@ class CallRecords:
         _QUEUED.set(_QUEUED.get() + time.perf_counter() - began)
 
     async def record(self, op: Op, answer: Awaitable[T]) -> T:
-        """Wait for the answer to a request, and tell how that went."""
+        """Wait for the answer to a request, and record the outcome."""
         queued = _QUEUED.get()
         _QUEUED.set(0.0)
         started_ns = time.time_ns() - int(1e9 * queued)

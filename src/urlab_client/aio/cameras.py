@@ -1,4 +1,4 @@
-"""Cameras as the handshake describes them, with the newest frame that arrived."""
+"""Cameras as the handshake describes them, with the newest frame received."""
 
 from __future__ import annotations
 
@@ -21,45 +21,46 @@ __all__ = ["SharedFrame", "URLabCameraView"]
 
 
 class URLabCameraView:
-    """One camera. Frames arrive with `client.step(include_cameras=…)`, and by themselves in live mode."""
+    """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
     name: str
     """Name without the articulation's prefix."""
     info: CameraInfo
-    """The handshake's description."""
+    """Description from the handshake."""
     delivered: bool
-    """False when the last step that asked for a frame got none: `latest_frame` is then older than the state."""
+    """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
 
     def __init__(self, name: str, info: CameraInfo, publishers: Publishers) -> None:
         self.name = name
         self.info = info
         self.delivered = True
         self._publishers = publishers
-        # For the client. Not declared above, so that the façade has none.
+        # For the client. Not declared above, to keep them out of the façade.
         self.memory: PictureMemory = PictureMemory()
         self.pictures: LatestPicture = LatestPicture(publishers.camera(self, asked=False))
 
     @property
     def latest_frame(self) -> Pixels | None:
-        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA.
+        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, otherwise (H, W, 4) BGRA.
 
-        Yours to keep: later frames are other arrays. Until one comes, this is the same array for all who ask.
+        Each frame is a new array, which later frames do not overwrite. Until the next frame arrives, all callers get
+        the same array.
         """
         return self.pictures.newest()[0]
 
     @property
     def sim_time(self) -> float | None:
-        """Simulation time of the newest frame, seconds; in live mode None unless the server sends it along."""
+        """Simulation time of the newest frame, seconds; None in live mode unless the server sends it."""
         return self.pictures.newest()[1]
 
     @property
     def frame_id(self) -> int | None:
-        """Which snapshot of the state the newest frame shows, to be compared with `StepOk.frame_id`; None if unsaid."""
+        """Id of the state snapshot that the newest frame shows, comparable to `StepOk.frame_id`; None if not sent."""
         return self.pictures.frame_id()
 
     @property
     def mode(self) -> CameraMode | str:
-        """What its pixels mean; a plain string for a mode this client does not know."""
+        """Meaning of the pixels; a plain string for a mode that this client does not know."""
         return known(CameraMode, self.info.mode)
 
     @property
@@ -78,30 +79,31 @@ class URLabCameraView:
         return np.dtype(np.float32 if self.mode == CameraMode.DEPTH else np.uint8)
 
     def describe(self) -> CameraDescription:
-        """Return what it is."""
+        """Return name, mode, resolution and field of view."""
         width, height = self.resolution
         return CameraDescription(name=self.name, mode=str(self.mode), width=width, height=height, fovy=self.fovy)
 
     async def capture(self, *, timeout: Timeout = DEFAULT) -> CameraSample:
-        """Take a picture now, in any step mode, without a step; it is then also `latest_frame`.
+        """Take a picture now, in any step mode, without a step; it also becomes `latest_frame`.
 
-        It shows the simulation after this call, and time does not pass for it: in `direct` and `puppet` mode the
-        server is brought into live mode for a moment, paused, which takes a few requests; a picture of every step is
-        quicker with `step(include_cameras=…)`. A camera that is switched off is switched on for as long. A server of
-        the alpha does not number its pictures: there the second one counts that arrives after the call.
+        The picture shows the simulation as it is after this call, and no simulation time passes. In `direct` and
+        `puppet` mode the client briefly switches the server to live mode, paused, which takes a few requests;
+        `step(include_cameras=…)` is faster for a picture of every step. A camera that is switched off is switched on
+        for the duration of the call. Servers of the alpha do not number their pictures; with them, this returns the
+        second picture that arrives after the call.
 
         Args:
-            timeout: Seconds to wait; None waits without limit. By default the client's, or 30 where that is less and
-                no picture of this camera has come before: the server may still be looking for OpenGL.
+            timeout: Seconds to wait; None waits without limit. The default is the client's timeout; it is at least 30 s
+                before the first picture of this camera, because the server may still be initialising OpenGL.
 
         Returns:
             The picture; `.png()` and `.jpeg()` encode it.
 
         Raises:
-            PictureTimeout: None came in time: the camera is off in the editor, or the server cannot draw.
-            NoActiveManager: No play session runs.
-            ModeLocked: The project pins a mode in which pictures come with steps only.
-            URLabError: The camera is not in the scene any more.
+            PictureTimeout: No picture arrived in time: the camera is off in the editor, or the server cannot render.
+            NoActiveManager: No play session is running.
+            ModeLocked: The project is locked to a mode that delivers pictures only with steps.
+            URLabError: The camera is no longer in the scene.
         """
         (sample,) = await self._publishers.capture([self], timeout)
         return sample
@@ -115,22 +117,24 @@ class URLabCameraView:
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
     ) -> Stream[CameraSample]:
-        """Stream its pictures, as the server publishes them.
+        """Stream the camera's pictures as the server publishes them.
 
-        A server of the alpha does so in live mode only, the plugin without time or number. Newer servers do in every
-        mode, each state once: nothing comes while the simulation stands still.
+        Servers of the alpha publish pictures in live mode only, the plugin without time or number. Newer servers
+        publish them in every mode, once per state: no pictures arrive while the simulation stands still.
 
         Args:
-            policy: `latest`, or `all` within the buffer.
-            max_rate: With `latest`, pictures per second at most, each the newest by then; None for as many as come.
-            buffer: Pictures that may wait, with `all`.
-            buffer_bytes: Bytes that may wait, with `all`.
-            timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
-                where that is less and the server is there and in live mode (it may still be looking for OpenGL), and
-                then without limit; None waits.
+            policy: `latest`, or `all` within the limits of the buffer.
+            max_rate: Maximum number of pictures per second, with `latest`; each is the newest at its time. None for no
+                limit.
+            buffer: Maximum number of buffered pictures, with `all`.
+            buffer_bytes: Maximum number of buffered bytes, with `all`.
+            timeout: Seconds that iteration waits for each picture. The default is the client's timeout for the first
+                one and no limit after that. The default for the first one is at least 30 s if the server is connected
+                and in live mode, because it may still be initialising OpenGL. None waits without limit.
 
         Raises:
-            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
+            ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
+                policy than `latest`.
         """
         return Stream(
             self._publishers.camera(self, policy),
@@ -143,9 +147,9 @@ class URLabCameraView:
         )
 
     def shared_frame(self) -> SharedFrame | None:
-        """Return the newest picture without copying it, for `transport="shm"`: see `SharedFrame` for what that means.
+        """Return the newest picture without copying it, for `transport="shm"`; see `SharedFrame` for its lifetime.
 
-        None unless the camera's pictures are being received from shared memory, as in live mode, or in any mode while
+        None unless the client is receiving the camera's pictures from shared memory: in live mode, or in any mode while
         a stream of `frames` is open.
         """
         return self._publishers.shared_frame(self)

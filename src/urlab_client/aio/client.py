@@ -62,50 +62,52 @@ log: logging.Logger = logging.getLogger("urlab_client.client")
 R = TypeVar("R", bound=Reply)
 
 _REVERT_S = 1.0
-_LOOKING_ON = (StepMode.AUTO, StepMode.LIVE)
+_READ_ONLY_MODES = (StepMode.AUTO, StepMode.LIVE)
 
 
 class URLabClient(ClientState):
     """A session with one server.
 
-    The client sends and starts nothing before the first call. Concurrent calls run one at a time.
+    The client sends nothing and starts nothing before the first call. Concurrent calls run one at a time.
 
     Args:
         address: `tcp://host` or `ipc://path`, to which the ports are appended; `tcp://host:port` names the RPC port
             itself. `sim://MODEL` starts a simulated server in a child process and stops it on close.
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
-        state_port: State stream, used in live mode. The client uses another port instead of the default if the server
-            announces one.
+        state_port: State stream, used in live mode. If the server announces another port, that port replaces the
+            default.
         ctrl_port: Streaming control.
         info_port: Actuator and camera descriptions.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
             works with a model compiled here.
         local_model: Load the handshake's compiled model into `model` and `data`.
         rcv_timeout_ms: Default deadline of a call in milliseconds; ops that take longer have longer ones.
-        auto_promote_step_mode: Let `discover()` switch the server to `direct` or `puppet` when `step_mode` says so.
+        auto_promote_step_mode: Let `discover()` switch the server to `direct` or `puppet` if `step_mode` names one of
+            them.
         transport: `zmq`, or `shm` on the same host.
-        shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
+        shm_dir: Directory of the shared-memory regions, if it differs from the one that the server names.
         encoding: `msgpack`, or `json` to make traffic readable while debugging.
-        server_key: Public key of a server that uses CURVE: a file, or its 40 characters. On other machines than this
-            one the environment variable `URLAB_SERVER_KEY` may name the file instead.
-        client_key: File with the client's own secret key, for servers that know their clients; likewise
-            `URLAB_CLIENT_KEY`. None makes up a key.
-        trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
-            the model is compiled here from XML, in a child process with limits.
-        live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
-            server and network those that nobody looks at; `frames()` is received all the same.
-        claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
-            those who look on, and for those who say `articulation.claim()`.
-        keep_session: After the first `discover()`, discover again by itself when the server has been restarted or play
-            has been started by somebody else; `events()` tells of it. A session that another client has taken over is
-            never taken back, and while a step or reset is in doubt, `resync()` comes first.
-        read_only: Look on beside the client that drives: the client opens no session, so that it takes the server over
-            from nobody, and refuses everything that would need one with `ReadOnlyClient`. `discover(handshake=…)` says
-            what there is; state, pictures and events come by the streams. For `transport="zmq"`.
-        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
-            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
-            what it raises is logged and changes nothing.
+        server_key: Public key of a server that uses CURVE: a file, or the 40 characters of the key. For a server on
+            another machine, the environment variable `URLAB_SERVER_KEY` can name the file instead.
+        client_key: File with the client's own secret key, for servers that authenticate clients. The environment
+            variable `URLAB_CLIENT_KEY` can name it instead. None generates a key.
+        trust_server: Load the binary model of a server that is neither on this machine nor authenticated by its key.
+            If False, the client compiles the model of such a server from XML, in a child process with limits.
+        live_pictures: Receive the pictures of all cameras automatically in live mode, for `latest_frame`. False saves
+            the server and the network this load; `frames()` still receives pictures.
+        claim_control: Take control of a robot with the first write to it, on servers where a robot has one owner. False
+            is for clients that only watch, and for those that call `articulation.claim()`.
+        keep_session: After the first `discover()`, discover again automatically after the server has restarted or play
+            has been started by another client or in the editor; `events()` reports it. The client never takes back a
+            session that another client has taken over. While the outcome of a step or reset is unknown, it waits for
+            `resync()`.
+        read_only: Watch a server that another client drives. The client opens no session, so it takes the server over
+            from no other client. Calls that need a session raise `ReadOnlyClient`. `discover(handshake=…)` describes
+            the scene; streams deliver state, pictures and events. Requires `transport="zmq"`.
+        observe: Callback invoked with a `CallRecord` after each request, successful or not: op, bytes, time in the
+            queue, round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the
+            client. The client logs exceptions that it raises and carries on.
 
     Raises:
         TypeError: `observe` is not a plain function.
@@ -165,8 +167,10 @@ class URLabClient(ClientState):
         if shm_dir is not None and Transport(transport) is not Transport.SHM:
             raise ValueError("shm_dir is for transport='shm'")
         alone = address.startswith("sim:") or config.transport is Transport.SHM
-        if read_only and (alone or config.step_mode not in _LOOKING_ON):
-            raise ValueError("read_only is for a server that another client drives, over transport='zmq', in no mode")
+        if read_only and (alone or config.step_mode not in _READ_ONLY_MODES):
+            raise ValueError(
+                "read_only needs transport='zmq', the address of a running server, and step_mode 'auto' or 'live'"
+            )
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
@@ -192,7 +196,7 @@ class URLabClient(ClientState):
         self._motion = Motion(
             self,
             driven=lambda: any(record.driven for record in self._state.objects.records.values()),
-            patience=rcv_timeout_ms / 1000,
+            stall_timeout=rcv_timeout_ms / 1000,
             session=session,
         )
         state = SimState(
@@ -230,7 +234,7 @@ class URLabClient(ClientState):
 
     @property
     def sim(self) -> SimNamespace:
-        """Starting and stopping play."""
+        """Start and stop play."""
         return self._sim
 
     @property
@@ -240,7 +244,7 @@ class URLabClient(ClientState):
 
     @property
     def outliner(self) -> OutlinerNamespace:
-        """Looking at the world."""
+        """Inspect the world."""
         return self._outliner
 
     @property
@@ -255,17 +259,17 @@ class URLabClient(ClientState):
 
     @property
     def farm(self) -> FarmNamespace:
-        """Sharing servers among clients."""
+        """Share servers among clients."""
         return self._farm
 
     @property
     def recording(self) -> RecordingNamespace:
-        """Recording joint states."""
+        """Record joint states."""
         return self._recording
 
     @property
     def replay(self) -> ReplayNamespace:
-        """Playing recordings back."""
+        """Play recordings back."""
         return self._replay
 
     # Operations
@@ -279,18 +283,19 @@ class URLabClient(ClientState):
     ) -> None:
         """Open a session, load the model, and build the wrappers of articulations, entities and cameras.
 
-        Safe to repeat: wrappers that still exist go on working. Takes the server over from any other client.
+        Safe to repeat: wrappers of objects that still exist stay valid. Takes the server over from any other client.
 
         Args:
             observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
                 actuator forces).
-            handshake: For a client with `read_only=True`, and for no other: what `handshake()` of the client that
-                drives returns. Call this again with the new one after each start of play.
+            handshake: Return value of `handshake()` of the client that drives the server. Required with
+                `read_only=True`, not allowed otherwise. Call `discover()` again with the new one after each start of
+                play.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ValueError: A handshake is given to a client that is not read-only, or it is none.
-            ReadOnlyClient: The client is read-only, and no handshake is given.
+            ValueError: The handshake is invalid, or the client is not read-only and takes none.
+            ReadOnlyClient: The client is read-only and no handshake is given.
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
             URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
@@ -325,27 +330,27 @@ class URLabClient(ClientState):
         Args:
             n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. Where the server cannot render for a step, the step waits up to 3 s per camera for
-                its picture in the camera's stream. A `sync` picture that is older than the step is omitted from the
-                reply, like one that did not arrive. Ignored in live mode by servers that draw in the other modes only.
-            observations: Level of this reply alone; default the level of the session.
+                step) or `latest`. If the server cannot render for a step, the step waits up to 3 s per camera for its
+                picture in the camera's stream. A `sync` picture that is older than the step is omitted from the reply,
+                like one that did not arrive. Servers that do not render for steps in live mode ignore this there.
+            observations: Level of this reply only; by default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            The state, which articulations, entities, cameras and `data` have already adopted.
+            The new state, which articulations, entities, cameras and `data` already show.
 
         Raises:
-            StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
-            OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
+            StepTimeout: The server did not finish within its limit of 5 s; the steps are still queued there.
+            OutcomeUnknown: The connection broke; the steps may or may not have been executed. `resync()` finds out.
             ValueError: Fewer steps than the mode allows; nothing was sent.
             KeyError: Unknown camera; nothing was sent.
             ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
-            NoSession: `discover()` was not called, or was broken off; nothing was sent.
+            NoSession: `discover()` was not called or did not finish; nothing was sent.
         """
         n_steps = integer("step: n_steps", n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if observations is SESSION_LEVEL else ObservationLevel(observations)
         turn = self._session.turn(Step, timeout=timeout)
-        if not turn.begin_at_once():  # which `async with` would take three coroutines for
+        if not turn.begin_nowait():  # saves the three coroutines of `async with`
             await turn.begin()
         try:
             return await take_steps(self._state, turn, n_steps, include_cameras, level)
@@ -360,20 +365,21 @@ class URLabClient(ClientState):
         *,
         timeout: Timeout = DEFAULT,
     ) -> ResetOk:
-        """Reset the simulation and take over the state. Set-points stay.
+        """Reset the simulation and adopt the new state. Set-points keep their values.
 
         Args:
-            keyframe_name: Keyframe to reset to. The short name is enough where one articulation has it.
-            seed: Remembered by the server. On a simulated server that varies its scene it decides on the episode's
-                numbers; else it has no effect on MuJoCo.
-            per_articulation_qpos: Articulation key to joint name to the first component of its position.
+            keyframe_name: Keyframe to reset to. The short name is enough if only one articulation has it.
+            seed: Seed that the server stores. On a simulated server that randomises its scene, it determines the
+                episode's random values; otherwise it has no effect on the physics.
+            per_articulation_qpos: Joint positions: articulation key to joint name to the first component of the
+                position.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
             The state, with `step` 0.
 
         Raises:
-            UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
+            UnknownKeyframe: No keyframe or more than one has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
             TypeError: A position is not a number; nothing was sent.
             ValueError: A position is NaN or infinite; nothing was sent.
@@ -384,35 +390,35 @@ class URLabClient(ClientState):
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
         """Find out what happened to steps, resets and mode changes whose replies were lost, and continue from there.
 
-        Call it after `OutcomeUnknown`, after `URLabTimeoutError` of a step, or after a step was cancelled. Asks
-        the server for its step counter and time without stepping it, updates the state, and opens a new session
-        when the old one is gone, or when a lost request may still be on its way: it is then refused when it arrives.
-        No step and no reset is sent a second time; whether to repeat them is the caller's decision.
+        Call it after `OutcomeUnknown`, after a step raised `URLabTimeoutError`, or after a step was cancelled. It
+        queries the server's step counter and time without stepping, and updates the state. It opens a new session if
+        the old one is gone, or if a lost request may still be in transit, so that the server refuses that request when
+        it arrives. It never sends a step or reset again; whether to repeat them is the caller's decision.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            What was found; if nothing was in doubt, only the state of the simulation.
+            The findings; only the state of the simulation if no outcome was unknown.
 
         Raises:
-            URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
+            URLabConnectionError: The server is not reachable yet. Call `resync()` again later.
         """
         return await resync(self._state, self._discovery, timeout=timeout)
 
     async def run_for(self, seconds: float) -> float:
-        """Let simulation time pass: step in `direct` and `puppet`, in `live` hand set-points over and watch.
+        """Let simulation time pass: step in `direct` and `puppet`; send set-points and wait in `live`.
 
         Args:
-            seconds: Simulation time, seconds; rounded to whole physics steps where the client steps.
+            seconds: Simulation time, seconds; rounded to whole physics steps in `direct` and `puppet`.
 
         Returns:
             Simulation time that passed, seconds.
 
         Raises:
-            URLabTimeoutError: In live mode, simulation time stands still, for example while paused; the message says
-                why.
-            ValueError: Negative, NaN or infinite; nothing was sent.
+            URLabTimeoutError: Simulation time does not advance in live mode, for example while paused; the message
+                gives the reason.
+            ValueError: `seconds` is negative, NaN or infinite; nothing was sent.
         """
         return await self._motion.run_for(seconds)
 
@@ -420,16 +426,16 @@ class URLabClient(ClientState):
         """Let simulation time pass, as `run_for` does, until a condition is true.
 
         Args:
-            predicate: The condition. Called before the first step, and then at least every 10 ms of simulation time,
-                in live mode with each snapshot; it reads the client's state and must return at once.
+            predicate: The condition, which reads the client's state and must return quickly. It is called before the
+                first step and then at least every 10 ms of simulation time; in live mode, after each snapshot.
             timeout: Seconds of simulation time after which to give up.
 
         Returns:
             Simulation time that passed, seconds.
 
         Raises:
-            URLabTimeoutError: The condition was not true within that time, or simulation time stands still; the message
-                contains what `explain()` found.
+            URLabTimeoutError: The condition did not become true in time, or simulation time does not advance; the
+                message contains the findings of `explain()`.
             TypeError: The predicate returns an awaitable.
         """
         return await self._motion.wait_until(predicate, timeout)
@@ -439,32 +445,32 @@ class URLabClient(ClientState):
     ) -> dict[str, CameraSample]:
         """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
 
-        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+        In `direct` and `puppet` mode, and while paused, all pictures show the same moment.
 
         Args:
-            cameras: Names, as `camera()` takes them; None for all there are.
-            timeout: Seconds to wait for all of them together; None waits without limit.
+            cameras: Camera names as for `camera()`; None for all cameras.
+            timeout: Seconds to wait for all pictures together; None waits without limit.
 
         Returns:
-            The pictures by the names given.
+            The pictures, keyed by the given names.
 
         Raises:
-            KeyError: There is no such camera, or there are several; nothing was sent.
-            TypeError: `cameras` is a name by itself.
-            PictureTimeout: Some came not in time; `.cameras` names them.
-            NoActiveManager: No play session runs.
-            ModeLocked: The project pins a mode in which pictures come with steps only.
+            KeyError: No camera or more than one has this name; nothing was sent.
+            TypeError: `cameras` is a single string or not iterable.
+            PictureTimeout: Some pictures did not arrive in time; `.cameras` names their cameras.
+            NoActiveManager: No play session is running.
+            ModeLocked: The project is locked to a mode that delivers pictures only with steps.
         """
         objects = self._state.objects
         if isinstance(cameras, str):
-            raise TypeError(f"capture takes several names; one: client.camera({cameras!r}).capture()")
+            raise TypeError(f"capture takes a list of names; for one camera call client.camera({cameras!r}).capture()")
         if cameras is None:
             names = {shown: name for name, shown in objects.shown_cameras(objects.camera_names()).items()}
         else:
             try:
                 names = {name: name for name in cameras}
             except TypeError:
-                raise TypeError(f"capture takes names of cameras, got {cameras!r:.80}.") from None
+                raise TypeError(f"capture takes camera names, got {cameras!r:.80}.") from None
         views = [self.camera(name) for name in names.values()]
         samples = await self._publishers.capture(views, timeout) if views else []
         return dict(zip(names, samples, strict=True))
@@ -478,24 +484,25 @@ class URLabClient(ClientState):
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
     ) -> Stream[StateSnapshot]:
-        """Stream the snapshots that the server publishes while play runs.
+        """Stream the snapshots that the server publishes during play.
 
-        One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
-        second in `puppet`. Works alongside all other calls, and costs the server nothing. If a server publishes only
-        in live mode, as the beta does, the stream has one snapshot for each of this client's own steps in the other
-        modes.
+        The server publishes one snapshot per physics tick in live mode, paused or not; one per step, and ten per second
+        between steps, in `direct`; ten per second in `puppet`. The stream does not block other calls and adds no load
+        to the server. If a server publishes only in live mode, as the beta does, the stream has one snapshot for each
+        of this client's own steps in the other modes.
 
         Args:
-            policy: `latest`, or `all` within the buffer.
-            max_rate: With `latest`, snapshots per second at most, each the newest by then. The rate does not drift: an
-                item that is taken late does not delay those after it. None for as many as come.
-            buffer: Snapshots that may wait, with `all`.
-            buffer_bytes: Bytes that may wait, with `all`.
-            timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
-                without limit; None waits.
+            policy: `latest`, or `all` within the limits of the buffer.
+            max_rate: Maximum number of snapshots per second, with `latest`; each is the newest at its time. The rate
+                does not drift: an item that is read late does not delay those after it. None for no limit.
+            buffer: Maximum number of buffered snapshots, with `all`.
+            buffer_bytes: Maximum number of buffered bytes, with `all`.
+            timeout: Seconds that iteration waits for each snapshot. The default is the client's timeout for the first
+                one and no limit after that. None waits without limit.
 
         Raises:
-            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
+            ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
+                policy than `latest`.
         """
         return Stream(
             self._publishers.state(policy),
@@ -520,35 +527,34 @@ class URLabClient(ClientState):
     ) -> Stream[RowSample]:
         """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
 
-        If a server publishes only whole snapshots, as the beta does, the client makes rows from those: in live mode
-        from what the server publishes, in the other modes from the replies to its own steps, with the readings of
-        their level. Accelerations are then NaN.
+        If a server publishes only whole snapshots, as the beta does, the client derives the rows from snapshots: in
+        live mode from the published ones, in the other modes from the replies to its own steps, with the readings of
+        their observation level. Accelerations are then NaN.
 
         Args:
-            articulation: Key of the articulation; None for all there are, and the plain entities.
-            kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; of entities `xpos`, `xquat`, `qpos`, `qvel`.
-                Empty for all of them, or with `components` for those that have one.
+            articulation: Key of the articulation; None for all articulations and the plain entities.
+            kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; for entities `xpos`, `xquat`, `qpos`, `qvel`.
+                Empty for all kinds, or, with `components`, for the kinds that have components.
             components: Component names; empty for all.
-            policy: `latest_per_key` keeps the newest row of each joint and so on; `latest`; `all` within the buffer.
-            buffer: Rows that may wait.
-            buffer_bytes: Bytes that may wait.
-            timeout: Seconds that iterating waits for each row; by default the client's for the first one and then
-                without limit; None waits.
+            policy: `latest_per_key` keeps the newest row of each joint, sensor or base; `latest` keeps the newest row
+                of all; `all` keeps every row within the limits of the buffer.
+            buffer: Maximum number of buffered rows.
+            buffer_bytes: Maximum number of buffered bytes.
+            timeout: Seconds that iteration waits for each row. The default is the client's timeout for the first one
+                and no limit after that. None waits without limit.
 
         Raises:
-            KeyError: Unknown articulation.
-            ValueError: Unknown kind or policy, or an empty buffer.
-            URLabError: `discover()` was not called yet. Or rows have to be made of snapshots, and without a local model
-                joints are not known.
+            KeyError: The articulation is unknown.
+            ValueError: A kind or the policy is unknown, or the buffer is empty.
+            URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
+                model.
         """
         if self._state.hello is None:
-            raise URLabError(
-                "row_stream: which articulations there are is not known yet.", hint="Call discover() first."
-            )
+            raise URLabError("row_stream: the articulations are not known yet.", hint="Call discover() first.")
         if not self._session.features.publishes_rows and self.articulations and self.model is None:
             raise URLabError(
-                "row_stream: this server publishes no rows; only with a local model can they be made of snapshots.",
-                hint="Make the client with local_model=True, or use state_stream().",
+                "row_stream: this server publishes no rows, and deriving them from snapshots requires a local model.",
+                hint="Create the client with local_model=True, or use state_stream().",
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
         return Stream(
@@ -565,43 +571,45 @@ class URLabClient(ClientState):
     def events(
         self, *, kinds: Collection[str | type[ClientEvent]] = (), buffer: int = BUFFER_ITEMS
     ) -> Stream[ClientEvent]:
-        """Stream what happens to the connection, the session and play, from this call on.
+        """Stream events of the connection, the session and play, from this call on.
 
         Args:
-            kinds: Which events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
+            kinds: Kinds of events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
                 `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
-            buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
+            buffer: Maximum number of buffered events. Beyond it the oldest are dropped; `dropped` of the next event
+                counts them.
 
         Raises:
             ClientClosed: The client was closed.
-            ValueError: There is no event of such a kind.
-            TypeError: `kinds` is a name by itself.
+            ValueError: A kind is unknown.
+            TypeError: `kinds` is a single string.
         """
         return self._publishers.events.stream(kinds, buffer)
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
-        """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.
+        """Send any request of `urlab_client.protocol.messages` and return its reply, without updating client state.
 
         Raises:
-            URLabRPCError: The server refused.
+            URLabRPCError: The server refused the request.
         """
         return await self._session.call(request, timeout=timeout)
 
     async def explain(self) -> Diagnosis:
         """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
 
-        Takes at most a few seconds, does not raise for problems that it finds, and changes nothing on the server.
+        Takes a few seconds at most, returns the problems that it finds rather than raising, and changes nothing on the
+        server.
         """
         config = structs.replace(self._config, state_port=self._state_port())
         return await diagnose(config, self._session, self._state)
 
     async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
-        """List the ops that the server offers; needs no session."""
+        """List the ops that the server offers. Needs no session."""
         reply: MetaOk = await self._session.call(MetaRequest(), timeout=timeout)
         return reply.ops
 
     async def close(self) -> None:
-        """Take back a step mode that `discover()` promoted, and close the connection. Idempotent."""
+        """Revert the step mode that `discover()` promoted, and close the connection. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -614,9 +622,9 @@ class URLabClient(ClientState):
             await self._session.control.aclose(connected=playing)
             await self._keeper.aclose()
             await self._watch.aclose()
-            await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
+            await asyncio.sleep(0)  # lets a blocking client notice that the server has gone in the meantime
             if promoted_from is not None and self.connected and self.manager_present:
-                with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
+                with contextlib.suppress(URLabError):  # best effort: play may have ended
                     async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
                         await ask_mode(self._state, turn, promoted_from)
         finally:
@@ -637,13 +645,15 @@ class URLabClient(ClientState):
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
-            "URLabClient cannot be pickled: it belongs to a connection of this process. "
-            "Send client.config, and make a client from it: URLabClient(**config.options())."
+            "URLabClient cannot be pickled: its connection belongs to this process. "
+            "Send client.config and create a client from it: URLabClient(**config.options())."
         )
 
     def _state_port(self) -> int:
         hello = self._state.hello
-        told = None if hello is None or hello.instance is None else hello.instance.state_port
-        # What the user has chosen goes before what the server says: there may be a tunnel between.
+        announced = None if hello is None or hello.instance is None else hello.instance.state_port
+        # The user's choice takes precedence over the server's announcement: there may be a tunnel in between.
         chosen = self._config.state_port
-        return self._transport.state_port or (told if told and chosen == ClientConfig().state_port else chosen)
+        if announced and chosen == ClientConfig().state_port:
+            chosen = announced
+        return self._transport.state_port or chosen

@@ -1,4 +1,4 @@
-"""What a client knows without asking: how it was made, the server, the model and the mirrored state."""
+"""Local attributes of a client: its configuration, the server, the model and the mirrored state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["ClientState"]
 
 
 class ClientState:
-    """The attributes of a client; reading them sends nothing and waits for nothing."""
+    """The attributes of a client. Reading them sends nothing and does not block."""
 
     def __init__(self, config: ClientConfig, session: Session, state: SimState) -> None:
         self._config = config
@@ -39,22 +39,22 @@ class ClientState:
 
     @property
     def address(self) -> str:
-        """The address the client was made with."""
+        """The address given to the constructor."""
         return self._config.address
 
     @property
     def config(self) -> ClientConfig:
-        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
+        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
         return self._config
 
     @property
     def connected(self) -> bool:
-        """Whether a server is on the line right now."""
+        """Whether the client is connected to a server at the moment."""
         return self._session.transport.connected
 
     @property
     def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
+        """Counters of requests, replies and connections, and with `transport="shm"` of the path that each took."""
         return self._session.transport.stats
 
     @property
@@ -74,7 +74,7 @@ class ClientState:
 
     @property
     def server(self) -> ServerInfo:
-        """What the server is and can do, as far as its answers have shown."""
+        """The server's versions and features, as far as its replies have shown them."""
         hello = self._state.hello
         return ServerInfo(
             features=self._session.features,
@@ -91,7 +91,7 @@ class ClientState:
 
     @property
     def manager_present(self) -> bool:
-        """Whether a play session runs, as far as this client knows."""
+        """Whether a play session is running, as far as this client knows."""
         return self._state.hello is not None and self._state.hello.manager_present
 
     @property
@@ -108,20 +108,20 @@ class ClientState:
     def data(self) -> MjData | None:
         """Local state that mirrors the server's after each reply, or None without a model.
 
-        Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read
-        after a reply, so read it again after each step; whoever does not read it pays nothing. Forces and contacts are
-        not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
+        Reading this property computes the poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`,
+        …), so read it again after each step. A client that does not read it saves the computation. Forces and contacts
+        are not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
         """
         return self._state.mirror.current_data()
 
     @property
     def model_is_approximate(self) -> bool:
-        """True when the model was compiled here because the server runs another MuJoCo build."""
+        """True if this client compiled the model because the server runs another MuJoCo build."""
         return self._state.mirror.approximate
 
     @property
     def articulations(self) -> NameMap[URLabArticulation]:
-        """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
+        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
         return self._state.objects.articulations
 
     @property
@@ -141,12 +141,12 @@ class ClientState:
 
     @property
     def step_count(self) -> int:
-        """Steps since `discover()` or `reset()`, as the server counts; constant in live mode."""
+        """Steps since `discover()` or `reset()`, as counted by the server; constant in live mode."""
         return self._state.step_count
 
     @property
     def reset_seed(self) -> int | None:
-        """The seed that the last `reset()` gave, which decides what a server varies; None without one."""
+        """Seed of the last `reset()`, which determines what the server randomises; None if it had none."""
         return self._state.reset_seed
 
     @property
@@ -180,9 +180,9 @@ class ClientState:
         return self._state.recv_wall_time_ns
 
     def describe(self) -> SceneDescription:
-        """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
+        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
 
-        Sends nothing. `to_dict()` and `to_json()` of the result make plain data of it.
+        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
         """
         with self._state.mirror.lock:
             described = [entity.describe() for entity in self.entities.values()]
@@ -199,10 +199,10 @@ class ClientState:
             )
 
     def handshake(self) -> bytes:
-        """Return what a client with `read_only=True` has to know: names, limits, cameras and the model.
+        """Return the names, limits, cameras and the model that a client with `read_only=True` needs.
 
-        For another process or machine, which passes it to its own client's `discover(handshake=…)`. It describes the
-        play session of the last handshake, and does not let anybody into this client's session.
+        Another process or machine passes the result to `discover(handshake=…)` of its own client. It describes the play
+        session of the last handshake and gives no access to this client's session.
 
         Raises:
             NoSession: `discover()` was not called.
@@ -216,10 +216,10 @@ class ClientState:
         return encode_message(shared)
 
     def camera(self, name: str) -> URLabCameraView:
-        """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
 
         Raises:
-            UnknownName: A `KeyError`: there is no such camera, or there are several.
+            UnknownName: No camera or more than one has this name. It is a `KeyError`.
         """
         objects = self._state.objects
         view = objects.camera(name)
@@ -228,19 +228,19 @@ class ClientState:
         return view
 
     def matches(self, snapshot: StateSnapshot) -> bool:
-        """Return whether a published state is of the world that the last handshake described, as far as it shows.
+        """Return whether a published state belongs to the world of the last handshake, as far as its fields show.
 
-        Right after play began anew, a stream may bring states of a world that `discover()` has not been told of.
+        Right after play restarts, a stream may deliver states of a world that `discover()` has not seen yet.
         """
         return self._state.matches(snapshot)
 
     def add_observer(self, observer: ClientObserver) -> None:
-        """Tell `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
+        """Notify `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
         if observer not in self._state.observers:
             self._state.observers = (*self._state.observers, observer)
 
     def remove_observer(self, observer: ClientObserver) -> None:
-        """Tell `observer` nothing more. Idempotent."""
+        """Stop notifying `observer`. Idempotent."""
         self._state.observers = tuple(known for known in self._state.observers if known is not observer)
 
     @property

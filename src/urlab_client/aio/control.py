@@ -1,7 +1,7 @@
-"""Who may write to a robot: claims, on servers where each robot has one owner.
+"""Claims: the right to write to a robot, on servers where each robot has one owner.
 
-For the session, which sends every request that writes to a robot through `Control.send`. A server without claims never
-hears of any.
+The session sends every request that writes to a robot through `Control.send`, which sends no claims to a server
+without them.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ log: logging.Logger = logging.getLogger("urlab_client.control")
 R = TypeVar("R", bound=Reply)
 
 CLAIM_S: Final = 30.0
-"""Seconds without a write after which a claim ends by itself, unless the user says otherwise."""
+"""Default seconds without a write after which a claim expires."""
 
 _RELEASE_S: Final = 1.0
-_RENEWALS: Final = 3  # in the time of one claim
+_RENEWALS: Final = 3  # per lifetime of a claim
 
 
 L_contra = TypeVar("L_contra", contravariant=True)
@@ -43,7 +43,7 @@ L = TypeVar("L")
 
 
 class Asks(Protocol[L_contra]):
-    """Sends one request within the turn of its caller and returns the reply."""
+    """Sends one request within the caller's turn and returns the reply."""
 
     def __call__(self, request: Request[R], limits: L_contra, /) -> Awaitable[R]:
         """See the class."""
@@ -51,7 +51,7 @@ class Asks(Protocol[L_contra]):
 
 
 class ControlledSession(Protocol):
-    """What `Control` needs of a session."""
+    """The part of a session that `Control` needs."""
 
     session_id: str
     features: Features
@@ -61,7 +61,7 @@ class ControlledSession(Protocol):
         ...
 
     async def probe(self, request: Request[R], *, timeout: float) -> R | None:
-        """Send a request if nothing else is under way."""
+        """Send a request if no other is in progress."""
         ...
 
 
@@ -71,7 +71,7 @@ def _owner_of(process: int) -> str:
 
 
 def process_owner() -> str:
-    """Return the name under which this process owns robots: the same for all its clients, and across reconnects."""
+    """Return the owner name of this process: the same for all its clients, and across reconnects."""
     return _owner_of(os.getpid())
 
 
@@ -85,12 +85,12 @@ class Control:
     """The robots that one client owns.
 
     Args:
-        session: What claims are sent over.
+        session: Session that sends the claims.
         wanted: Whether to claim a robot with the first write to it; False leaves that to `claim`.
 
     Attributes:
-        resolve: Returns the key of an articulation that a request names in any way; None for an unknown name.
-        owner: Name in which this client claims.
+        resolve: Returns the key of an articulation for any of its names; None for an unknown name.
+        owner: Owner name of this client's claims.
     """
 
     def __init__(self, session: ControlledSession, *, wanted: bool = True) -> None:
@@ -100,23 +100,23 @@ class Control:
         self._wanted = wanted
         self._held: dict[str, _Claim] = {}
         self._others: dict[str, str] = {}
-        # Owners that are ourselves: a server that does not read `control_owner` calls us by the session of the time.
+        # Owner names that mean this client: a server that ignores `control_owner` uses the id of the current session.
         self._names = {self.owner}
         self._renewal: asyncio.Task[None] | None = None
 
     def owner_of(self, key: str) -> str | None:
-        """Return who owns a robot as far as is known here, None for nobody or for not knowing."""
+        """Return the owner of a robot, or None if it has none or the owner is not known."""
         if key in self._held:
             return self.owner
         return self._others.get(key)
 
     async def send(self, request: ControlRequest[R], ask: Asks[L], limits: L) -> R:
-        """Send a request that writes to robots, claiming them before it where that is needed.
+        """Send a request that writes to robots, and claim them first where necessary.
 
         Args:
             request: The request.
             ask: Sends one request within the caller's turn.
-            limits: The caller's, for `ask`.
+            limits: Time limits, passed to `ask`.
 
         Raises:
             NotControlOwner: Another client owns one of the robots; nothing was written.
@@ -126,54 +126,54 @@ class Control:
         request.control_owner = self.owner
         if isinstance(request, ClaimControl):
             return cast("R", await self._claim(request, ask, limits))
-        for key in self._given_up(request):
-            self._held.pop(key, None)  # else it would be claimed again in a while
+        for key in self._released(request):
+            self._held.pop(key, None)  # otherwise the claim would be renewed
         robots = self._robots(request)
         if self._wanted and robots:
             now = asyncio.get_running_loop().time()
             for key in robots:
                 claim = self._held.get(key)
                 if claim is None or claim.until < now:
-                    await self._claim(self._asked(key), ask, limits)
+                    await self._claim(self._claim_request(key), ask, limits)
         try:
             reply = await ask(request, limits)
         except NotControlOwner as refusal:
             if refusal.owner not in {UNCLAIMED, *self._names} or not self._wanted or not robots:
                 raise self._refused(robots, refusal) from None
-            # The claim ran out, play was started anew, or it was made in a session that is gone. Nothing was written,
-            # so once more is not twice.
+            # The claim expired, play was restarted, or the claim belonged to an earlier session. Nothing was written,
+            # so the request may be sent again.
             for key in robots:
-                await self._claim(self._asked(key), ask, limits)
+                await self._claim(self._claim_request(key), ask, limits)
             try:
                 reply = await ask(request, limits)
-            except NotControlOwner as again:
-                raise self._refused(robots, again) from None
+            except NotControlOwner as second:
+                raise self._refused(robots, second) from None
         self._note_write(robots)
         return reply
 
     async def claim(self, key: str, *, force: bool, ttl: float, timeout: Timeout) -> None:
-        """Own a robot from now on.
+        """Claim a robot.
 
         Raises:
             ControlClaimed: Another client owns it.
-            ValueError: `ttl` is no length of time.
+            ValueError: `ttl` is negative, NaN or infinite.
         """
         if not 0 <= ttl < math.inf:
-            raise ValueError(f"ttl is a number of seconds of at least 0, got {ttl}")
+            raise ValueError(f"ttl must be at least 0 seconds and finite, got {ttl}")
         if self._session.features.claims:
             await self._session.call(ClaimControl(articulation=key, ttl_s=ttl, force=force), timeout=timeout)
 
     async def release(self, key: str, *, timeout: Timeout) -> None:
-        """Give a robot up, if it is owned."""
+        """Release a robot if this client owns it."""
         if self._held.pop(key, None) is None or not self._session.features.claims:
             return
         try:
             await self._session.call(ReleaseControl(articulation=key), timeout=timeout)
         except NotControlOwner as refusal:
-            self._learn([key], refusal)  # somebody took it, or it ran out: it is not ours, as was wanted
+            self._learn([key], refusal)  # another client took it, or the claim expired: it is released either way
 
     async def aclose(self, *, connected: bool) -> None:
-        """Give up whatever is owned, as far as the server listens. Idempotent."""
+        """Release all owned robots if the server still answers. Idempotent."""
         renewal, self._renewal = self._renewal, None
         if renewal is not None:
             renewal.cancel()
@@ -182,12 +182,12 @@ class Control:
         for key in held if connected else ():
             try:
                 await self._session.call(ReleaseControl(articulation=key, control_owner=self.owner), timeout=_RELEASE_S)
-            except URLabError as error:  # a courtesy: the server may have moved on
+            except URLabError as error:  # best effort: the claims expire anyway
                 log.debug("%s could not be released: %s", key, error)
                 break
 
     def forget(self) -> None:
-        """Note that play ended, and every claim with it."""
+        """Drop all claims, because play has ended."""
         self._held.clear()
         self._others.clear()
 
@@ -207,13 +207,13 @@ class Control:
             case _:
                 return []
 
-    def _given_up(self, request: ControlRequest[Reply]) -> list[str]:
+    def _released(self, request: ControlRequest[Reply]) -> list[str]:
         return self._known([request.articulation]) if isinstance(request, ReleaseControl) else []
 
     def _known(self, names: Iterable[str]) -> list[str]:
         return [key for name in names if (key := self.resolve(name)) is not None]
 
-    def _asked(self, key: str) -> ClaimControl:
+    def _claim_request(self, key: str) -> ClaimControl:
         claim = self._held.pop(key, None)
         ttl = CLAIM_S if claim is None else claim.ttl
         return ClaimControl(articulation=key, ttl_s=ttl, control_owner=self.owner)
@@ -225,7 +225,7 @@ class Control:
         except ControlClaimed as refusal:
             if request.force or refusal.owner not in self._names:
                 raise self._refused([key], refusal) from None
-            # Our own, from a session that is gone: nobody else is robbed.
+            # The owner is this client in an earlier session, so forcing takes the robot from no other client.
             request.force = True
             reply = await ask(request, limits)
         self._note_claim(key, request.ttl_s, reply)
@@ -252,18 +252,18 @@ class Control:
     def _refused(self, robots: Sequence[str], refusal: NotControlOwner) -> NotControlOwner:
         self._learn(robots, refusal)
         if refusal.owner == UNCLAIMED:
-            refusal.hint = "Call articulation.claim() first, or make the client with claim_control=True."
+            refusal.hint = "Call articulation.claim() first, or create the client with claim_control=True."
         return refusal
 
     def _learn(self, robots: Sequence[str], refusal: NotControlOwner) -> None:
-        """Note that these robots are not all ours; of several, the server does not say which one is not."""
+        """Note that this client does not own all of these robots; the server does not name the ones it does not own."""
         for key in robots:
             self._held.pop(key, None)
         if len(robots) == 1 and refusal.owner not in {"", UNCLAIMED}:
             self._others[robots[0]] = refusal.owner
 
     async def _renew(self) -> None:
-        """Claim again what is owned and has not been written to for a while, as long as anything is."""
+        """Renew the claims of robots that have had no recent write, until no claim is left."""
         loop = asyncio.get_running_loop()
         while timed := {key: claim for key, claim in self._held.items() if claim.ttl > 0}:
             await asyncio.sleep(min(claim.ttl for claim in timed.values()) / _RENEWALS)
@@ -276,6 +276,6 @@ class Control:
         try:
             await self._session.probe(request, timeout=claim.ttl / _RENEWALS)
         except NotControlOwner as refusal:
-            log.warning("%s is controlled by %s now", key, refusal.owner)
+            log.warning("%s is now controlled by %s", key, refusal.owner)
         except URLabError as error:
             log.debug("the claim of %s could not be renewed: %s", key, error)

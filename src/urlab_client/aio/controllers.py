@@ -31,17 +31,17 @@ class URLabController:
 
     @property
     def articulation_prefix(self) -> str:
-        """Key of the articulation it drives."""
+        """Key of the articulation that it drives."""
         return self._prefix
 
     @property
     def kind(self) -> ControllerKind | str:
-        """`pd`, `passthrough`, or what a newer server calls it."""
+        """`pd`, `passthrough`, or a plain string for a kind that this client does not know."""
         return known(ControllerKind, self._info.kind)
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """Parameters as the server acknowledged them last; a read-only view that stays current."""
+        """Parameters that the server acknowledged last; a read-only view that stays current."""
         return MappingProxyType(self._info.params)
 
     @property
@@ -50,11 +50,11 @@ class URLabController:
         return MappingProxyType(self._info.schema)
 
     async def configure(self, *, timeout: Timeout = DEFAULT, **params: Any) -> dict[str, Any]:
-        """Check parameters against the schema, push them, and return all that are in force now.
+        """Check parameters against the schema, push them, and return all parameters in force.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-            **params: Parameters to change; a mapping patches the actuators it names.
+            **params: Parameters to change; a mapping changes only the actuators that it names.
 
         Raises:
             ControllerSchemaViolation: A parameter does not fit the schema; nothing was sent.
@@ -108,7 +108,7 @@ class URLabPDController(URLabController):
         *,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, Any]:
-        """Change gains of the actuators named; the others keep theirs. Return all parameters in force.
+        """Change gains of the named actuators and return all parameters in force. Others keep their gains.
 
         Raises:
             ControllerSchemaViolation: An unknown actuator or a value below the minimum; nothing was sent.
@@ -124,7 +124,7 @@ class URLabPDController(URLabController):
         *,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, Any]:
-        """Change the default gains and bind every actuator to them. Return all parameters in force.
+        """Change the default gains, apply them to every actuator, and return all parameters in force.
 
         Raises:
             ControllerSchemaViolation: A value is below the minimum; nothing was sent.
@@ -134,13 +134,13 @@ class URLabPDController(URLabController):
         for name, value in given.items():
             if value is not None:
                 params[f"default_{name}"] = value
-                # The server changes the default only; actuators keep the gains they were bound with.
+                # The server changes only the default; actuators keep the gains that they were bound with.
                 params[name] = dict.fromkeys(self._info.params.get(name, {}), value)
         return await self.configure(timeout=timeout, **params)
 
 
 class _View(Mapping[str, float]):
-    """Live view on one per-actuator parameter."""
+    """Live view of one per-actuator parameter."""
 
     __slots__ = ("_name", "_params")
 
@@ -162,28 +162,32 @@ class _View(Mapping[str, float]):
 
 
 def make_controller(session: Session, prefix: str, info: ControllerInfo) -> URLabController:
-    """Return the wrapper for a handshake's controller block; it follows the block."""
+    """Return the wrapper for a handshake's controller block, which it reflects."""
     return (URLabPDController if info.kind == ControllerKind.PD else URLabController)(session, prefix, info)
 
 
 def check_controller(prefix: str, info: ControllerInfo) -> None:
-    """Check what a handshake says of a controller.
+    """Check a handshake's controller block.
 
     Raises:
-        ProtocolError: Gains of a PD controller are not numbers by actuator, or a least value is not a number.
+        ProtocolError: Gains of a PD controller are not numbers by actuator, or a minimum is not a number.
     """
     _check_gains(prefix, info.kind, info.params, "hello")
     for name, rule in info.schema.items():
         low = rule.get("min")
         if low is not None and not _is_number(low):
-            raise ProtocolError(f"hello: {low!r} as the least {name} of the controller of {prefix!r}.", op="hello")
+            raise ProtocolError(
+                f"hello: the minimum of {name} of the controller of {prefix!r} is {low!r}, not a number.", op="hello"
+            )
 
 
 def _check_gains(prefix: str, kind: str, params: Mapping[str, Any], op: str) -> None:
     for name in _GAINS if kind == ControllerKind.PD else ():
         gains = params.get(name, {})
         if not (isinstance(gains, dict) and all(map(_is_number, cast("dict[str, Any]", gains).values()))):
-            raise ProtocolError(f"{op}: {name} of the controller of {prefix!r} is {gains!r:.60}.", op=op)
+            raise ProtocolError(
+                f"{op}: {name} of the controller of {prefix!r} is {gains!r:.60}, not numbers by actuator.", op=op
+            )
 
 
 def _is_number(value: object) -> bool:
@@ -196,19 +200,19 @@ def _check_params(
     """Refuse parameters that do not fit the schema; the plugin would ignore them silently.
 
     Raises:
-        ControllerSchemaViolation: With what is wrong and what would be right.
+        ControllerSchemaViolation: A parameter does not fit the schema.
     """
     for name, value in params.items():
         rule = schema.get(name)
         if rule is None:
-            raise _violation(prefix, f"no parameter is called {name!r}; it has: {', '.join(schema) or 'none'}")
+            raise _violation(prefix, f"no parameter is called {name!r}; available: {', '.join(schema) or 'none'}")
         if rule.get("type") == "per_joint":
             if not isinstance(value, Mapping):
                 raise _violation(prefix, f"{name} takes a mapping of actuator name to number, got {value!r}")
             for actuator, number in cast("Mapping[str, Any]", value).items():
                 if actuator not in current.get(name, {}):
                     raise _violation(
-                        prefix, f"{name}: no actuator {actuator!r}; it drives: {', '.join(current.get(name, {}))}"
+                        prefix, f"{name}: no actuator {actuator!r}; available: {', '.join(current.get(name, {}))}"
                     )
                 _check_number(prefix, f"{name}[{actuator!r}]", number, rule)
         else:

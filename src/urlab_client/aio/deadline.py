@@ -1,4 +1,4 @@
-"""How long a call may take: the `timeout` parameter that every op shares."""
+"""The `timeout` parameter of every op."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Default(enum.Enum):
 
 
 DEFAULT: Final = Default.DEFAULT
-"""Leave the deadline to the op and the client."""
+"""Use the default timeout of the op or the client."""
 
 Timeout: TypeAlias = float | Literal[Default.DEFAULT] | None
-"""Seconds for queueing, sending and the reply together; None waits without limit."""
+"""Seconds for queueing, sending and receiving the reply together; None waits without limit."""

@@ -1,4 +1,4 @@
-"""The event loop that asynchronous objects live on: asyncio's, and the same one for all their life."""
+"""Checks that an asynchronous object runs on asyncio, and always on the same event loop."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["running_loop"]
 def running_loop(
     bound: asyncio.AbstractEventLoop | None = None, owner: str = "This client"
 ) -> asyncio.AbstractEventLoop:
-    """Return the event loop that runs here.
+    """Return the running event loop.
 
     Args:
-        bound: The one that the caller has been used on before; None before its first use.
-        owner: What to call the caller.
+        bound: The loop that the caller has been used on; None before its first use.
+        owner: Name of the caller for the error message.
 
     Raises:
-        URLabError: None of asyncio's runs here, or it is another one.
+        URLabError: No asyncio event loop is running, or another one than `bound`.
     """
     loop = asyncio._get_running_loop()  # noqa: SLF001  # unlike get_running_loop, never raises
     if loop is None:
-        here = "this code runs on trio" if _on_trio() else "no event loop runs here"
+        here = "this code runs on trio" if _on_trio() else "no event loop is running"
         raise URLabError(
             f"The async client runs on asyncio's event loop, but {here}.",
             hint="Run it with asyncio.run() or anyio's asyncio backend. Elsewhere use the blocking client: under trio, "
@@ -33,7 +33,7 @@ def running_loop(
         )
     if bound is not None and bound is not loop:
         raise URLabError(
-            f"{owner} belongs to another event loop.", hint="Make one per loop, or use the blocking client."
+            f"{owner} belongs to another event loop.", hint="Create one per loop, or use the blocking client."
         )
     return loop
 

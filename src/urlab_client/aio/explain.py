@@ -1,7 +1,8 @@
 """`client.explain()`: why is my robot not moving?
 
-Looks from the outside in, from sockets to set-points, and says what it sees in sentences. Changes nothing on the
-server: what the wire cannot tell without a change (the step mode, the control source) is what this client knows.
+The checks go from the outside in, from sockets to set-points, and report findings as sentences. They change nothing on
+the server. Values that the wire cannot report without a change (step mode, control source) are those that this client
+knows.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from urlab_client.protocol.messages.sim import PieStatus
 __all__ = ["diagnose", "watched"]
 
 _CONNECT_S = 2.0
-_LOOKS = 5
-_LOOK_S = 0.05
+_POLLS = 5
+_POLL_S = 0.05
 _LISTED = 8
 
 
@@ -40,13 +41,13 @@ S = TypeVar("S", bound=_Status)
 
 
 async def watched(look: Callable[[], Awaitable[S]], first: S) -> S:
-    """Look at play again until simulation time has passed, or it seems to stand still, and return the last look.
+    """Poll the state of play until simulation time has advanced or seems to stand still; return the last state.
 
-    What counts is looks, not seconds: a server that has to wait for its processor is late with its answers, too.
+    The limit counts polls, not seconds, because a server that waits for its processor also answers late.
     """
     last = first
-    for _ in range(_LOOKS):
-        await asyncio.sleep(_LOOK_S)
+    for _ in range(_POLLS):
+        await asyncio.sleep(_POLL_S)
         last = await look()
         if last.sim_time != first.sim_time:
             break
@@ -72,7 +73,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
         Verdict.OK, "server", f"It answers in {1e3 * (loop.time() - before):.1f} ms and offers {len(ops)} ops."
     )
     if config.read_only:
-        text = "This client is read-only. What keeps robots from moving, the client that drives can find out."
+        text = "This client is read-only. Call explain() of the client that drives to find out why robots do not move."
         yield Finding(Verdict.NOTE, "session", text)
         return
     hello = state.hello
@@ -97,7 +98,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
 
 
 def _cameras(session: Session, state: SimState) -> Iterator[Finding]:
-    """Look at which cameras stream, on a server where they are off at first."""
+    """Check which cameras stream, on a server where they are off by default."""
     switch = state.publishers.camera_switch
     if switch is None or not session.features.camera_switch:
         return
@@ -109,14 +110,14 @@ def _cameras(session: Session, state: SimState) -> Iterator[Finding]:
     ]
     if silent:
         more = f" and {len(silent) - _LISTED} more" if len(silent) > _LISTED else ""
-        text = f"This client has not switched on {', '.join(silent[:_LISTED])}{more}, so that they may stream nothing. "
+        text = f"This client has not switched on {', '.join(silent[:_LISTED])}{more}, so they may not stream. "
         yield Finding(
-            Verdict.NOTE, "cameras", text + "Iterating over their frames() does, and capture() needs no switch."
+            Verdict.NOTE, "cameras", text + "Iterating over frames() switches a camera on; capture() works either way."
         )
 
 
 def _control(config: ClientConfig, session: Session, state: SimState) -> Iterator[Finding]:
-    """Look at who may write to the robots, on a server where each has one owner."""
+    """Check which client may write to the robots, on a server where each robot has one owner."""
     if not session.features.claims:
         return
     for key, record in state.objects.records.items():
@@ -127,10 +128,10 @@ def _control(config: ClientConfig, session: Session, state: SimState) -> Iterato
             text = f"{owner!r} controls it, so writes to it are refused. articulation.claim(force=True) takes it over."
             yield Finding(Verdict.PROBLEM, key, text)
         elif record.driven and not config.claim_control:
-            text = "Nobody controls it, as far as this client knows, so writes to it are refused. "
+            text = "No client controls it, as far as this client knows, so writes to it are refused. "
             yield Finding(Verdict.PROBLEM, key, text + "Call articulation.claim(), or leave claim_control on.")
         else:
-            yield Finding(Verdict.NOTE, key, "This client does not control it yet: the first write claims it.")
+            yield Finding(Verdict.NOTE, key, "This client does not control it yet. The first write claims it.")
 
 
 async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator[Finding]:
@@ -165,7 +166,7 @@ async def _connect(host: str, port: int) -> str | None:
 def _reason(error: OSError) -> str:
     if isinstance(error, ConnectionRefusedError):
         return "Connection refused"
-    # The Proactor loop's errors have numbers of Windows' own; `errno` is then EINVAL, and only the text is right.
+    # Errors of the Proactor loop have Windows error numbers; `errno` is then EINVAL, and only the text is right.
     if getattr(error, "winerror", None) is not None:
         return error.strerror or str(error)
     return os.strerror(error.errno) if error.errno else str(error)
@@ -173,21 +174,21 @@ def _reason(error: OSError) -> str:
 
 def _versions(state: SimState) -> Finding:
     hello, mirror = state.hello, state.mirror
-    assert hello is not None  # noqa: S101  # the caller looked
+    assert hello is not None  # noqa: S101  # checked by the caller
     server = f"{hello.urlab_version} with MuJoCo {hello.mujoco_version}"
     if mirror.approximate:
         text = f"The server runs {server}; the local model was compiled here and only approximates the server's."
         return Finding(Verdict.NOTE, "versions", text)
     if mirror.model is None:
         return Finding(Verdict.NOTE, "versions", f"The server runs {server}; there is no local model.")
-    return Finding(Verdict.OK, "versions", f"The server runs {server}; the local model is the same build's.")
+    return Finding(Verdict.OK, "versions", f"The server runs {server}; the local model is of the same build.")
 
 
 async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
     try:
         first = await session.call(PieStatus())
         second = await watched(lambda: session.call(PieStatus()), first)
-    except URLabError as error:  # no answer, too: the editor's main thread may be stuck
+    except URLabError as error:  # including no answer: the editor's main thread may be stuck
         if isinstance(error, RPC_ERRORS["unknown_op"]):
             return Finding(Verdict.NOTE, "play", "A packaged build: it does not report its play state."), True
         subject = "session" if isinstance(error, SessionTakenOver) else "play"
@@ -204,7 +205,7 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
         text = f"Physics stands still at {second.sim_time or 0:g} s: it is paused. Call runtime.set_paused(False)."
         return Finding(Verdict.PROBLEM, "play", text), True
     if state.mode is not StepMode.LIVE and runs:
-        text = f"Time passes by itself although this client expects mode {state.mode}: somebody changed the mode. "
+        text = f"Time passes without steps although this client expects mode {state.mode}: the mode was changed. "
         return Finding(Verdict.PROBLEM, "play", text + "Call runtime.set_mode() or discover()."), True
     how = "running" if runs else "waiting for step()"
     return Finding(Verdict.OK, "play", f"Play is ready, physics {how} at {second.sim_time or 0:g} s."), True
@@ -227,15 +228,15 @@ def _physics(session: Session, state: SimState) -> Iterator[Finding]:
 def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
     wanted = config.step_mode
     if wanted is StepMode.AUTO:
-        known = "as long as no step shows otherwise" if state.mode_assumed else "as the server has it"
+        known = "assumed until a step shows otherwise" if state.mode_assumed else "as the server reports"
         yield Finding(Verdict.OK, "step mode", f"{state.mode}, {known}.")
     elif state.mode is wanted:
-        yield Finding(Verdict.OK, "step mode", f"{state.mode}, as asked for.")
+        yield Finding(Verdict.OK, "step mode", f"{state.mode}, as requested.")
     else:
-        text = f"{state.mode} instead of {wanted}. The server may pin it, or runtime.set_mode() changed it."
+        text = f"{state.mode} instead of {wanted}. The project may be locked to it, or runtime.set_mode() changed it."
         yield Finding(Verdict.NOTE, "step mode", text)
     if state.step_count == 0 and state.mode is not StepMode.LIVE:
-        yield Finding(Verdict.NOTE, "steps", "step() was not called since discover(): nothing moves without it.")
+        yield Finding(Verdict.NOTE, "steps", "step() has not been called since discover(). Nothing moves without it.")
 
 
 def _articulations(state: SimState) -> Iterator[Finding]:
@@ -243,7 +244,7 @@ def _articulations(state: SimState) -> Iterator[Finding]:
         yield Finding(Verdict.PROBLEM, "articulations", "The play session has none. Spawn a robot before sim.start().")
     for key, record in state.objects.records.items():
         if not len(record.ctrl):
-            yield Finding(Verdict.NOTE, key, "It has no actuators: it moves by contacts and gravity only.")
+            yield Finding(Verdict.NOTE, key, "It has no actuators, so only contacts and gravity move it.")
             continue
         controlled = record.controller is not None and record.control_mode is ControlMode.UE_CONTROLLER
         if controlled and record.controller is not None:
@@ -256,7 +257,7 @@ def _articulations(state: SimState) -> Iterator[Finding]:
             text = "Its positions are not finite: the simulation has diverged. Call reset(); try a shorter timestep."
             yield Finding(Verdict.PROBLEM, key, text)
         if strange := record.not_finite():
-            text = f"Set-points that are not finite, so that step() refuses them: {', '.join(strange)}."
+            text = f"Set-points are not finite, so step() refuses them: {', '.join(strange)}."
             yield Finding(Verdict.PROBLEM, key, text)
             continue
         if outside := record.out_of_range():
@@ -266,7 +267,7 @@ def _articulations(state: SimState) -> Iterator[Finding]:
             text = "All set-points are 0. Set them with set_ctrl() or ctrl_array before step()."
             yield Finding(Verdict.NOTE, key, text)
         elif not controlled and state.step_count and not np.any(record.applied):
-            text = "Set-points are sent but none is applied: is the control source `ui`? "
+            text = "Set-points are sent but not applied. Is the control source `ui`? "
             yield Finding(Verdict.PROBLEM, key, text + "Call runtime.set_control_source('zmq').")
         else:
             how = f"through its {record.controller.kind} controller" if controlled and record.controller else "directly"

@@ -1,6 +1,6 @@
-"""Editor ops that the server carries out as jobs: waiting for their end, within one deadline.
+"""Editor ops that the server runs as jobs: waiting for their end, within one deadline.
 
-For the session, which comes here when an op is answered by `op_started`.
+The session uses this module when the server answers an op with `op_started`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ log: logging.Logger = logging.getLogger("urlab_client.session")
 R = TypeVar("R", bound=Reply)
 
 OnProgress = Callable[[JobStatus], object]
-"""Told how far a job is, on the client's event loop."""
+"""Callback invoked with the progress of a job, on the client's event loop."""
 
 _FIRST_S: Final = 0.02
 _LONGEST_S: Final = 0.25
 _GROWTH: Final = 1.5
-_LOOK: Final = "What the editor did shows in outliner.list_actors(), list_blueprints() or scene.current_level()."
+_CHECK: Final = "Check what the editor did with outliner.list_actors(), list_blueprints() or scene.current_level()."
 
 
 async def finish(
@@ -47,27 +47,27 @@ async def finish(
     deadline: float | None,
     on_progress: OnProgress | None,
 ) -> R:
-    """Wait for a job's end and return what it delivers, as if that had been the reply to the op.
+    """Wait for a job's end and return its result, as if that had been the reply to the op.
 
-    The server tells the end of a job once. The op is never sent again.
+    The server reports the end of a job once. The op is never sent again.
 
     Args:
         op: The op.
-        reply: Its reply.
-        started: What answered it.
-        poll: Sends one question, to be answered by the deadline.
+        reply: Type of its reply.
+        started: Reply that announced the job.
+        poll: Sends one status request, subject to the deadline.
         deadline: Loop time until which to wait; None for no limit.
-        on_progress: Told of each answer.
+        on_progress: Callback invoked with the status after each poll.
 
     Raises:
-        URLabRPCError: The editor refused, as it could have done at once.
-        OutcomeUnknown: The end of the job was told, and did not arrive.
-        URLabTimeoutError: It has not ended in time; it goes on.
+        URLabRPCError: The editor refused the op; the refusal arrived as the job's result.
+        OutcomeUnknown: The report of the job's end was lost.
+        URLabTimeoutError: The job did not end in time; it keeps running.
     """
     loop = asyncio.get_running_loop()
     began = loop.time()
     job = started.job_id
-    log.debug("%s: the editor does it as %s", op.name, job)
+    log.debug("%s: the editor runs it as %s", op.name, job)
     pause = _FIRST_S
     lost: URLabError | None = None
     try:
@@ -86,7 +86,7 @@ async def finish(
             except OutcomeUnknown as broken:
                 if lost is not None:
                     raise _unknown(op, job) from broken
-                lost = broken  # its answer may have told the end; asking once more shows
+                lost = broken  # the lost reply may have reported the end: the next poll shows
                 continue
             if on_progress is not None:
                 on_progress(
@@ -95,7 +95,7 @@ async def finish(
             if status.state in {"done", "failed"}:
                 return _result(op, reply, status)
     except asyncio.CancelledError as cancelled:
-        cancelled.add_note(f"{op.name}: the editor goes on with {job}; whether it succeeds is not known. {_LOOK}")
+        cancelled.add_note(f"{op.name}: the editor continues {job}; its outcome is not known. {_CHECK}")
         raise
 
 
@@ -103,13 +103,13 @@ def _result(op: Op, reply: type[R], status: OpStatusOk) -> R:
     if status.result is not None:
         return decode_job(op, reply, status.result)
     if status.state == "failed":
-        raise URLabRPCError("", f"{status.job_id} failed, and the editor does not say why.", op=op.name)
+        raise URLabRPCError("", f"{status.job_id} failed, and the editor gave no reason.", op=op.name)
     raise ProtocolError(f"{op.name}: {status.job_id} is done, but its result is missing.", op=op.name)
 
 
 def _overdue(op: Op, job: str, waited: float) -> URLabTimeoutError:
     error = URLabTimeoutError(
-        f"{op.name}: {job} has not ended within {waited:.1f} s. The editor goes on with it.", op=op.name, hint=_LOOK
+        f"{op.name}: {job} did not end within {waited:.1f} s. The editor continues it.", op=op.name, hint=_CHECK
     )
     error.job_id = job
     return error
@@ -117,9 +117,9 @@ def _overdue(op: Op, job: str, waited: float) -> URLabTimeoutError:
 
 def _unknown(op: Op, job: str) -> OutcomeUnknown:
     error = OutcomeUnknown(
-        f"{op.name}: {job} has ended, but the one report of how did not arrive here. It was not sent again.",
+        f"{op.name}: {job} has ended, but the report of its outcome was lost. The op was not sent again.",
         op=op.name,
-        hint=_LOOK,
+        hint=_CHECK,
     )
     error.job_id = job
     return error

@@ -1,8 +1,8 @@
 """`sim://…` addresses: a simulated server in a child process, started when first needed and stopped with the client.
 
-The child is this package's own command line, so that the client needs no import of the server. It ends when its
-standard input closes: it cannot outlive the client, however that dies. A Ctrl-C that interrupts the client does not
-reach it: the simulation is still there afterwards.
+The child runs this package's own command line, so the client does not import the server. The child exits when its
+standard input closes, so it cannot outlive the client, however the client dies. A Ctrl-C that interrupts the client
+does not reach the child: the simulation is still there afterwards.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ SCHEME = "sim://"
 _START_S = 60.0
 _START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
-_STOP_S = 10.0  # it takes 0.2 on an idle machine, and 3 where eight programs want a processor
+_STOP_S = 10.0  # it takes 0.2 s on an idle machine, and 3 s with eight programs per processor
 
 
 class _Ready(Struct):
@@ -64,9 +64,9 @@ class _Ready(Struct):
 def serve_arguments(address: str) -> list[str]:
     """Return the `urlab serve` arguments for a `sim://` address.
 
-    `sim://MODEL` names an MJCF file, a saved level or a bundled robot. `?model=…` adds another one, any other query
+    `sim://MODEL` names an MJCF file, a saved level or a bundled robot. `?model=…` adds another one. Any other query
     item is an option of `urlab serve`: `sim://arm?model=ball&mjcf-options&controller=arm=pd`. `start-timeout=SECONDS`
-    is for the client that starts it, see `start_seconds`.
+    is for the client that starts the server; see `start_seconds`.
 
     Raises:
         ValueError: No model is named.
@@ -84,10 +84,10 @@ def serve_arguments(address: str) -> list[str]:
 
 
 def start_seconds(address: str) -> float:
-    """Return how long the server of a `sim://` address may take to start, seconds: 60, or its `start-timeout`.
+    """Return the seconds that the server of a `sim://` address may take to start: its `start-timeout`, or 60.
 
     Raises:
-        ValueError: It is not a number of seconds above 0.
+        ValueError: `start-timeout` is not a number of seconds above 0.
     """
     given = dict(parse_qsl(address.partition("?")[2])).get(_START_TIMEOUT)
     try:
@@ -100,7 +100,7 @@ def start_seconds(address: str) -> float:
 
 
 def with_start_timeout(address: str, seconds: float) -> str:
-    """Return an address whose server may take that long to start, unless it is not `sim://`, or says so itself."""
+    """Return a `sim://` address with a start timeout, unless it already has one. Other addresses do not change."""
     _, _, query = address.partition("?")
     if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
         return address
@@ -108,15 +108,15 @@ def with_start_timeout(address: str, seconds: float) -> str:
 
 
 def with_option(address: str, name: str, value: str) -> str:
-    """Return a `sim://` address whose server gets a further option."""
+    """Return a `sim://` address with a further option for its server."""
     return f"{address}{'&' if '?' in address else '?'}{urlencode({name: value})}"
 
 
 def with_model_options(address: str) -> str:
-    """Return a `sim://` address whose server honours the model's `<option>`, unless the address settles that itself.
+    """Return a `sim://` address whose server honours the model's `<option>`, unless the address sets that itself.
 
-    Environments and policies use it: what is trained or evaluated is the model as its author wrote it. The plugin,
-    which a plain `sim://` address stands for, ignores the options.
+    Environments and policies use it, to train and evaluate the model as its author wrote it. A plain `sim://` address
+    behaves like the plugin, which ignores the options.
     """
     model, _, query = address.partition("?")
     named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
@@ -126,10 +126,10 @@ def with_model_options(address: str) -> str:
 
 
 class LaunchedTransport:
-    """Transport to a simulated server of its own.
+    """Transport to a simulated server that it starts.
 
     Attributes:
-        scene_warnings: What the server had to say of its scene when it started.
+        scene_warnings: Warnings of the server about its scene, from its start.
     """
 
     def __init__(self, address: str, *, shm: bool = False) -> None:
@@ -157,12 +157,12 @@ class LaunchedTransport:
 
     @property
     def endpoint(self) -> str:
-        """The server's RPC endpoint once it runs, before that the address."""
+        """The server's RPC endpoint once it runs; the address before that."""
         return self._address if self._inner is None else self._inner.endpoint
 
     @property
     def connected(self) -> bool:
-        """Whether the server runs and is on the line."""
+        """Whether the server is running and connected."""
         return self._inner is not None and self._inner.connected
 
     async def request(
@@ -170,14 +170,14 @@ class LaunchedTransport:
     ) -> bytes:
         """See `RequestTransport.request`. The first request also starts the server, which its deadline does not cover.
 
-        When the server has died, a handshake starts another one; anything else would be refused by it anyway.
+        If the server has died, a handshake starts another one; the new server would refuse any other request.
         """
         process = self._process
         if self._inner is not None and process is not None and process.returncode is not None:
             if op.request is not Hello:
                 raise self._ended(process, op)
             self._lost_at = self._inner.lost_at
-            await self._bury()
+            await self._stop_server()
         if self._inner is None:
             loop = asyncio.get_running_loop()
             before = loop.time()
@@ -188,7 +188,7 @@ class LaunchedTransport:
         return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
 
     async def follow(self, hello: HelloOk) -> None:
-        """See `Transport.follow`: there is no other way."""
+        """See `Transport.follow`. Does nothing: there is only one path."""
 
     async def aclose(self) -> None:
         """See `Transport.aclose`. Waits a bounded time for the server to end."""
@@ -198,10 +198,10 @@ class LaunchedTransport:
         if self._launching is not None:
             self._launching.cancel()
             await asyncio.wait((self._launching,))
-        await self._bury()
+        await self._stop_server()
 
-    async def _bury(self) -> None:
-        """Release what belongs to the server that was started last, and wait a bounded time for its end."""
+    async def _stop_server(self) -> None:
+        """Release the resources of the server that was started last, and wait a bounded time for its exit."""
         inner, self._inner = self._inner, None
         process, self._process = self._process, None
         drain, self._drain = self._drain, None
@@ -218,11 +218,11 @@ class LaunchedTransport:
             async with asyncio.timeout(_STOP_S):
                 await process.wait()
         except TimeoutError:
-            log.warning("%s: the server did not end within %g s and was killed", self._address, _STOP_S)
-        finally:  # cancelled, too: whoever does not wait any longer leaves no process and no pipes behind
+            log.warning("%s: the server did not exit within %g s and was killed", self._address, _STOP_S)
+        finally:  # also if cancelled: no process or pipe may be left behind
             _kill(process)
             await process.wait()
-            # A pipe that asyncio has not seen the end of when its loop is closed makes it complain at some later time.
+            # asyncio warns later about a pipe that is still open when its loop is closed.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_STOP_S):
                     if drain is not None:
@@ -232,13 +232,13 @@ class LaunchedTransport:
                             await pipe.read()
 
     async def _started(self, op: Op) -> ZmqTransport:
-        """Start a server in a task of its own, which `aclose` can break off as well as who waits for it."""
+        """Start a server in a separate task, which both `aclose` and the waiting caller can cancel."""
         if self._closed:
             raise self._was_closed()
-        await self._bury()  # what is left of a start that was broken off
+        await self._stop_server()  # remains of a cancelled start
         task = self._launching = asyncio.create_task(self._launch(op), name="urlab-launch")
         try:
-            # Cancelled, this cancels the task and waits for its end.
+            # If cancelled, this cancels the task and waits for its end.
             (transport,) = await asyncio.gather(task, return_exceptions=True)
         finally:
             self._launching = None
@@ -249,20 +249,20 @@ class LaunchedTransport:
         return transport
 
     async def _tell_end(self, process: asyncio.subprocess.Process | _Watched, transport: ZmqTransport) -> None:
-        """Fail what waits, unsent, for a connection to a server that has ended: none will come."""
+        """Fail unsent requests that wait for a connection once the server has exited."""
         await process.wait()
         transport.fail_waiting(self._ended(process))
 
     def _ended(self, process: asyncio.subprocess.Process | _Watched, op: Op | None = None) -> ServerUnreachable:
         return ServerUnreachable(
-            f"{f'{op.name}: ' if op else ''}the simulated server of {self._address} has ended with code "
+            f"{f'{op.name}: ' if op else ''}the simulated server of {self._address} has exited with code "
             f"{process.returncode}. Nothing was sent.",
             op=op.name if op else None,
             hint="discover() starts another one.",
         )
 
     def _was_closed(self) -> ClientClosed:
-        return ClientClosed(f"The client of {self._address} was closed.", hint="Make a new client.")
+        return ClientClosed(f"The client of {self._address} was closed.", hint="Create a new client.")
 
     async def _launch(self, op: Op) -> ZmqTransport:
         command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
@@ -270,7 +270,7 @@ class LaunchedTransport:
         self._process = process
         try:
             line = await self._first_line(process, op)
-        except BaseException:  # cancelled, too: the next call starts afresh
+        except BaseException:  # also if cancelled: the next call starts another server
             _kill(process)
             raise
         ready = msgspec.json.decode(line, type=_Ready)
@@ -289,7 +289,7 @@ class LaunchedTransport:
         return transport
 
     async def _first_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> bytes:
-        """Return the ready line, or raise what the server said instead."""
+        """Return the ready line, or raise with the server's error output."""
         output, errors = process.stdout, process.stderr
         if output is None or errors is None:
             raise TypeError("the server's output must be a pipe")
@@ -301,7 +301,7 @@ class LaunchedTransport:
                 reason = (await errors.read()).decode(errors="replace").strip()
                 await process.wait()
         except TimeoutError:
-            reason = f"not ready within {self._start_s:g} s; an address may say ?{_START_TIMEOUT}=SECONDS"
+            reason = f"not ready within {self._start_s:g} s; add ?{_START_TIMEOUT}=SECONDS to the address for more"
         raise ServerUnreachable(
             f"{op.name}: no simulated server for {self._address}: {reason or 'it exited without output'}", op=op.name
         )
@@ -311,15 +311,15 @@ async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watche
     pipe = subprocess.PIPE
     try:
         return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)
-    except NotImplementedError:  # what asyncio says of a loop that starts no processes
+    except NotImplementedError:  # asyncio raises it on a loop that cannot start processes
         return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART))  # noqa: ASYNC220, S603
 
 
 class _Watched:
-    """A process that threads read from and wait for; what is used of `asyncio.subprocess.Process`.
+    """A process that threads read from and wait for, with the part of `asyncio.subprocess.Process` used here.
 
-    For loops that start none: the selector loop on Windows, and up to Python 3.13 with a loop policy that, as uvloop's,
-    has no child watcher.
+    For loops that cannot start processes: the selector loop on Windows and, up to Python 3.13, loops of a policy
+    without a child watcher, such as uvloop's.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
@@ -347,7 +347,7 @@ class _Watched:
         self._process.kill()
 
     async def wait(self) -> None:
-        """Wait for the end."""
+        """Wait for the exit of the process."""
         await self._ended.wait()
 
     def _feed(self, reader: asyncio.StreamReader, pipe: IO[bytes]) -> None:
@@ -363,8 +363,8 @@ class _Watched:
 
 
 def _memory_directory() -> str:
-    """Return where regions are best: in memory, where the system has a directory there."""
-    memory = "/dev/shm"  # noqa: S108 - the server makes a directory of its own in it, for its user alone
+    """Return the best directory for regions: in memory, if the system has one there."""
+    memory = "/dev/shm"  # noqa: S108 - the server creates its own directory in it, accessible to its user only
     return memory if os.access(memory, os.W_OK) else tempfile.gettempdir()
 
 
@@ -380,13 +380,13 @@ def _kill(process: asyncio.subprocess.Process | _Watched) -> None:
     if sys.platform == "win32":
         process.kill()
         return
-    # Not `process.kill()`: of a child that has just ended it would take the status that asyncio's watcher waits for.
+    # Not `process.kill()`: it would reap a child that has just exited, whose status asyncio's watcher waits for.
     with contextlib.suppress(ProcessLookupError):
         os.kill(process.pid, signal.SIGKILL)
 
 
 async def _log_lines(stream: asyncio.StreamReader) -> None:
-    """Keep the pipe empty, or the server would block on it."""
+    """Log what the server prints. An undrained pipe would block the server."""
     while True:
         try:
             line = await stream.readline()

@@ -1,7 +1,7 @@
-"""Letting simulation time pass until something is so: `run_for()`, `wait_until()` and `move_to()`.
+"""Letting simulation time pass until a condition holds: `run_for()`, `wait_until()` and `move_to()`.
 
-Works alike in every step mode: in `direct` and `puppet` the client steps, in `live` it watches. Limits are simulation
-time, so that they mean the same on a slow machine; that time itself passes is watched by the clock on the wall.
+They work in every step mode: in `direct` and `puppet` the client steps, in `live` it waits. Limits are in simulation
+time, so they mean the same on a slow machine. A wall-clock timeout detects simulation time that stands still.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Motion"]
 
-_LOOK_S = 0.01  # simulation time between two looks at a predicate
-_SLICE_S = 0.1  # simulation time per request where nobody looks: what a slow scene still does within its deadline
-_MOVING = 0.01  # rad/s or m/s: slower than this a joint hangs rather than moves
+_CHECK_S = 0.01  # simulation time between two checks of a predicate
+_SLICE_S = 0.1  # simulation time per request without a predicate: a slow scene still finishes it within its deadline
+_MOVING = 0.01  # rad/s or m/s: a joint that is slower than this is stuck
 _AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for so long
 
 
 class Simulation(Protocol):
-    """What is needed of a client."""
+    """The part of a client that `Motion` needs."""
 
     @property
     def step_mode(self) -> StepMode: ...
@@ -50,7 +50,7 @@ class Simulation(Protocol):
 
 
 class Movable(Protocol):
-    """What is needed of an articulation."""
+    """The part of an articulation that `Motion` needs."""
 
     @property
     def name(self) -> str: ...
@@ -61,22 +61,22 @@ class Movable(Protocol):
 
 
 class Motion:
-    """Lets the time of a simulation pass.
+    """Lets simulation time pass.
 
     Args:
         simulation: The client.
-        driven: Tells whether the client has set-points of its own, which in live mode must be handed over.
-        patience: Seconds on the wall in which simulation time must move; None waits without limit.
-        session: Tells of restarts of the server.
+        driven: Returns whether the client has set-points of its own, which must be sent in live mode.
+        stall_timeout: Wall-clock seconds within which simulation time must advance; None waits without limit.
+        session: The client's session, which counts restarts of the server.
     """
 
     def __init__(
-        self, simulation: Simulation, *, driven: Callable[[], bool], patience: float | None, session: Session
+        self, simulation: Simulation, *, driven: Callable[[], bool], stall_timeout: float | None, session: Session
     ) -> None:
         self._simulation = simulation
         self._session = session
         self._driven = driven
-        self._patience = patience
+        self._stall_timeout = stall_timeout
 
     async def run_for(self, seconds: float) -> float:
         """See `URLabClient.run_for`."""
@@ -96,13 +96,13 @@ class Motion:
             answer = predicate()
             if inspect.isawaitable(answer):
                 if inspect.iscoroutine(answer):
-                    answer.close()  # or Python warns that nobody awaited it
-                raise TypeError("wait_until takes a function that returns at once, not a coroutine function.")
+                    answer.close()  # avoids Python's warning that it was never awaited
+                raise TypeError("wait_until takes a plain function, not a coroutine function.")
             return bool(answer)
 
         limit = _positive("wait_until: timeout", timeout)
-        passed, so = await self._until(holds, "wait_until", limit, _LOOK_S)
-        if not so:
+        passed, held = await self._until(holds, "wait_until", limit, _CHECK_S)
+        if not held:
             raise URLabTimeoutError(
                 f"wait_until: the condition did not hold within {limit:g} s of simulation time.",
                 hint=await self._findings(),
@@ -121,14 +121,14 @@ class Motion:
         for aim in aims:
             aim.actuator.set_control(aim.set_point)
         passed, settled = await self._until(
-            lambda: all(aim.settled(tolerance) for aim in aims), "move_to", limit, _LOOK_S
+            lambda: all(aim.settled(tolerance) for aim in aims), "move_to", limit, _CHECK_S
         )
         if not settled:
             left = {aim.joint.name: aim.left() for aim in aims if not aim.settled(tolerance)}
             joints = articulation.joints
             texts = [f"{name!r} is {abs(error):.3g} {joints[name].unit} away" for name, error in left.items()]
             raise NotSettled(
-                f"move_to: {articulation.name!r} has not settled within {limit:g} s of simulation time: "
+                f"move_to: {articulation.name!r} did not settle within {limit:g} s of simulation time: "
                 f"{', '.join(texts)}.",
                 remaining=left,
                 hint=await self._findings() or self._still_moving(joints[name] for name in left),
@@ -136,7 +136,7 @@ class Motion:
         return passed
 
     async def _until(self, done: Callable[[], bool], what: str, limit: float, slice_s: float) -> tuple[float, bool]:
-        """Let time pass until something is so or the limit has come; return how much passed, and whether it is so."""
+        """Let time pass until `done` or the limit; return the seconds that passed, and the last result of `done`."""
         simulation = self._simulation
         live = simulation.step_mode is StepMode.LIVE
         if done():
@@ -147,9 +147,9 @@ class Motion:
         async with aclosing(self._passing(what, limit, slice_s)) as times:
             async for now in times:
                 self._check_restarts(what, restarts)
-                if live:  # the first that is known to be new, whatever was known before
+                if live:  # the client's own time may be stale: count from the first snapshot
                     start, live = now, False
-                # A reset puts the clock back: what passed since counts, too.
+                # A reset sets the clock back: count from there.
                 start = min(start, now)
                 passed = now - start
                 if done():
@@ -160,7 +160,7 @@ class Motion:
         simulation = self._simulation
         if simulation.step_mode is StepMode.LIVE:
             end: float | None = None
-            async with aclosing(self._watched(what)) as times:
+            async with aclosing(self._live_times(what)) as times:
                 async for now in times:
                     yield now
                     end = now + limit if end is None else end
@@ -176,51 +176,51 @@ class Motion:
             timestep = timestep or max(0.0, simulation.sim_time - before)
             yield simulation.sim_time
 
-    async def _watched(self, what: str) -> AsyncGenerator[float, None]:
+    async def _live_times(self, what: str) -> AsyncGenerator[float, None]:
         loop = running_loop()
         if self._driven():
             await self._simulation.step()
         newest, since, restarts = -1.0, loop.time(), self._session.restarts
         async with self._simulation.state_stream() as snapshots:
             while True:
-                now = (await snapshots.receive(timeout=self._patience)).time
+                now = (await snapshots.receive(timeout=self._stall_timeout)).time
                 self._check_restarts(what, restarts)  # a new server is paused: time stands still there
                 if now != newest:
                     newest, since = now, loop.time()
                     yield now
-                elif self._patience is not None and loop.time() - since > self._patience:
+                elif self._stall_timeout is not None and loop.time() - since > self._stall_timeout:
                     raise URLabTimeoutError(
-                        f"{what}: simulation time has stood still at {now:.3f} s for {self._patience:g} s.",
+                        f"{what}: simulation time has stood still at {now:.3f} s for {self._stall_timeout:g} s.",
                         hint=await self._findings(),
                     )
 
     def _check_restarts(self, what: str, before: int) -> None:
-        if self._session.restarts != before:  # by now the session may be one with the new server
+        if self._session.restarts != before:  # the session may already be one with the new server
             raise server_restarted(what, self._session.transport.endpoint)
 
     @staticmethod
     def _still_moving(joints: Iterable[Joint]) -> str | None:
         moving = [repr(joint.name) for joint in joints if abs(float(joint.velocity)) > _MOVING]
-        return f"Still on the way: {', '.join(moving)}. Allow a longer timeout." if moving else None
+        return f"Still moving: {', '.join(moving)}. Allow a longer timeout." if moving else None
 
     async def _findings(self) -> str | None:
-        """Return what keeps robots from moving, as far as that can be found out."""
+        """Return the problems that keep robots from moving, as found by `explain()`."""
         found = (await self._simulation.explain()).findings
         return " ".join(f"{one.subject}: {one.text}" for one in found if one.verdict is Verdict.PROBLEM) or None
 
 
 class _Aim:
-    """One joint on its way."""
+    """One joint on its way to its target."""
 
     def __init__(self, articulation: Movable, name: str, target: float) -> None:
         driven = None if name in articulation.joints else articulation.actuators.get(name)
         if driven is not None and driven.joint is not None:
-            raise KeyError(f"move_to takes joints: {name!r} is an actuator, which moves the joint {driven.joint!r}.")
+            raise KeyError(f"move_to takes joints; {name!r} is an actuator, which moves the joint {driven.joint!r}.")
         self.joint = articulation.joints[name]
         what = f"move_to: joint {self.joint.name!r} of {articulation.name!r}"
         self.target = finite(what, target)
         if not self.joint.unit:
-            raise ValueError(f"{what} is a {self.joint.kind} joint: its position is not one number. Nothing was set.")
+            raise ValueError(f"{what} is a {self.joint.kind} joint; its position is not one number. Nothing was set.")
         low, high = self.joint.limits or (self.target, self.target)
         if not low <= self.target <= high:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""A lock between the tasks of one event loop that costs next to nothing while it is free."""
+"""A lock between the tasks of one event loop that is cheap to take while it is free."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Mutex"]
 class Mutex:
     """Mutual exclusion of tasks, first come, first served.
 
-    Unlike `asyncio.Lock` it can be taken without a coroutine, and it is handed on: whoever is woken has it.
+    Unlike `asyncio.Lock` it can be taken without a coroutine, and it is handed over: a task that is woken holds it.
     """
 
     __slots__ = ("_held", "_waiting")
@@ -21,18 +21,18 @@ class Mutex:
         self._waiting: deque[asyncio.Future[None]] = deque()
 
     def locked(self) -> bool:
-        """Whether somebody has it."""
+        """Return whether the lock is held."""
         return self._held
 
     def acquire_nowait(self) -> bool:
-        """Take it if it is free, and return whether it was."""
+        """Take the lock if it is free, and return whether it was."""
         if self._held:
             return False
         self._held = True
         return True
 
     async def acquire(self) -> None:
-        """Wait for it."""
+        """Wait for the lock and take it."""
         if not self._held:
             self._held = True
             return
@@ -43,12 +43,12 @@ class Mutex:
         except asyncio.CancelledError:
             if handed.cancelled():
                 self._waiting.remove(handed)
-            else:  # it came in the turn of the loop in which the caller was cancelled
+            else:  # the lock was handed over in the same loop iteration in which the caller was cancelled
                 self.release()
             raise
 
     def release(self) -> None:
-        """Hand it to whoever has waited longest, or let it go."""
+        """Hand the lock to the task that has waited longest, or free it."""
         for handed in self._waiting:
             if not handed.done():
                 self._waiting.remove(handed)

@@ -1,4 +1,4 @@
-"""One RPC session: gives out turns, stamps requests, bounds them in time and decodes the answers."""
+"""One RPC session: grants turns, stamps requests, sets their deadlines and decodes the replies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.aio.turn import Limits, Turn, at_once
+from urlab_client.aio.turn import Limits, Turn, require_reply
 from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import (
     check_finite,
@@ -50,33 +50,33 @@ log: logging.Logger = logging.getLogger("urlab_client.session")
 R = TypeVar("R", bound=Reply)
 _HELLO = op_of(Hello)
 _COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
-"""Whose scene the running task changes by several ops."""
-_UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
+"""Session whose scene the running task changes by several ops."""
+_UNLISTED = frozenset({"hello", "meta"})  # every server offers them and none lists them
 
 
 class Session:
     """A session with one server.
 
-    The server answers one request at a time anyway, and a second request must not be queued behind a first that
-    may fail: so requests wait here for the line to be free, where waiting is visible and cancellable. What depends on
-    the client's state, or changes it, waits for a `turn` besides.
+    The server handles one request at a time anyway, and a second request must not be queued behind a first one that may
+    fail. Requests therefore wait here for the line to be free, where waiting is visible and cancellable. Requests that
+    depend on the client's state or change it also wait for a `turn`.
 
     Attributes:
         session_id: Id of the open session; empty without one.
-        greeted: Whether a handshake was sent, with whatever outcome.
-        features: What the server can do, as far as its answers have shown.
+        greeted: Whether a handshake was sent, with any outcome.
+        features: Features of the server, as far as its replies have shown them.
         control: The robots that this client owns.
-        read_only: Whether nothing may be asked that takes a session.
-        on_opened: Told of each session that was opened, also by a handshake that its caller had given up.
-        on_refusal: Told of each refusal before it is raised.
-        confirmed: Whether the server has answered within this session since the connection was made. It may be another
-            server after that was lost, which only a refused or accepted session id shows.
-        was_down: Whether nobody listened at the address for a while since the server last answered within this session.
-        restarts: How many sessions ended because the server was started again.
-        line: Held while a request is under way, from encoding it to its reply.
-        turns: Held by the `Turn` under way.
-        editing: Held while the editor has a job.
-        scene: Held by whoever changes the scene, for one op or for several that belong together.
+        read_only: Whether requests that need a session are refused.
+        on_opened: Callback invoked with the handshake of each new session, even if its caller had given up.
+        on_refusal: Callback invoked with each refusal before it is raised.
+        confirmed: Whether the server has answered within this session since the connection was established. After a
+            lost connection another server may listen, which only a refused or accepted session id shows.
+        was_down: Whether no server listened at the address for a while since the last answer within this session.
+        restarts: Number of sessions that ended because the server restarted.
+        line: Held while a request is in progress, from its encoding to its reply.
+        turns: Held by the current `Turn`.
+        editing: Held while the editor runs a job.
+        scene: Held by the task that changes the scene, for one op or for several that belong together.
     """
 
     def __init__(
@@ -110,29 +110,29 @@ class Session:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
-        # A handshake that was given up after it was sent opens a session all the same.
+        # A handshake whose caller gave up after it was sent still opens a session.
         self._given_up: asyncio.Future[bytes] | None = None
         self._unanswered = False
 
     @property
     def transport(self) -> RequestTransport:
-        """What carries the requests."""
+        """The transport of the requests."""
         return self._transport
 
     async def call(
         self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
     ) -> R:
-        """Send a request that does not depend on the client's state; return its reply, after the end of its job.
+        """Send a request that does not depend on the client's state; return its reply, or the result of its job.
 
         Args:
             request: Any request struct of `urlab_client.protocol.messages`.
-            timeout: Seconds for queueing, sending and the reply, of a job, too; None waits.
-            on_progress: Told how far a job is.
+            timeout: Seconds for queueing, sending and the reply, including a job; None waits without limit.
+            on_progress: Callback invoked with the progress of a job.
 
         Raises:
-            URLabRPCError: The server refused.
+            URLabRPCError: The server refused the request.
             URLabConnectionError: The server cannot be reached, or the connection broke.
-            URLabTimeoutError: No reply in time.
+            URLabTimeoutError: No reply arrived in time.
             NoSession: No session is open; nothing was sent.
             TypeError, ValueError: The request is malformed; nothing was sent.
         """
@@ -151,10 +151,10 @@ class Session:
 
     @asynccontextmanager
     async def composing(self, request: type[Request[Any]], timeout: Timeout) -> AsyncGenerator[None]:
-        """Let no other task change the scene while this one does by several ops, the first of which is `request`.
+        """Keep other tasks from changing the scene while this one does so by several ops, of which `request` is first.
 
         Raises:
-            URLabTimeoutError: Others changed it until the deadline of that op; nothing was sent.
+            URLabTimeoutError: Other tasks held the scene until the deadline of that op; nothing was sent.
         """
         op = op_of(request)
         await self.acquire(self.scene, op, self.limits(op, timeout, self.bound_loop().time())[0])
@@ -168,7 +168,7 @@ class Session:
     async def _call(self, request: Request[R], op: Op, limits: Limits, on_progress: OnProgress | None) -> R:
         if op.needs is not Needs.EDITOR:
             return await self._on_line(request, op, limits)
-        # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
+        # One job at a time: the next editor op would wait for it anyway, and block the server in the meantime.
         await self.acquire(self.editing, op, limits[0])
         try:
             await self.acquire(self.line, op, limits[0])
@@ -193,27 +193,28 @@ class Session:
     async def _on_line(self, request: Request[R], op: Op, limits: Limits) -> R:
         await self.acquire(self.line, op, limits[0])
         try:
-            return at_once(op, await self.exchange(request, op, limits))
+            return require_reply(op, await self.exchange(request, op, limits))
         finally:
             self.line.release()
 
     def turn(self, request: type[Request[Any]], *, timeout: Timeout = DEFAULT, each: bool = False) -> Turn:
-        """Return the turn of a task whose requests depend on the client's state or change it.
+        """Return a turn for requests that depend on the client's state or change it.
 
         Args:
-            request: The first request, whose deadline covers the wait for the turn as well.
-            timeout: Seconds for queueing and all requests together; the default is for each by itself, None waits.
-            each: Whether a timeout that is given is for each request by itself, too.
+            request: Type of the first request, whose deadline also covers the wait for the turn.
+            timeout: Seconds for queueing and all requests together; None waits without limit. The default timeout
+                applies to each request separately.
+            each: Whether a given timeout also applies to each request separately.
         """
         op = op_of(request)
         self.check_offered(op)
         return Turn(self, op, timeout, each=each)
 
     async def probe(self, request: Request[R], *, timeout: float) -> R | None:
-        """Send a request that nobody waits for, unless somebody else's is under way, and give way to the next one.
+        """Send a background request if no other is in progress, and cancel it when another request comes.
 
         Returns:
-            The reply, or None if it gave way.
+            The reply, or None if the request was cancelled or not sent.
         """
         if self.line.locked() or self._queued:
             return None
@@ -227,11 +228,11 @@ class Session:
             self._aside = None
 
     async def hello(self, turn: Turn, request: Hello) -> HelloOk:
-        """Open a session; the one before it becomes invalid, here and for any other client."""
+        """Open a session; the previous one becomes invalid, here and for any other client."""
         if self._json:
             request.encoding = "json"
         reply = await turn.call(request)
-        # A packaged build lacks the editor's ops, an older server lacks newer ones.
+        # A packaged build lacks the editor's ops, and an older server lacks newer ops.
         try:
             listed = [op.name for op in (await turn.call(Meta())).ops]
         except UnknownOp:
@@ -240,14 +241,14 @@ class Session:
         return reply
 
     async def aclose(self) -> None:
-        """Release the transport; calls that wait fail with `ClientClosed`."""
+        """Close the transport; waiting calls fail with `ClientClosed`."""
         await self._transport.aclose()
 
     def bound_loop(self) -> asyncio.AbstractEventLoop:
-        """Return the running loop, on which this session stays.
+        """Return the running loop, to which this session is bound.
 
         Raises:
-            URLabError: It is another one than before, or not asyncio's.
+            URLabError: The session is bound to another loop, or no asyncio loop is running.
         """
         bound = self._loop
         if bound is None or asyncio._get_running_loop() is not bound:  # noqa: SLF001  # as in `running_loop`
@@ -255,30 +256,31 @@ class Session:
         return bound
 
     def check_offered(self, op: Op) -> None:
-        """Refuse an op that the server does not list, or that a client that looks on may not send.
+        """Check that the server offers an op and that this client may send it.
 
         Raises:
-            UnknownOp: It does not; nothing was sent.
-            ReadOnlyClient: It may not; nothing was sent.
+            UnknownOp: The server does not list the op; nothing was sent.
+            ReadOnlyClient: The client is read-only; nothing was sent.
         """
         if self.read_only and op.name != "meta":
             raise ReadOnlyClient(
                 f"{op.name}: this client is read-only. Nothing was sent.",
                 op=op.name,
-                hint="It has no session: let the client that drives do it, or make one without read_only=True.",
+                hint="It has no session. Use the client that drives the server, or create one without read_only=True.",
             )
         listed = self.features.ops
         if listed is not None and op.name not in listed and op.name not in _UNLISTED:
-            raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
+            raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
     def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
         """Return the limits of a request.
 
         Args:
             op: Its op.
-            timeout: As its caller gave it.
-            since: Loop time from which it counts.
-            takes: Seconds that the server may take, in place of those the op declares; for the default timeout.
+            timeout: Timeout given by the caller.
+            since: Loop time from which the timeout counts.
+            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
+                default timeout.
         """
         default = self._default_timeout
         if timeout is not DEFAULT:
@@ -286,13 +288,13 @@ class Session:
             return deadline, deadline
         if default is None:
             return None, None
-        # A slow op may take long to answer; whether a server is there at all shows much sooner.
+        # The reply to a slow op may take long, but a missing server shows much sooner.
         seconds = (op.timeout if takes is None else takes) or 0.0
         connect_by = since + default
         return (since + seconds if seconds > default else connect_by), connect_by
 
     def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]:
-        """Send a request and return its answer; for whoever holds the line."""
+        """Send a request and return its answer. The caller must hold the line."""
         if self.features.claims and isinstance(request, ControlRequest):
             return self.control.send(request, self._ask, limits)
         if self._call_records is not None:
@@ -302,10 +304,11 @@ class Session:
     async def _ask(self, request: Request[R], limits: Limits) -> R:
         op = op_of(request)
         answer = self._answer(request, op, limits)
-        return at_once(op, await (answer if self._call_records is None else self._call_records.record(op, answer)))
+        records = self._call_records
+        return require_reply(op, await (answer if records is None else records.record(op, answer)))
 
     async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
-        # One coroutine, though it does several things: each one between a step and its socket costs every step.
+        # A single coroutine, because each further one between a step and its socket slows down every step.
         stamped = self.session_id
         frame = encode_request(request, stamped, json=self._json)
         if not op.hot:
@@ -322,14 +325,14 @@ class Session:
                 answer = await self._ask_again(frame, op, lost, limits)
             finally:
                 if late is not None and self._transport.stats.sent > sent:
-                    self.greeted = self._unanswered = True  # until its answer has been read
+                    self.greeted = self._unanswered = True  # `_unanswered` until the reply has been read
             if log.isEnabledFor(logging.DEBUG):
                 took = 1e3 * (time.perf_counter() - began)
                 log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
             return self._read(op_reply(request, op), op, stamped, answer)
         except SessionTakenOver as refusal:
-            # A handshake of our own that was given up opens a session all the same. What it made the server refuse
-            # was not executed, and is sent once more in that session.
+            # An abandoned handshake of this client still opens a session. A request refused because of it was not
+            # executed, and is sent again in that session.
             if not again and await self._settled(limits[0]) and self.session_id != stamped:
                 return await self._answer(request, op, limits, again=True)
             if not stamped:
@@ -339,7 +342,7 @@ class Session:
             if self.was_down:
                 raise self._after_restart(stamped, op, refusal.message) from None
             if self._unanswered:
-                raise _by_ourselves(refusal) from None
+                raise _maybe_own_handshake(refusal) from None
             raise
 
     def _after_restart(self, stamped: str, op: Op, said: str) -> ServerRestarted:
@@ -349,11 +352,11 @@ class Session:
         return server_restarted(op.name, self._transport.endpoint, said)
 
     def _read(self, kind: type[R], op: Op, stamped: str, answer: bytes) -> R | OpStarted:
-        """Decode the answer to a request that was sent in the session `stamped`, and learn what it tells."""
+        """Decode the answer to a request that was sent in the session `stamped`, and update the session from it."""
         try:
             reply = decode_answer(op, kind, answer)
         except URLabRPCError as refusal:
-            # A refusal of what was sent before the latest hello says nothing about the session of now.
+            # A refusal of a request sent before the latest hello says nothing about the current session.
             taken_over = isinstance(refusal, SessionTakenOver)
             if self.on_refusal is not None and stamped == self.session_id and not taken_over:
                 self.on_refusal(refusal)
@@ -378,23 +381,23 @@ class Session:
             self.on_opened(hello)
 
     def _await_later(self, reply: asyncio.Future[bytes]) -> None:
-        """Take the session over that a handshake opens whose caller has given up."""
+        """Adopt the session that an abandoned handshake opens, when its reply arrives."""
         self._given_up = reply
         reply.add_done_callback(self._take_later)
 
     def _take_later(self, reply: asyncio.Future[bytes]) -> None:
         if self._given_up is not reply or not reply.done():
-            return  # a later handshake has been answered since
+            return  # a later handshake has been answered in the meantime
         self._given_up = None
         if reply.cancelled():
             return  # the connection was lost; `_unanswered` remembers it
         try:
             self._open(decode_reply(op_of(Hello), HelloOk, reply.result()))
         except URLabError as error:
-            log.info("the answer to a handshake that was given up is of no use: %s", error)
+            log.info("the reply to an abandoned handshake cannot be used: %s", error)
 
     async def _settled(self, deadline: float | None) -> bool:
-        """Wait until it is known which session a handshake opened that was given up; return whether it is."""
+        """Wait for the reply to an abandoned handshake; return whether none is outstanding."""
         reply = self._given_up
         if reply is not None:
             left = None if deadline is None else max(0.0, deadline - asyncio.get_running_loop().time())
@@ -403,10 +406,10 @@ class Session:
         return self._given_up is None
 
     async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, limits: Limits) -> bytes:
-        """Repeat a request that changes nothing, whose connection broke, until there is an answer or time is up."""
+        """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
         late = self._await_later if op is _HELLO else None
         while True:
-            log.debug("%s: asking again, because the connection was lost", op.name)
+            log.debug("%s: sending the request again, because the connection was lost", op.name)
             try:
                 deadline, connect_by = limits
                 return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
@@ -444,20 +447,20 @@ class Session:
 
 
 def op_reply(request: Request[R], op: Op) -> type[R]:
-    """Return the reply struct of a request, typed: the registry knows it, type checkers know it from the request."""
+    """Return the reply struct of a request, with the type that the request declares."""
     return op.reply  # type: ignore[return-value]  # Op cannot carry R: the registry holds ops of every R
 
 
 def server_restarted(what: str, endpoint: str, said: str = "") -> ServerRestarted:
-    """Return the error of what a restart of the server ended, with what the server said of the session."""
+    """Return the error of an op that a restart of the server ended, with the server's message `said`."""
     words = f" ({said})" if said else ""
-    text = f"the server at {endpoint} was started again and does not know the session{words}."
+    text = f"the server at {endpoint} has restarted and does not know the session{words}."
     return ServerRestarted(text, op=what)
 
 
-def _by_ourselves(refusal: SessionTakenOver) -> SessionTakenOver:
+def _maybe_own_handshake(refusal: SessionTakenOver) -> SessionTakenOver:
     return SessionTakenOver(
         refusal.code,
-        f"{refusal.message.rstrip('.')}. A handshake of this client that was given up may have opened another session.",
+        f"{refusal.message.rstrip('.')}. An abandoned handshake of this client may have opened another session.",
         op=refusal.op,
     )

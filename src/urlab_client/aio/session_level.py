@@ -1,4 +1,4 @@
-"""The default of `step(observations=…)`: what `discover()` chose."""
+"""The default of `step(observations=…)`: the level chosen in `discover()`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class SessionLevel(enum.Enum):
 
     SESSION_LEVEL = ObservationLevel.STANDARD
 
-    def __repr__(self) -> str:  # as help() and inspect.signature() show the default
+    def __repr__(self) -> str:  # shown as the default by help() and inspect.signature()
         return f"{self.value.value!r} or as chosen in discover()"
 
 
 SESSION_LEVEL: Final = SessionLevel.SESSION_LEVEL
-"""The level chosen in `discover()`, which is `standard` unless it was told otherwise."""
+"""The level chosen in `discover()`, by default `standard`."""

@@ -1,4 +1,4 @@
-"""What a stream keeps between the wire and its reader. Plain data structures: no I/O, no clocks, no locks."""
+"""The buffer between the wire and the reader of a stream. Plain data structures: no I/O, no clocks, no locks."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ class BufferedMessage:
     """A message on its way to the reader.
 
     Attributes:
-        topic: Its topic.
-        payload: Its content, not decoded yet.
-        size: Bytes of the content.
-        seq: Its number among all messages pushed, from 1.
-        dropped: Messages pushed before this one that it stands for: they will never be popped.
-        gap: Why messages are missing before this one, or None.
-        wall_ns: When it arrived, UTC, nanoseconds.
-        item: What it was decoded to; for the reader's use.
-        malformed: Whether decoding it failed; for the reader's use.
+        topic: Topic.
+        payload: Content, not decoded yet.
+        size: Size of the content, bytes.
+        seq: Sequence number among all pushed messages, from 1.
+        dropped: Number of messages dropped before this one and counted here.
+        gap: Reason why messages are missing before this one, or None.
+        wall_ns: Time of arrival, UTC, nanoseconds.
+        item: Decoded item; for the reader's use.
+        malformed: Whether decoding failed; for the reader's use.
     """
 
     __slots__ = ("dropped", "gap", "item", "malformed", "payload", "seq", "size", "topic", "wall_ns")
@@ -41,33 +41,33 @@ class BufferedMessage:
 
 
 class StreamBuffer:
-    """Messages that wait for one reader.
+    """Buffered messages for one reader.
 
-    Nothing is lost without a trace: what is dropped is counted on the entry that takes its place, else on the one
-    popped next, which also takes over its `gap`. Under `latest_per_key` a topic keeps its place in the queue when a
-    newer message takes over, so that a busy topic neither starves nor overtakes the others.
+    Every loss is counted: a dropped message counts on the entry that replaces it, otherwise on the entry popped next,
+    which also inherits its `gap`. Under `latest_per_key` a topic keeps its place in the queue when a newer message
+    replaces the old one, so a busy topic neither starves nor overtakes the others.
 
-    When the limits are exceeded the oldest message gives way, so that a reader who falls behind misses as little as
-    possible. `latest` has no limits: it keeps one message, however large.
+    Beyond the limits the oldest message is dropped, so that a slow reader misses as little as possible. `latest` has no
+    limits: it keeps one message of any size.
 
     Args:
-        policy: What to keep.
-        max_items: Messages to keep at most.
-        max_bytes: Bytes of content to keep at most; a larger message is never kept.
+        policy: Which messages to keep.
+        max_items: Maximum number of messages.
+        max_bytes: Maximum number of bytes of content; a larger message is never kept.
 
     Attributes:
-        policy: As given.
-        received: Messages pushed.
-        received_bytes: Bytes of their content.
-        dropped: Messages that will never be popped.
-        size: Bytes of content now waiting.
+        policy: Policy, as given.
+        received: Number of pushed messages.
+        received_bytes: Number of bytes of their content.
+        dropped: Number of messages that will never be popped.
+        size: Bytes of buffered content.
         newest: The entry pushed last, popped or not; None before the first, and after one too large to keep.
     """
 
     def __init__(self, policy: StreamPolicy, max_items: int, max_bytes: int) -> None:
         max_items, max_bytes = integer("buffer", max_items), integer("buffer_bytes", max_bytes)
         if max_items < 1 or max_bytes < 1:
-            raise ValueError(f"a buffer holds at least one item and one byte, not {max_items} and {max_bytes}")
+            raise ValueError(f"a buffer must hold at least one item and one byte, not {max_items} and {max_bytes}")
         self.policy = policy
         self._max_items = max_items
         self._max_bytes = max_bytes
@@ -85,7 +85,7 @@ class StreamBuffer:
         return len(self._waiting)
 
     def push(self, topic: bytes, payload: Any, size: int, wall_ns: int = 0) -> None:
-        """Add a message, and drop what the policy and the limits say."""
+        """Add a message, and drop others as the policy and the limits require."""
         self.received += 1
         self.received_bytes += size
         entry = BufferedMessage(topic, payload, size, wall_ns, self.received)
@@ -106,7 +106,7 @@ class StreamBuffer:
                 self._evict()
 
     def pop(self) -> BufferedMessage | None:
-        """Take the next entry out; None if nothing waits."""
+        """Remove and return the next entry; None if the buffer is empty."""
         if not self._waiting:
             return None
         entry = self._waiting.popitem(last=False)[1]
@@ -114,25 +114,25 @@ class StreamBuffer:
         return entry
 
     def skip(self, entry: BufferedMessage) -> None:
-        """Hand what a popped entry says about losses on to the next one: it turned out to be of no use."""
-        self._hand_on(entry)
+        """Drop a popped entry that is malformed; the next entry inherits its losses."""
+        self._pass_on_losses(entry)
 
     def reject(self) -> None:
-        """Count a message that is of no use from the start."""
+        """Count a message that is malformed on arrival."""
         self.received += 1
         self._carried += 1
 
     def note_gap(self, why: str) -> None:
-        """Say of the next message pushed that others are missing before it."""
+        """Mark the next pushed message: others are missing before it."""
         self._carried_gap = why
 
     def take_overflow(self) -> int:
-        """Return how many messages gave way to the limits since this was asked last."""
+        """Return the number of messages dropped because of the limits since the last call."""
         lost, self._overflowed = self._overflowed, 0
         return lost
 
     def clear(self) -> None:
-        """Drop everything that waits."""
+        """Drop all buffered messages."""
         self.dropped += len(self._waiting)
         self._waiting.clear()
         self.size = 0
@@ -145,13 +145,13 @@ class StreamBuffer:
         self._overflowed += 1
         if entry is self.newest:
             self.newest = None
-        self._hand_on(entry)
+        self._pass_on_losses(entry)
 
-    def _hand_on(self, entry: BufferedMessage) -> None:
-        heir = next(iter(self._waiting.values()), None)
-        if heir is None:
+    def _pass_on_losses(self, entry: BufferedMessage) -> None:
+        following = next(iter(self._waiting.values()), None)
+        if following is None:
             self._carried += entry.dropped + 1
             self._carried_gap = self._carried_gap or entry.gap
         else:
-            heir.dropped += entry.dropped + 1
-            heir.gap = heir.gap or entry.gap
+            following.dropped += entry.dropped + 1
+            following.gap = following.gap or entry.gap

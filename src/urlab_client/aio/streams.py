@@ -1,4 +1,4 @@
-"""Streams: what the server publishes, as asynchronous iterators that are context managers, too."""
+"""Streams of published data, as asynchronous iterators that are also context managers."""
 
 from __future__ import annotations
 
@@ -42,41 +42,47 @@ BUFFER_BYTES = 64 * 1024 * 1024
 
 
 class Source(Protocol[T_co]):
-    """Where a stream's messages come from and what they mean: all that a stream knows of it."""
+    """Origin of a stream's messages, which also decodes them."""
 
     name: str
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop."""
+        """Start passing messages to `handler`, from the event loop."""
         ...
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop passing messages to `handler`. Idempotent."""
         ...
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Return whether a message is anything to the reader at all."""
+        """Return whether a message is relevant to the reader."""
         ...
 
     def decode(self, topic: bytes, payload: BytesLike) -> T_co:
-        """Make an item of a message. Raises `ProtocolError`."""
+        """Decode a message into an item.
+
+        Raises:
+            ProtocolError: The message is malformed.
+        """
         ...
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return how many seconds the first item may be in coming; 0 where nothing says that it takes long."""
+        """Return the seconds that the first item may take to arrive; 0 if no delay is expected."""
         ...
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        """Return why nothing came for so long, and what to do about it."""
+        """Return why no message arrived for `seconds`, and what to do about it."""
         ...
 
 
 class _StreamHandler(MessageHandler, Generic[T]):
-    """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
-    dropped without being closed can so be collected, and stops receiving then.
+    """Buffer, reader and end of one stream.
 
-    Messages are pushed on the event loop. Everything that does not wait may be called from any thread: in the façade
-    it is, so the buffer and the counters are guarded by a lock, which is never held while decoding.
+    The receiver holds a reference to this object, which holds none to the stream. A stream that is dropped without
+    being closed can therefore be garbage-collected, and stops receiving then.
+
+    Messages are pushed on the event loop. The façade calls methods that do not wait from any thread, so a lock guards
+    the buffer and the counters. It is never held while decoding.
     """
 
     def __init__(
@@ -96,7 +102,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._timeout = timeout
         self._default_timeout = default_timeout
         self._period = 0.0 if max_rate is None else 1.0 / max_rate
-        self._due = -math.inf  # when the next item may be handed out, by the monotonic clock
+        self._due = -math.inf  # monotonic time at which the next item may be delivered
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._attached = False
@@ -107,7 +113,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._arrived: float | None = None
         self._delivered = self._malformed = self._gaps = 0
 
-    # What the source calls
+    # Called by the source
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         if self._source.wants(topic, payload):
@@ -135,23 +141,23 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._end = error
         self._wake()
 
-    # What the reader calls
+    # Called by the reader
 
     def open(self) -> None:
-        """Begin to receive, if that has not been done yet."""
+        """Start receiving if not started yet."""
         if self.closed:
             raise StopAsyncIteration
         self._loop = running_loop(self._loop, f"{self._source.name}: this stream")
         self.attach()
 
     def attach(self) -> None:
-        """Let the source feed this."""
+        """Attach to the source if not attached yet."""
         if not self._attached and self._end is None:
             self._source.attach(self)
             self._attached = True
 
     async def next(self) -> T:
-        """Return the next item, within the stream's own limit."""
+        """Return the next item within the stream's own timeout."""
         return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
 
     async def receive(self, timeout: Timeout) -> T:
@@ -166,12 +172,12 @@ class _StreamHandler(MessageHandler, Generic[T]):
             self._reading = False
 
     def receive_nowait(self) -> T | None:
-        """Return the next item if one waits."""
+        """Return the next item if one is buffered."""
         self._refuse_second_reader()
         return self._take()
 
     def latest(self) -> T | None:
-        """Return the newest item there is, without taking it away from the reader."""
+        """Return the newest item without removing it from the buffer."""
         with self._lock:
             entry = self._buffer.newest
             last = self._last
@@ -195,7 +201,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
             )
 
     def close(self) -> None:
-        """Stop receiving, on the event loop."""
+        """Stop receiving. Call it on the event loop."""
         if self.closed:
             return
         self.closed = True
@@ -205,13 +211,13 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._wake()
 
     def abandon(self) -> None:
-        """Stop receiving, from whichever thread collects garbage."""
+        """Stop receiving. May be called from any thread, by the garbage collector."""
         if self.closed or not self._attached:
             return
         if self._loop is None:
             self._source.detach(self)
         else:
-            with contextlib.suppress(RuntimeError):  # the loop is closed, and with it everything that received
+            with contextlib.suppress(RuntimeError):  # the loop is closed, so nothing receives
                 self._loop.call_soon_threadsafe(self._source.detach, self)
 
     def __repr__(self) -> str:
@@ -222,7 +228,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
         return f"<Stream {self._source.name} {self._buffer.policy}{rate}, {state}: {counts}>"
 
     def _early_by(self) -> float:
-        """Return how many seconds are left until the next item may be handed out."""
+        """Return the seconds left until the next item may be delivered."""
         return self._due - time.monotonic() if self._period and self._end is None else 0.0
 
     def _wake(self) -> None:
@@ -232,12 +238,12 @@ class _StreamHandler(MessageHandler, Generic[T]):
     def _refuse_second_reader(self) -> None:
         if self._reading:
             raise ConcurrentReadError(
-                f"{self._source.name}: somebody already waits for the next item of this stream.",
-                hint="Open a stream for each reader: they share one connection.",
+                f"{self._source.name}: another reader is already waiting for the next item of this stream.",
+                hint="Open a stream for each reader; all streams share one connection.",
             )
 
     def _take(self) -> T | None:
-        """Return the next item, None if there is none yet; raise what ends the stream."""
+        """Return the next item, or None if there is none yet; raise the error that ended the stream."""
         while True:
             if self.closed:
                 raise StopAsyncIteration
@@ -248,9 +254,9 @@ class _StreamHandler(MessageHandler, Generic[T]):
                 waiting = len(self._buffer)
             if lost and not self._tolerant:
                 raise StreamOverflow(
-                    f"{self._source.name}: the reader fell behind: {lost} messages were lost, {waiting} wait.",
+                    f"{self._source.name}: the reader fell behind: {lost} messages were lost, {waiting} are buffered.",
                     lost=lost,
-                    hint="Reading continues with the oldest waiting item. Read faster, or pass a larger buffer=….",
+                    hint="Reading continues with the oldest buffered item. Read faster, or pass a larger buffer=….",
                 )
             if entry is None:
                 if self._end is not None:
@@ -264,15 +270,15 @@ class _StreamHandler(MessageHandler, Generic[T]):
                     continue
                 self._delivered += 1
             if self._period:
-                # From when it was due, not from when it was taken: else each late awakening would lower the rate.
+                # Counted from the due time, not from the read: otherwise each late wake-up would lower the rate.
                 now = time.monotonic()
                 self._due = (self._due if now - self._due < self._period else now) + self._period
-            # Messages may have been lost in front of it since `latest` looked at it.
+            # Messages before it may have been lost since `latest` decoded it.
             item.dropped, item.gap = entry.dropped, entry.gap
             return item
 
     def _decoded(self, entry: BufferedMessage) -> T | None:
-        """Return the item of a message, None if it is malformed."""
+        """Return the item of a message, or None if it is malformed."""
         with self._lock:
             if entry.item is not None or entry.malformed:
                 return entry.item
@@ -329,23 +335,24 @@ class _StreamHandler(MessageHandler, Generic[T]):
     def _warn(self, problem: str) -> None:
         if not self._warned:
             self._warned = True
-            log.warning("%s: skipped a malformed message: %s More are only counted.", self._source.name, problem)
+            log.warning("%s: skipped a malformed message: %s Later ones are only counted.", self._source.name, problem)
 
 
 class Stream(Generic[T]):
     """Items that the server publishes, as they arrive.
 
-    It opens with the first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
-    stream is closed; when the client is closed, it raises `ClientClosed` after the items that had arrived.
+    The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
+    stream is closed. When the client is closed, iteration raises `ClientClosed` after the items that had arrived.
 
-    The policy decides which items wait for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps the
-    newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next read
-    raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
+    The policy decides which items are kept for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps
+    the newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next
+    read raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
 
-    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. Losses before an item
-    reaches this process, in the queues of the server or the network, are invisible: the wire has no numbers.
+    Each item has `seq`, `dropped` and `gap`, which show what the reader missed. Losses before an item reaches this
+    process, in the queues of the server or the network, cannot be detected: messages on the wire are not numbered.
 
-    One reader at a time; anyone may read `latest`, `stats` and `closed`. An item that nobody reads is not decoded.
+    Only one reader at a time may wait for items. `latest`, `stats` and `closed` may be used from anywhere. Items are
+    decoded only when they are read.
 
     Example:
         async with client.state_stream() as states:
@@ -366,26 +373,27 @@ class Stream(Generic[T]):
         eager: bool = False,
         tolerant: bool = False,
     ) -> None:
-        """Make a stream; nothing is received before its first use.
+        """Create a stream. It receives nothing before its first use.
 
         Args:
-            source: What feeds it.
-            policy: What to keep for a busy reader.
-            buffer: Items kept at most.
-            buffer_bytes: Bytes kept at most.
-            timeout: Seconds that iterating waits for an item; by default `default_timeout` for the first item and
-                without limit for those after it.
-            default_timeout: Seconds that `receive` waits by default; None waits.
-            max_rate: Items per second at most, for policy `latest`; None for all.
-            eager: Receive from now on. The source must allow it from any thread.
-            tolerant: Let an overflow show in the next item's `dropped` only.
+            source: Source of the messages.
+            policy: Which items to keep for a busy reader.
+            buffer: Maximum number of buffered items.
+            buffer_bytes: Maximum number of buffered bytes.
+            timeout: Seconds that iteration waits for an item; by default `default_timeout` for the first item and no
+                limit after that.
+            default_timeout: Seconds that `receive` waits by default; None waits without limit.
+            max_rate: Maximum number of items per second, with policy `latest`; None for no limit.
+            eager: Start receiving immediately. The source must allow that from any thread.
+            tolerant: Report an overflow only in `dropped` of the next item.
 
         Raises:
-            ValueError: Unknown policy, a limit below 1, or a rate that is not above 0 or not for this policy.
+            ValueError: The policy is unknown, a limit is below 1, or `max_rate` is not above 0 or used with another
+                policy than `latest`.
         """
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
         if max_rate is not None and kept.policy is not StreamPolicy.LATEST:
-            raise ValueError(f"max_rate is for policy 'latest', which leaves out items; {kept.policy!r} keeps them")
+            raise ValueError(f"max_rate requires policy 'latest', which skips items; {kept.policy!r} keeps them")
         if max_rate is not None:
             require("max_rate", max_rate, SupportsFloat, "a number above 0")
             if not 0 < float(max_rate) < math.inf:
@@ -398,7 +406,7 @@ class Stream(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed here."""
+        """Whether the reader closed the stream."""
         return self._handler.closed
 
     @property
@@ -407,19 +415,21 @@ class Stream(Generic[T]):
         return self._handler.stats()
 
     def latest(self) -> T | None:
-        """Return the newest item without waiting and without taking it away from the reader; None before the first.
+        """Return the newest item without waiting and without removing it from the buffer; None before the first.
 
         The reader gets the same object.
         """
         return self._handler.latest()
 
     def receive_nowait(self) -> T | None:
-        """Return the next item if one waits, else None, as before the stream is opened and after it is closed.
+        """Return the next item if one is buffered, otherwise None.
+
+        Returns None before the stream is opened and after it is closed.
 
         Raises:
             StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Somebody waits for the next item.
-            ClientClosed: The client was closed, and what had arrived is read.
+            ConcurrentReadError: Another reader is waiting for the next item.
+            ClientClosed: The client was closed and all items that had arrived have been read.
         """
         try:
             return self._handler.receive_nowait()
@@ -430,14 +440,14 @@ class Stream(Generic[T]):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
-                that is less and a server in live mode may still be preparing its first picture.
+            timeout: Seconds to wait; None waits without limit. The default is the client's `rcv_timeout_ms`; it is at
+                least 30 s while a server in live mode may still be preparing its first picture.
 
         Raises:
-            URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.
+            URLabTimeoutError: No item arrived in time; the message names the stage that failed and what to check.
             StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Somebody else waits for the next item.
-            ClientClosed: The client was closed, and what had arrived is read.
+            ConcurrentReadError: Another reader is waiting for the next item.
+            ClientClosed: The client was closed and all items that had arrived have been read.
             URLabError: The stream was closed.
         """
         try:
@@ -446,7 +456,7 @@ class Stream(Generic[T]):
             raise self._was_closed() from None
 
     async def aclose(self) -> None:
-        """Stop receiving and drop what waits. A reader's iteration ends. Idempotent."""
+        """Stop receiving and discard buffered items. A running iteration ends. Idempotent."""
         self._handler.close()
 
     async def __aenter__(self) -> Self:
@@ -468,7 +478,7 @@ class Stream(Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        """Return the next item; see `receive` for what it raises."""
+        """Return the next item; see `receive` for the errors."""
         return await self._handler.next()
 
     def __del__(self) -> None:

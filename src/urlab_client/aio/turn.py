@@ -1,4 +1,4 @@
-"""Turns: while a task has one, it alone reads and changes the client's state, and sends what depends on it."""
+"""Turns: exclusive access to the client's state, for tasks whose requests depend on it."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.jobs import OpStarted
 
-__all__ = ["Limits", "Turn", "at_once"]
+__all__ = ["Limits", "Turn", "require_reply"]
 
 R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
 
 Limits: TypeAlias = tuple[float | None, float | None]
-"""Loop times by which a request must have been answered, and a connection must stand; None waits."""
+"""Loop times of two deadlines, for the reply and for the connection; None waits without limit."""
 
 
 class TurnSession(Protocol):
-    """What a turn needs of its session, where the meaning of each stands."""
+    """The part of `Session` that a turn needs; see there."""
 
     line: Mutex
     turns: Mutex
@@ -47,10 +47,10 @@ class TurnSession(Protocol):
 
 
 class Turn:
-    """The time in which one task alone reads and changes the client's state, and sends what depends on it.
+    """Exclusive access of one task to the client's state, and to the connection for requests that depend on it.
 
-    Within it a request is built, sent, accounted for and taken over. Requests that do not depend on the client's state
-    may go in between only during `aside`.
+    Within a turn a request is built, sent and accounted for, and its reply updates the state. Requests that do not
+    depend on the client's state may be sent in between only during `aside`.
     """
 
     __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
@@ -67,8 +67,8 @@ class Turn:
         self._before = 0  # requests that had been sent before the latest `call`
         self._left = False
 
-    def begin_at_once(self) -> bool:
-        """Begin if nobody else has a turn and nothing is under way; return whether it was so."""
+    def begin_nowait(self) -> bool:
+        """Begin if no other task has a turn and no request is in progress; return whether the turn has begun."""
         session, op = self._session, self._op
         self._asked = session.limits(op, self._timeout, self._began)
         if op.needs is Needs.EDITOR or not session.turns.acquire_nowait():
@@ -83,7 +83,7 @@ class Turn:
         """Wait for the turn.
 
         Raises:
-            URLabTimeoutError: Others had theirs until the deadline; nothing was sent.
+            URLabTimeoutError: Other tasks had their turns until the deadline; nothing was sent.
         """
         session, op = self._session, self._op
         limits = self._asked or session.limits(op, self._timeout, self._began)
@@ -96,7 +96,7 @@ class Turn:
             raise
 
     def end(self) -> None:
-        """Let the next one begin."""
+        """End the turn, so that the next one can begin."""
         if self._ready:
             self._give_line()
         self._session.turns.release()
@@ -112,7 +112,7 @@ class Turn:
 
     @property
     def sent(self) -> bool:
-        """Whether the request of the latest `call` left, so that the server may have executed it."""
+        """Whether the request of the latest `call` was sent, so that the server may have executed it."""
         return self._session.transport.stats.sent > self._before if self._ready else self._left
 
     def call(self, request: Request[R], *, takes: float | None = None) -> Coroutine[Any, Any, R]:
@@ -120,10 +120,11 @@ class Turn:
 
         Args:
             request: The request.
-            takes: Seconds that the server may take, in place of those its op declares; for the default timeout.
+            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
+                default timeout.
 
         Raises:
-            URLabError: As `Session.call`.
+            URLabError: See `Session.call`.
         """
         session, op, limits = self._session, self._op, self._asked
         self._before = session.transport.stats.sent
@@ -135,17 +136,17 @@ class Turn:
         self._first = False
         answer = session.exchange(request, op, limits)
         if op.needs is Needs.EDITOR:
-            return _at_once(op, answer)
-        return cast("Coroutine[Any, Any, R]", answer)  # only the editor's ops are ever answered with a job
+            return _await_reply(op, answer)
+        return cast("Coroutine[Any, Any, R]", answer)  # the server answers only the editor's ops with a job
 
     def deadline(self, takes: float) -> float:
-        """Return the loop time until which this turn may wait for something that takes so long, in seconds."""
+        """Return the loop time until which this turn may wait for something that takes `takes` seconds."""
         by = asyncio.get_running_loop().time() + takes
         limit = None if self._timeout is DEFAULT else self._limits(self._op)[0]
         return by if limit is None else min(by, limit)
 
     async def aside(self, work: Awaitable[T]) -> T:
-        """Let requests that do not depend on the client's state pass while `work`, which sends nothing, is done."""
+        """Let requests that do not depend on the client's state pass while awaiting `work`, which sends nothing."""
         self._give_line()
         result = await work
         await self._take_line(self._limits(self._op)[0])
@@ -172,22 +173,22 @@ class Turn:
             self._session.editing.release()
 
     def _limits(self, op: Op, takes: float | None = None) -> Limits:
-        # What is waited for the turn counts for the first request, and for all where one timeout covers them.
+        # The wait for the turn counts for the first request, and for all requests if one timeout covers them.
         counted = self._first or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
         return self._session.limits(op, self._timeout, since, takes)
 
 
-async def _at_once(op: Op, answer: Awaitable[R | OpStarted]) -> R:
-    return at_once(op, await answer)
+async def _await_reply(op: Op, answer: Awaitable[R | OpStarted]) -> R:
+    return require_reply(op, await answer)
 
 
-def at_once(op: Op, answer: R | OpStarted) -> R:
-    """Return the answer to an op that is none of the editor's jobs.
+def require_reply(op: Op, answer: R | OpStarted) -> R:
+    """Return the reply to an op that may not run as a job.
 
     Raises:
-        ProtocolError: The server has made a job of it.
+        ProtocolError: The server has started a job instead.
     """
     if isinstance(answer, OpStarted):
-        raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
+        raise ProtocolError(f"{op.name}: the server started {answer.job_id} instead of replying.", op=op.name)
     return answer

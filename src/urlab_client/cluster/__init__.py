@@ -1,6 +1,6 @@
-"""Rollouts on a Ray cluster: episodes by actors or tasks, each on a simulated server of its own or a leased address.
+"""Rollouts on a Ray cluster: episodes by actors or tasks, each on its own simulated server or a leased address.
 
-Needs the extra `ray`. The driver calls `ray.init()` before anything here.
+Requires the extra `ray`. The driver must call `ray.init()` first.
 """
 
 import importlib.util

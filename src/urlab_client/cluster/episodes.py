@@ -1,4 +1,4 @@
-"""What goes to a worker and what comes back."""
+"""The data that workers receive and return."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from urlab_client.protocol.errors import URLabError
 __all__ = ["Episode", "Job", "Policy", "RolloutError", "Setup", "seed_of"]
 
 Policy = Callable[[Any, np.random.Generator], Any]
-"""`(observation, rng) -> action`, as the spaces of the environment have them: flat arrays, or dictionaries of arrays
-with `space_mode="dict"`. Each episode gets a copy of its own, as it was when sent.
+"""`(observation, rng) -> action`, in the spaces of the environment: flat arrays, or dictionaries of arrays with
+`space_mode="dict"`. Each episode gets its own copy of the policy as it was sent.
 """
 
 
 class RolloutError(URLabError):
-    """An episode failed for good: its policy raised, its attempts are used up, or no worker could be started."""
+    """An episode failed permanently: its policy raised, all attempts failed, or no worker could be started."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Episode:
     """One finished episode of `T` actions.
 
-    Equal `id`, `seed` and `scene` mean equal arrays, bit for bit, whichever attempt and node they come from, on the
-    same build of MuJoCo.
+    Episodes with the same `id`, `seed` and `scene` have the same arrays, bit for bit, on any node and in any attempt,
+    with the same build of MuJoCo.
 
     Attributes:
         id: 0 to n - 1; each appears once.
-        seed: Seed of the reset noise and of the policy's generator; follows from the run's seed and `id`.
-        scene: The scene's address, or the name of the lease pool.
-        address: Where it ran.
+        seed: Seed of the reset noise and of the policy's generator, derived from the run's seed and `id`.
+        scene: Address of the scene, or name of the lease pool.
+        address: Address of the server that ran it.
         attempt: 1, or more after failures.
         node_id: Ray's id of the node, hexadecimal.
         pid: Process id of the worker.
-        observations: Float64, shape (T + 1, observation size); with `space_mode="dict"` dictionaries as the
-            environment's, of such arrays, those of cameras uint8 with shape (T + 1, H, W, 3).
+        observations: Float64, shape (T + 1, observation size); with `space_mode="dict"` dictionaries of such
+            arrays, as in the environment; cameras are uint8 with shape (T + 1, H, W, 3).
         actions: Float32, shape (T, action size), or a dictionary of such arrays.
         rewards: Float64, shape (T,).
         terminated: Whether the termination function ended it.
         truncated: Whether the step limit ended it.
-        success: What the task says of the end; None without a task that says so.
+        success: Whether the task was solved; None if the task does not define success.
         sim_time: Simulated seconds at the end.
         started: Unix time in seconds, by the worker's clock.
-        setup: Seconds for lease, server and reset.
-        duration: Seconds that it took, with `setup`.
+        setup: Time for lease, server and reset, seconds.
+        duration: Total time including `setup`, seconds.
     """
 
     id: int
@@ -87,13 +87,13 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What the environments of a run are like.
+    """Configuration of the environments of a run.
 
     Attributes:
-        key: Equal for equal options: an environment that has it may be used again.
+        key: Equal for equal options; an environment with the same key can be reused.
         env_options: Options of `URLabEnv`.
         client_options: Options of the client.
-        lease_timeout: Seconds that an attempt waits for a free address.
+        lease_timeout: Longest wait of an attempt for a free address, seconds.
     """
 
     key: str
@@ -103,9 +103,9 @@ class Setup:
 
     @classmethod
     def of(cls, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> Self:
-        """Describe environments."""
+        """Build the configuration."""
         options = dict(env_options), dict(client_options)
-        dumps: Any = import_module("ray").cloudpickle.dumps  # functions, too, by their code
+        dumps: Any = import_module("ray").cloudpickle.dumps  # also serialises functions by value
         return cls(hashlib.sha256(dumps(options)).hexdigest(), *options, lease_timeout)
 
 

@@ -20,11 +20,11 @@ _SERVER_LEASE_S: Final = 30.0  # without a request
 
 
 class LeaseLost(URLabError):
-    """The lease ran out, or the actor that keeps the leases is gone."""
+    """The lease expired, or the actor that manages the leases is gone."""
 
 
 class Book:
-    """Who holds what until when. Runs as an asynchronous actor, so its methods never run in parallel."""
+    """The leases and their holders. Runs as an asynchronous actor, so its methods never run in parallel."""
 
     def __init__(self, addresses: Sequence[str], ttl: float) -> None:
         self._ttl = ttl
@@ -34,7 +34,7 @@ class Book:
         self._changed = asyncio.Condition()
 
     async def take(self, holder: str, timeout: float) -> str | None:
-        """Lease a free address, waiting for one; None after `timeout` seconds or when the holder was given up."""
+        """Lease a free address, waiting for one; None after `timeout` seconds or if the holder was released."""
         deadline = time.monotonic() + timeout
         self._waiting.add(holder)
         try:
@@ -51,13 +51,13 @@ class Book:
                     try:
                         await asyncio.wait_for(self._changed.wait(), max(ends - time.monotonic(), 0.0))
                     except TimeoutError:
-                        continue  # a lease ran out, or the time did
+                        continue  # a lease expired, or the timeout did
                 return None
         finally:
             self._waiting.discard(holder)
 
     async def renew(self, holder: str) -> bool:
-        """Prolong a lease; False when it ran out."""
+        """Renew a lease; False if it has expired."""
         self._expire()
         for address, lease in self._holders.items():
             if lease is not None and lease[0] == holder:
@@ -66,7 +66,7 @@ class Book:
         return False
 
     async def give_back(self, holder: str) -> None:
-        """Free what a holder has, and stop it from waiting; nothing when it has nothing."""
+        """Release the lease of a holder and end its wait; no effect if it has none."""
         async with self._changed:
             self._waiting.discard(holder)
             for address, lease in self._holders.items():
@@ -75,15 +75,15 @@ class Book:
             self._changed.notify_all()
 
     async def note_server_lease(self, address: str, lease_id: str) -> None:
-        """Remember the lease that a holder took of the server itself."""
+        """Store the lease that a holder acquired from the server itself."""
         self._server_leases[address] = lease_id
 
     async def server_lease(self, address: str) -> str | None:
-        """Return the latest lease that a holder took of the server itself."""
+        """Return the latest lease that a holder acquired from the server itself."""
         return self._server_leases.get(address)
 
     async def holders(self) -> dict[str, str | None]:
-        """Return the holder of each address, None where it is free."""
+        """Return the holder of each address; None if it is free."""
         self._expire()
         return {address: lease and lease[0] for address, lease in self._holders.items()}
 
@@ -95,7 +95,7 @@ class Book:
 
 
 class Lease:
-    """An address for the time being.
+    """A leased address.
 
     Attributes:
         address: The address.
@@ -109,10 +109,10 @@ class Lease:
         self._renewed = time.monotonic()
 
     def keep(self) -> None:
-        """Prolong the lease when a third of its time is over; to be called often.
+        """Renew the lease if a third of its time has passed. Call this often.
 
         Raises:
-            LeaseLost: It ran out, so that somebody else may use the address.
+            LeaseLost: The lease expired, and another holder may use the address.
         """
         now = time.monotonic()
         if now - self._renewed < self._ttl / 3:
@@ -123,13 +123,13 @@ class Lease:
 
     @contextmanager
     def of_server(self, client: URLabClient) -> Generator[None]:
-        """Hold the server's own lease, where it has one, so that clients outside the pool see that it is in use.
+        """Hold the server's own lease, if it supports leases, so that clients outside the pool see that it is in use.
 
-        Every step prolongs it, and it is given back at the end. One that was left by a holder who was killed is taken
-        over, and the robots with it: the pool says that nobody has the address any more.
+        Every step renews it, and it is released at the end. The lease of a killed holder is taken over together with
+        the robots, because the pool has freed the address.
 
         Raises:
-            LeaseBusy: Somebody outside the pool uses the server.
+            LeaseBusy: A client outside the pool is using the server.
         """
         if not client.server.features.leases:
             yield
@@ -147,15 +147,15 @@ class Lease:
             _ask(self._book.note_server_lease.remote(self.address, lease_id), _REPLY_S)
             yield
         finally:
-            with suppress(URLabError):  # with the server, or after a long pause, the lease is gone too
+            with suppress(URLabError):  # if the server is gone, or after a long pause, so is the lease
                 client.farm.release_lease(lease_id)
 
 
 class LeasePool:
     """Addresses that workers lease, kept by an actor on the driver's node.
 
-    May be shared by several runs and sent to tasks and actors. A lease that is neither prolonged nor given back, as
-    when its holder was killed, is free again after `ttl`; `rollouts` gives back earlier for workers that it saw die.
+    May be shared by several runs and sent to tasks and actors. A lease that is neither renewed nor released, for
+    example because its holder was killed, expires after `ttl`; `rollouts` releases the leases of dead workers earlier.
     The actor lives as long as the driver, or until `close()`.
     """
 
@@ -163,12 +163,12 @@ class LeasePool:
         """Start the actor.
 
         Args:
-            addresses: Servers in play that all have the same scene.
-            name: What `Episode.scene` says for them.
-            ttl: Seconds after which a lease ends that is not prolonged.
+            addresses: Addresses of servers in play with the same scene.
+            name: Name of the pool in `Episode.scene`.
+            ttl: Seconds after which a lease expires unless it is renewed.
 
         Raises:
-            ValueError: No address, one twice, or a `ttl` that is not above 0.
+            ValueError: There is no address, one occurs twice, or `ttl` is not above 0.
             URLabError: Ray is not initialised.
         """
         if not addresses or len(set(addresses)) != len(addresses):
@@ -189,14 +189,14 @@ class LeasePool:
 
     @contextmanager
     def lease(self, holder: str, *, timeout: float = 60.0) -> Generator[Lease]:
-        """Lease an address and give it back at the end.
+        """Lease an address and release it at the end.
 
         Args:
-            holder: A name that nobody else uses.
+            holder: A unique name.
             timeout: Seconds to wait for a free address.
 
         Raises:
-            LeaseLost: None was free in time, or the pool is gone.
+            LeaseLost: No address was free in time, or the pool is gone.
         """
         address = _ask(self._book.take.remote(holder, timeout), timeout + _REPLY_S)
         if address is None:
@@ -204,16 +204,16 @@ class LeasePool:
         try:
             yield Lease(self._book, holder, address, self._ttl)
         finally:
-            with suppress(LeaseLost):  # with the pool, the lease is gone too
-                # Waits, because a process that ends at once would not have sent it.
+            with suppress(LeaseLost):  # if the pool is gone, so is the lease
+                # Waits, because a process that exits immediately would not send it.
                 _ask(self._book.give_back.remote(holder), _REPLY_S)
 
     def give_back(self, holder: str) -> None:
-        """Free what a holder has leased, without waiting for it."""
+        """Release the lease of a holder, without waiting for it."""
         self._book.give_back.remote(holder)
 
     def holders(self) -> dict[str, str | None]:
-        """Return the holder of each address, None where it is free.
+        """Return the holder of each address; None if it is free.
 
         Raises:
             LeaseLost: The pool is gone.
@@ -221,7 +221,7 @@ class LeasePool:
         return _ask(self._book.holders.remote(), _REPLY_S)
 
     def close(self) -> None:
-        """End the actor; leases cannot be prolonged any more."""
+        """Stop the actor; leases can no longer be renewed."""
         _ray.kill(self._book)
 
 

@@ -1,4 +1,4 @@
-"""`rollouts`: many episodes on the workers of a Ray cluster, handed out as they finish."""
+"""`rollouts`: many episodes on the workers of a Ray cluster, returned as they finish."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Rollouts", "rollouts"]
 log: logging.Logger = logging.getLogger("urlab_client.cluster")
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
-_SLICE_S: Final = 0.2  # how soon a cancelled reader and an overdue episode are noticed
+_SLICE_S: Final = 0.2  # how often cancelled readers and overdue episodes are checked
 _FETCH_S: Final = 60.0
 
 
@@ -39,16 +39,16 @@ class _Running:
 class _Starting:
     worker: Any
     kept: bool
-    """From an earlier run: it may have died since, which is no failure of this one."""
+    """Whether it comes from an earlier run; if it has died since, that is not a failure of this run."""
 
 
 class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
-    """The episodes of a run, in the order in which they finish; iterate with `for` or `async for`, once.
+    """The episodes of a run in the order in which they finish. Iterate once, with `for` or `async for`.
 
-    Work is done while somebody iterates: each worker has one episode, finished or not, that nobody took yet, and gets
-    the next one when that was taken. Closing ends the workers and their servers and gives back the leases; it happens
-    by itself after the last episode and after an error. Use it as a context manager when leaving early. Workers of a
-    `WorkerPool` go back to it, except those that are in the middle of an episode.
+    Iterating drives the run: each worker holds one episode, running or finished, and gets the next one after you have
+    taken it. Closing ends the workers and their servers and releases the leases. It happens automatically after the
+    last episode and after an error; use the object as a context manager to leave early. Workers of a `WorkerPool`
+    return to it, except those in the middle of an episode.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         self._start_timeout = start_timeout
         self._workers = workers
         self._owns_workers = owns_workers
-        self._kept: list[Any] | None = None  # none lent yet
+        self._kept: list[Any] | None = None  # none borrowed yet
         self._starting: dict[Any, _Starting] = {}
         self._idle: list[Any] = []
         self._running: dict[Any, _Running] = {}
@@ -100,7 +100,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         while not self._finished:
             if self._over():
                 raise StopAsyncIteration
-            # What a turn finds stays in `_finished`, so a reader that is cancelled meanwhile loses nothing.
+            # Results stay in `_finished`, so a cancelled reader loses nothing.
             await anyio.to_thread.run_sync(self._turn)
         return self._finished.popleft()
 
@@ -121,7 +121,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         self.close()
 
     def close(self) -> None:
-        """End the workers with their servers, and give back the leases. Idempotent; waits for nothing."""
+        """End the workers and their servers, and release the leases. Idempotent; does not wait."""
         if self._closed:
             return
         self._closed = True
@@ -144,7 +144,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         return self._closed
 
     def _turn(self) -> None:
-        """Hand out work, wait a moment for what finishes, and look after what failed."""
+        """Assign work, wait briefly for results, and handle failures."""
         if self._reading:
             raise RuntimeError("Rollouts are read by one reader at a time")
         self._reading = True
@@ -205,10 +205,10 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
             cause = error.cause if isinstance(error.cause, Exception) else error
             self._idle.append(running.worker)
             if not isinstance(cause, URLabError):
-                # A policy that raises would do so again.
+                # A policy that raises would raise again.
                 raise RolloutError(f"Episode {running.job.id} raised {type(cause).__name__}: {cause}") from error
             self._again(running.job, cause)
-        except _ray.exceptions.RayError as error:  # the worker, its node or the result is gone
+        except _ray.exceptions.RayError as error:  # the worker, its node or the result is lost
             self._end(running.worker, running.job)
             self._again(running.job, error)
         else:
@@ -263,36 +263,36 @@ def rollouts(
     start_timeout: float = 120.0,
     lease_timeout: float = 60.0,
 ) -> Rollouts:
-    """Run `n` episodes on the cluster and hand them out as they finish, each exactly once.
+    """Run `n` episodes on the cluster and return each of them exactly once, as they finish.
 
-    An episode whose worker, node, server or lease fails is run again from its start, with the same seed and so with
-    the same result, elsewhere if need be. Attempts that failed leave nothing in the output.
+    If the worker, node, server or lease of an episode fails, the episode runs again from its start, elsewhere if
+    necessary, with the same seed and therefore the same result. Failed attempts do not appear in the output.
 
     Args:
-        policy: Sent to the workers by value; each episode starts with a fresh copy.
-        scenes: `sim://MODEL` addresses, to be served by the workers, in blocks of `n / len(scenes)` episodes; or a
-            pool of addresses to lease, one per episode.
+        policy: The policy, sent to the workers by value; each episode starts with a fresh copy.
+        scenes: `sim://MODEL` addresses that the workers serve, in blocks of `n / len(scenes)` episodes; or a pool of
+            addresses to lease, one per episode.
         n: Number of episodes.
-        ids: Those of the episodes 0 to n - 1 that are to be run, such as `missing_ids` of an earlier run; all for None.
+        ids: Ids of the episodes to run, from 0 to n - 1, such as `missing_ids` of an earlier run; None for all.
         seed: Seed of the run.
         max_episode_steps: Actions after which an episode is truncated.
         env_options: Further options of `URLabEnv`: `task`, `randomise`, `observations`, `cameras`, `space_mode`,
             `reward_fn`, `termination_fn`, `n_substeps`, `reset_noise`, `keyframe`.
         client_options: Further options of the workers' clients.
-        workers: Workers that stay up after the run, instead of the run's own.
-        n_workers: Largest number of workers, which is also that of episodes in flight; 0 for one per processor of the
-            cluster, or per address of the pool. `workers` has its own number, and its own options.
+        workers: Pool of workers to use; otherwise the run starts its own.
+        n_workers: Maximum number of workers and of episodes in flight; 0 for one per processor of the cluster, or per
+            address of the pool. Not with `workers`, which has its own number and options.
         worker_options: Options of the Ray actors, such as `num_cpus` or `resources`; one processor each by default.
-        retries: Attempts of an episode after the first one.
-        episode_timeout: Seconds for an attempt, after which its worker is ended.
-        start_timeout: Seconds without any worker after which the run fails.
-        lease_timeout: Seconds that an attempt waits for a free address.
+        retries: Number of attempts of an episode after the first one.
+        episode_timeout: Longest duration of an attempt, after which its worker is killed, seconds.
+        start_timeout: Time without any worker after which the run fails, seconds.
+        lease_timeout: Longest wait of an attempt for a free address, seconds.
 
     Returns:
-        The episodes. Iterating raises `RolloutError` when an episode failed for good.
+        The episodes. Iterating raises `RolloutError` if an episode fails permanently.
 
     Raises:
-        ValueError: An option out of range, one that belongs to `workers`, or a scene that is not `sim://`.
+        ValueError: An option is out of range or belongs to `workers`, or a scene is not a `sim://` address.
         URLabError: Ray is not initialised.
     """
     names = [scenes.name] if isinstance(scenes, LeasePool) else [scenes] if isinstance(scenes, str) else list(scenes)

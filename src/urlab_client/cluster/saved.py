@@ -1,4 +1,4 @@
-"""Episodes as files of a folder, so that a run can go on where it was interrupted."""
+"""Episodes as files in a folder, so that an interrupted run can continue."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ _ABOUT: Final = "about"
 
 
 def save_episode(episode: Episode, folder: str | os.PathLike[str]) -> Path:
-    """Write an episode to `folder/episode_ID.npz`, in place of one that is there.
+    """Write an episode to `folder/episode_ID.npz`, replacing an existing file.
 
-    The file appears when it is whole: a driver that is killed meanwhile leaves none, or the one before.
+    The file appears only when it is complete; if the driver is killed, there is no file, or the previous one.
 
     Args:
         episode: The episode.
-        folder: Made where there is none.
+        folder: The folder, created if missing.
 
     Returns:
-        The file. It holds plain arrays, and what is not one as JSON under `about`.
+        The file. It contains plain arrays, and everything else as JSON under `about`.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     path = _path(folder, episode.id)
@@ -57,11 +57,11 @@ def save_episode(episode: Episode, folder: str | os.PathLike[str]) -> Path:
 
 
 def load_episodes(folder: str | os.PathLike[str]) -> Iterator[Episode]:
-    """Read the episodes that were saved in a folder, in the order of their ids, one at a time.
+    """Read the episodes in a folder one at a time, in the order of their ids.
 
     Raises:
-        OSError: There is no such folder, or a file cannot be read.
-        ValueError: A file holds no episode.
+        OSError: The folder does not exist, or a file cannot be read.
+        ValueError: A file does not contain an episode.
     """
     for path in _saved(folder):
         about, file = _opened(path)
@@ -76,10 +76,10 @@ def load_episodes(folder: str | os.PathLike[str]) -> Iterator[Episode]:
 
 
 def missing_ids(folder: str | os.PathLike[str], n: int, *, seed: int = 0) -> list[int]:
-    """Return the ids of a run's episodes that are not in a folder yet: `rollouts(…, n, seed=seed, ids=…)`.
+    """Return the ids of a run's episodes that are not yet in a folder: `rollouts(…, n, seed=seed, ids=…)`.
 
     Args:
-        folder: Where `save_episode` put the others; there may be none yet.
+        folder: Folder used with `save_episode`; it may not exist yet.
         n: Number of episodes of the run.
         seed: Seed of the run.
 
@@ -117,7 +117,7 @@ def _opened(path: Path) -> tuple[dict[str, Any], Any]:
 
 
 def _leaves(values: Any, place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], NDArray[Any]]]:
-    """Yield the arrays of nested dictionaries with the keys that lead to them."""
+    """Yield the arrays of nested dictionaries with their key paths."""
     if not isinstance(values, Mapping):
         yield place, values
         return

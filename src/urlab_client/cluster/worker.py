@@ -21,9 +21,9 @@ _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unk
 
 
 class Worker:
-    """Runs episodes. A simulated server serves them until another scene, other options or a failure come.
+    """Runs episodes. It keeps its simulated server until the scene or options change, or until a failure.
 
-    The server is a child process that ends with this one, however that ends.
+    The server is a child process that ends with this one, even if this one is killed.
     """
 
     def __init__(self) -> None:
@@ -31,14 +31,14 @@ class Worker:
         self._env: URLabEnv | None = None
 
     def node_id(self) -> str:
-        """Return Ray's id of this node; that it answers says that the worker is up."""
+        """Return Ray's id of this node; the answer shows that the worker is up."""
         return str(_ray.get_runtime_context().get_node_id())
 
     def run(self, policy: Policy, setup: Setup, job: Job) -> Episode:
         """Run one attempt of an episode.
 
         Raises:
-            LeaseBusy: Somebody outside the pool uses the leased server.
+            LeaseBusy: A client outside the pool is using the leased server.
             URLabError: The server or the lease failed.
         """
         try:
@@ -50,13 +50,13 @@ class Worker:
                     with lease.of_server(env.client):
                         return self._run(policy, setup, job, lease)
                 finally:
-                    self.close()  # before somebody else gets the address
+                    self.close()  # before another holder gets the address
         except BaseException:
-            self.close()  # the next attempt starts afresh
+            self.close()  # the next attempt starts from scratch
             raise
 
     def close(self) -> None:
-        """End the simulated server. Idempotent."""
+        """Stop the simulated server. Idempotent."""
         env, self._env = self._env, None
         if env is not None:
             env.close()
@@ -112,7 +112,7 @@ def _float32(action: Any) -> Any:
     if isinstance(action, Mapping):
         given = cast("Mapping[str, Any]", action)
         return {key: _float32(value) for key, value in given.items()}
-    return np.array(action, dtype=np.float32)  # a copy: a policy may fill one array again and again
+    return np.array(action, dtype=np.float32)  # a copy, because a policy may reuse its array
 
 
 def _stacked(rows: Sequence[Any]) -> Any:
@@ -133,13 +133,13 @@ def run_episode(
     env_options: Mapping[str, Any] = MappingProxyType({}),
     client_options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Episode:
-    """Run one episode of a run in this process: as a Ray task, `ray.remote(run_episode).remote(policy, scene, i)`.
+    """Run one episode in this process, for example as a Ray task: `ray.remote(run_episode).remote(policy, scene, i)`.
 
-    A simulated server is started for it and ended after it. The result has the arrays, bit for bit, of the episode
-    that `rollouts` hands out for the same arguments, so Ray may run the task again wherever it likes.
+    Starts a simulated server for the episode and stops it afterwards. The result has the same arrays, bit for bit, as
+    the episode that `rollouts` returns for the same arguments, so Ray may repeat the task anywhere.
 
     Args:
-        policy: See `rollouts`, here and for all other arguments.
+        policy: See `rollouts` for this and all other arguments.
         scene: `sim://MODEL` address.
         episode: Id of the episode.
         seed: Seed of the run.
@@ -148,7 +148,7 @@ def run_episode(
         client_options: Further options of the client.
 
     Returns:
-        The episode. Its `attempt` is 1: Ray does not say how often it tried.
+        The episode. `attempt` is always 1, because Ray does not report its attempts.
 
     Raises:
         URLabError: The server failed.

@@ -20,15 +20,15 @@ class WorkerPool:
     """Workers for several runs, one run at a time: `rollouts(…, workers=pool)`.
 
     They start with the first run that needs them. Between two runs they wait, each with the simulated server of its
-    last scene, which the next run goes on with if its scene and options are the same. Each holds its processor
-    meanwhile. A worker that died, alone or with its node, is replaced in the next run.
+    last scene, which the next run reuses if its scene and options are the same. Each occupies its processor meanwhile.
+    A worker that died, alone or with its node, is replaced in the next run.
     """
 
     def __init__(self, n_workers: int = 0, *, worker_options: Mapping[str, Any] = MappingProxyType({})) -> None:
-        """Make a pool without workers.
+        """Create a pool without workers.
 
         Args:
-            n_workers: Largest number of workers; 0 for one per processor of the cluster, or per leased address.
+            n_workers: Maximum number of workers; 0 for one per processor of the cluster, or per leased address.
             worker_options: Options of the Ray actors, such as `num_cpus` or `resources`; one processor each by default.
 
         Raises:
@@ -44,7 +44,7 @@ class WorkerPool:
         options = {"num_cpus": 1, "scheduling_strategy": "SPREAD", **worker_options, "max_restarts": 0}
         self._actor = _ray.remote(Worker).options(**options)
         self._waiting: list[Any] = []
-        self._run: weakref.ref[object] | None = None  # a run that nobody holds any more has no workers either
+        self._run: weakref.ref[object] | None = None  # a garbage-collected run has no workers
         self._closed = False
 
     def __enter__(self) -> Self:
@@ -57,11 +57,11 @@ class WorkerPool:
 
     @property
     def size(self) -> int:
-        """Number of workers that wait for a run."""
+        """Number of idle workers."""
         return len(self._waiting)
 
     def lend(self, run: object) -> list[Any]:
-        """Hand all workers to a run, which gives back those that are left of them; used by `rollouts`.
+        """Lend all workers to a run, which returns the remaining ones; used by `rollouts`.
 
         Raises:
             URLabError: Another run has them, or the pool is closed.
@@ -79,7 +79,7 @@ class WorkerPool:
         return self._actor.remote()
 
     def give_back(self, workers: Sequence[Any]) -> None:
-        """Take the workers of a run that is over; used by `rollouts`."""
+        """Take back the workers of a finished run; used by `rollouts`."""
         self._run = None
         if self._closed:
             _end(workers)
@@ -87,7 +87,7 @@ class WorkerPool:
             self._waiting.extend(workers)
 
     def close(self) -> None:
-        """End the workers and their servers; those of a run that goes on end with it. Idempotent; waits for nothing."""
+        """End the workers and their servers; those of a current run end with it. Idempotent; does not wait."""
         self._closed = True
         _end(self._waiting)
         self._waiting.clear()

@@ -1,1 +1,1 @@
-"""Bridges to other libraries, each behind an optional extra and imported only when asked for."""
+"""Integrations with other libraries, each behind an optional extra and imported on demand."""

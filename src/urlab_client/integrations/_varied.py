@@ -1,4 +1,4 @@
-"""What a server varies from episode to episode, from the client's side."""
+"""Variation from episode to episode, as seen by the client."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ __all__ = ["OVER_WIRE", "VariedOverWire", "controlled_actuators", "variation_of"
 
 @dataclass(eq=False)
 class VariedOverWire:
-    """What an environment varies by ops, on a server that varies nothing by itself.
+    """What an environment varies by ops, on a server that varies nothing itself.
 
     Attributes:
-        declaration: What it varies.
-        draws: What was drawn for the present episode; None before the first.
+        declaration: What varies.
+        draws: The values drawn for the current episode; None before the first.
     """
 
     declaration: Randomisation
@@ -34,18 +34,18 @@ class VariedOverWire:
 
 
 OVER_WIRE: WeakKeyDictionary[URLabClient, VariedOverWire] = WeakKeyDictionary()
-"""By client: for recordings, which follow the client and know nothing of environments."""
+"""Variation by ops, by client. Recordings use it, because they see the client but not the environment."""
 
 
 def variation_of(
     client: URLabClient, model: mujoco.MjModel, layouts: Mapping[str, ArticulationLayout]
 ) -> Variation | None:
-    """Return how the server varies its scene, None if it does not.
+    """Return how the server varies its scene, or None if it does not.
 
     Args:
         client: The client, after the handshake.
-        model: Its model.
-        layouts: Where the articulations are in the model, by key.
+        model: The client's model.
+        layouts: Layouts of the articulations in the model, by key.
     """
     from urlab_client.randomise.variation import Variation, declared_in  # noqa: PLC0415
 
@@ -56,11 +56,11 @@ def variation_of(
 
 
 def controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
-    """Return the actuators that a controller with gains drives, by their numbers in the model.
+    """Return the model ids of the actuators that a controller with gains drives.
 
     Args:
         client: The client, after the handshake.
-        layouts: Where the articulations are in the model, by key.
+        layouts: Layouts of the articulations in the model, by key.
     """
     controlled: set[int] = set()
     for key, articulation in client.articulations.items():

@@ -1,6 +1,6 @@
 """Vocabulary of the op declarations: `Request`, `Reply`, `Op` and the field types they share.
 
-For whoever declares an op (`messages/*`) or derives something from the declarations. No I/O.
+For modules that declare ops (`messages/*`) or derive something from the declarations. No I/O.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ __all__ = [
 ]
 
 Floats: TypeAlias = NDArray[np.float64]
-"""A vector of numbers on the wire, an array of shape `(n,)` here."""
+"""A vector of numbers on the wire; here an array of shape `(n,)`."""
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
 
 
 DialectName: TypeAlias = Literal["alpha", "beta"]
-"""The generations of the plugin whose whole wire is known; see `protocol.dialects`."""
+"""The supported wire dialects of the plugin; see `protocol.dialects`."""
 
 
 def doc(text: str) -> Meta:
@@ -80,13 +80,13 @@ R_co = TypeVar("R_co", bound=Reply, covariant=True)
 
 
 class Request(Struct, Generic[R_co], tag_field="op", kw_only=True, omit_defaults=True):
-    """A question whose answer is an `R_co`. The session stamps `session_id` when it sends it."""
+    """A request whose reply is an `R_co`. The session sets `session_id` when it sends the request."""
 
     session_id: Annotated[str, doc("Session id from the latest `hello_ok`.")] = ""
 
 
 class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=True):
-    """A request that writes to a robot, which some servers accept only from the robot's owner."""
+    """A request that writes to a robot. Some servers accept it only from the robot's owner."""
 
     control_owner: Annotated[
         str | None, doc("Name of the client that writes; absent stands for the session. Not known to the alpha.")
@@ -94,11 +94,11 @@ class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=T
 
 
 EDITOR_TIMEOUT_S: Final = 30.0
-"""Seconds to wait for an editor op: it waits for the game thread, which level or mesh work can hold for long."""
+"""Timeout of an editor op, seconds: it waits for the game thread, which level or mesh work can occupy for long."""
 
 
 class Needs(StrEnum):
-    """What a server must have running for an op: the op's category on the wire."""
+    """What must be running on the server for an op; the op's category on the wire."""
 
     NOTHING = "no_manager"
     EDITOR = "editor_only"
@@ -106,38 +106,38 @@ class Needs(StrEnum):
 
 
 class Effect(StrEnum):
-    """What the caller may assume when the reply to an op is lost."""
+    """What the caller may assume if the reply to an op is lost."""
 
     READ = "read"
-    """Changes nothing: may be sent again."""
+    """Changes nothing, so it may be sent again."""
     WRITE = "write"
-    """May have been executed: never sent again by itself."""
+    """May have been executed, so it is never sent again automatically."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)  # there is one of each
+@dataclass(frozen=True, kw_only=True, eq=False)  # each op is a single object
 class Op:
-    """One op, declared once. Everything that knows an op derives from this.
+    """The declaration of an op, from which everything else is derived.
 
     Attributes:
-        request: The request struct; its tag is the op's name.
+        request: The request struct; its tag is the name of the op.
         ns: Namespace on the client (`scene`, …); empty for ops of the client itself.
         method: Name of the client's method; defaults to the op's name.
         needs: What must be running.
         effect: Whether it may be sent again after a lost reply.
-        timeout: Seconds to wait for the reply at least; None leaves it to the client's default.
-        hot: Built by the client itself at kilohertz rates or with megabytes in it: sent without checking the struct's
-            field types again, and decoded by the server in one go.
+        timeout: Minimum time to wait for the reply, seconds; None for the client's default.
+        hot: Built by the client itself at kilohertz rates or with megabytes of data: sent without checking the struct's
+            field types again, and decoded by the server directly.
         infinite: Request fields whose numbers may be infinite; all others are finite.
-        errors: Codes the op itself can answer, besides the envelope's.
-        generated: Whether `tools/gen_ops.py` writes the client's method. Ops that mirror state or build handles
-            have theirs written by hand.
+        errors: Error codes of the op, in addition to those of every request.
+        generated: Whether `tools/gen_ops.py` writes the client's method. Methods of ops that mirror state or create
+            handles are written by hand.
         returns: For a generated method: name of the reply field to return, a class to fill from the reply's fields
             of the same names, or None.
-        positional: For a generated method: how many leading parameters are positional.
-        undeclared: Required fields that only the op's handler checks, so that `meta` does not list them.
-        declares: Reply fields as `meta` lists them, where the plugin's list differs from what it sends.
-        dialects: Generations of the plugin that offer it.
-        job: Whether the beta answers `op_started` and delivers the reply through `op_status`.
+        positional: For a generated method: number of leading positional parameters.
+        undeclared: Required fields that only the op's handler checks and `meta` does not list.
+        declares: Reply fields as `meta` lists them, if the plugin's list differs from what it sends.
+        dialects: Dialects that have the op.
+        job: Whether the beta answers with `op_started` and delivers the reply through `op_status`.
     """
 
     request: type[Request[Any]]

@@ -1,4 +1,4 @@
-"""The errors that the client finds itself: connection, deadlines, bytes, versions, streams. No answer of a server."""
+"""Errors detected by the client: connection, deadlines, bytes, versions, streams."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def _rebuild(cls: type[URLabError], args: tuple[Any, ...], state: dict[str, Any]
 
 
 def _sentence(text: str) -> str:
-    """Return a text that another sentence may follow: a server's message may lack its full stop."""
+    """Return a text that ends with a full stop, which a server's message may lack."""
     return text if not text or text.endswith((".", "!", "?", "…")) else f"{text}."
 
 
 class URLabError(Exception):
-    """Base of everything this package raises on purpose.
+    """Base class of all exceptions of this package.
 
     Attributes:
         op: Name of the op that failed, or None.
-        code: Short stable code; empty where no server was involved.
-        hint: What to do next; part of `str()` already.
+        code: Short stable code; empty if no server was involved.
+        hint: What to do next; included in `str()`.
     """
 
     op: str | None
@@ -60,7 +60,7 @@ class URLabError(Exception):
         return f"{_sentence(text)} {self.hint}" if self.hint else text
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the error as data that JSON can hold: `error` (the class), `message`, `op`, `code` and `hint`."""
+        """Return the error as JSON-compatible data: `error` (the class), `message`, `op`, `code` and `hint`."""
         return {
             "error": type(self).__name__,
             "message": str(self),
@@ -74,7 +74,7 @@ class URLabError(Exception):
 
 
 class URLabConnectionError(URLabError, ConnectionError):
-    """The link to the server is unusable."""
+    """The connection to the server cannot be used."""
 
 
 class ServerUnreachable(URLabConnectionError):
@@ -82,18 +82,18 @@ class ServerUnreachable(URLabConnectionError):
 
 
 class AuthenticationFailed(ServerUnreachable):
-    """Server and client do not accept each other's CURVE keys, or only one of them uses such keys; nothing was sent."""
+    """Server and client do not accept each other's CURVE keys, or only one of them uses keys; nothing was sent."""
 
 
 class ConnectionLost(URLabConnectionError):
-    """The connection broke. Nothing that changes the simulation was under way."""
+    """The connection was lost. No request that changes the simulation was in progress."""
 
 
 class OutcomeUnknown(URLabConnectionError):
-    """The connection broke after a request was sent that changes state: it may or may not have been executed.
+    """The connection was lost after a request that changes state was sent; it may or may not have been executed.
 
     Attributes:
-        job_id: The editor's job that carries it out, if it is one.
+        job_id: The editor's job that executes it, if any.
     """
 
     job_id: str | None = None
@@ -104,24 +104,24 @@ class ClientClosed(URLabConnectionError):
 
 
 class ForkedError(URLabConnectionError):
-    """The client was made in another process; a forked child must make its own."""
+    """The client was created in another process; a forked child must create its own."""
 
 
 class URLabTimeoutError(URLabError, TimeoutError):
     """No reply arrived within the deadline. A request that was sent may still be executed by the server.
 
     Attributes:
-        job_id: The editor's job that carries it out, if it is one; it goes on.
+        job_id: The editor's job that executes it, if any; it continues.
     """
 
     job_id: str | None = None
 
 
 class NotSettled(URLabTimeoutError):
-    """Joints are not where `move_to()` was to take them. Their set-points stay.
+    """Joints did not reach the targets of `move_to()`. Their set-points are kept.
 
     Attributes:
-        remaining: How far each of them has to go, by joint name: radians or metres, with sign.
+        remaining: Signed distance to the target by joint name, radians or metres.
     """
 
     remaining: dict[str, float]
@@ -135,7 +135,7 @@ class PictureTimeout(URLabTimeoutError):
     """Cameras delivered no picture in time.
 
     Attributes:
-        cameras: Which ones.
+        cameras: Names of the cameras.
     """
 
     cameras: list[str]
@@ -146,7 +146,7 @@ class PictureTimeout(URLabTimeoutError):
 
 
 class ProtocolError(URLabError):
-    """A frame from the server could not be understood.
+    """A frame from the server could not be decoded.
 
     Attributes:
         raw: The first bytes of the frame.
@@ -160,7 +160,7 @@ class ProtocolError(URLabError):
 
 
 class ReadOnlyClient(URLabError):
-    """The client looks on and asks the server for nothing: it was made with `read_only=True`. Nothing was sent."""
+    """The client was created with `read_only=True` and sends no requests. Nothing was sent."""
 
 
 class URLabVersionMismatch(URLabError):
@@ -189,10 +189,10 @@ class URLabVersionMismatch(URLabError):
 
 
 class StreamOverflow(URLabError):
-    """A stream read with policy `all` fell behind its bounded buffer. Reading goes on with the oldest that is left.
+    """A stream with policy `all` overflowed its bounded buffer. Reading continues with the oldest remaining message.
 
     Attributes:
-        lost: Messages that were lost.
+        lost: Number of lost messages.
     """
 
     lost: int

@@ -1,4 +1,4 @@
-"""What a client says of itself: how it was made, its server, what it has found out."""
+"""Types that describe a client: its configuration, its server, its diagnoses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 
 class Verdict(StrEnum):
-    """How serious a finding is."""
+    """Severity of a finding."""
 
     OK = "ok"
     NOTE = "note"
@@ -35,12 +35,12 @@ class Verdict(StrEnum):
 
 
 class Finding(Serializable, Struct, frozen=True):
-    """One thing that `client.explain()` looked at.
+    """One result of `client.explain()`.
 
     Attributes:
         verdict: `OK`, `NOTE` (worth knowing) or `PROBLEM` (keeps robots from moving).
-        subject: What it is about: `server`, `play`, an articulation's key, …
-        text: What is the case, and what to do about it.
+        subject: Subject of the finding: `server`, `play`, an articulation's key, …
+        text: Description of the state, and what to do about it.
     """
 
     verdict: Verdict
@@ -49,17 +49,17 @@ class Finding(Serializable, Struct, frozen=True):
 
 
 class Diagnosis(Serializable, Struct, frozen=True):
-    """What `client.explain()` found, from the sockets inwards; `print()` shows it line by line.
+    """The findings of `client.explain()`, from the sockets inwards; `print()` shows one per line.
 
     Attributes:
-        findings: In the order of examination.
+        findings: The findings, in the order in which they were checked.
     """
 
     findings: list[Finding]
 
     @property
     def healthy(self) -> bool:
-        """Whether nothing keeps the robots from moving."""
+        """Whether nothing prevents the robots from moving."""
         return all(finding.verdict is not Verdict.PROBLEM for finding in self.findings)
 
     def __repr__(self) -> str:
@@ -73,21 +73,21 @@ class Diagnosis(Serializable, Struct, frozen=True):
 
 
 class Resync(Serializable, Struct, frozen=True, kw_only=True):
-    """What `client.resync()` found out.
+    """The result of `client.resync()`.
 
     Attributes:
-        session_held: Whether the server still knew the session: it neither restarted nor was taken over.
-        session_renewed: Whether a new session was opened: because the old one was gone, or so that a request which
-            may still travel is refused when it arrives.
-        playing: Whether a play session runs. Without one there is no state: `step` and `time` are 0.
-        step: The server's step counter; counts from the session's beginning or the last reset.
+        session_held: Whether the session was still valid: the server was neither restarted nor taken over.
+        session_renewed: Whether a new session was opened, because the old one was lost, or so that the server refuses a
+            request that may still arrive.
+        playing: Whether a play session is running. Without one there is no state: `step` and `time` are 0.
+        step: The server's step counter since the beginning of play or the last reset.
         time: Simulation time, seconds.
-        steps_sent: Steps in doubt: sent since the last reply, their own replies lost. Pushes in puppet mode.
-        steps_applied: How many of those were executed; None where it cannot be known, because the session was gone or
-            something else moved the counter as well.
-        reset_applied: Whether a reset in doubt was executed; None if there was none, or it cannot be known.
-        settled: Whether nothing that was in doubt can still take effect. False when the server has queued steps that it
-            could not do yet, as after `StepTimeout`.
+        steps_sent: Number of steps with an unknown outcome, whose replies were lost. Pushes in puppet mode.
+        steps_applied: Number of these that were executed; None if unknown, because the session was lost or something
+            else also changed the counter.
+        reset_applied: Whether a reset with an unknown outcome was executed; None if there was none, or if unknown.
+        settled: Whether none of the requests in doubt can still take effect. False if the server has queued steps, as
+            after `StepTimeout`.
     """
 
     session_held: bool
@@ -102,36 +102,37 @@ class Resync(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class CallOutcome(StrEnum):
-    """What became of a request."""
+    """Outcome of a request."""
 
     OK = "ok"
     REFUSED = "refused"
     """The server answered with an error."""
     TIMEOUT = "timeout"
-    """No reply in time, or no turn: the bytes sent tell which."""
+    """No reply, or no turn, in time; `sent_bytes` distinguishes the two."""
     LOST = "lost"
-    """No connection, or it broke."""
+    """No connection, or it was lost."""
     CANCELLED = "cancelled"
     FAILED = "failed"
-    """The request was malformed, or the reply."""
+    """The request or the reply was malformed."""
 
 
 class CallRecord(Serializable, Struct, frozen=True, kw_only=True):
-    """One request of a client, as `observe=` is told of it when it is over.
+    """One finished request of a client, as passed to `observe=`.
 
-    What follows from one call of a method may be several: `discover()` sends `hello` and `meta`, an editor's job is
-    asked after with `op_status`.
+    One method call may send several requests: `discover()` sends `hello` and `meta`, and an editor's job is polled with
+    `op_status`.
 
     Attributes:
-        op: Its op.
+        op: Name of the op.
         endpoint: The server's address.
-        started_ns: This machine's UTC clock when the request came up, nanoseconds.
-        queued_s: Seconds that it waited for other requests of this client.
-        round_trip_s: Seconds from sending to the reply, with the wait for a connection; 0 if it never got so far.
-        sent_bytes: Size of the request; with each repetition after a lost connection. 0 if it never got so far.
+        started_ns: UTC clock of this machine when the request was made, nanoseconds.
+        queued_s: Time spent waiting for other requests of this client, seconds.
+        round_trip_s: Time from sending to the reply, including the wait for a connection, seconds; 0 if it was not
+            sent.
+        sent_bytes: Size of the request, including repetitions after a lost connection; 0 if it was not sent.
         received_bytes: Size of the reply; 0 without one.
-        outcome: What became of it.
-        error: The server's code for what it refused, else the name of the exception; empty if all went well.
+        outcome: Outcome of the request.
+        error: The server's code if it refused the request, otherwise the name of the exception; empty on success.
     """
 
     op: str
@@ -146,7 +147,7 @@ class CallRecord(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
-    """The arguments a client was made with; see `URLabClient` for their meaning."""
+    """The arguments of a client; see `URLabClient`."""
 
     address: str = "tcp://localhost"
     step_mode: StepMode = StepMode.AUTO
@@ -175,14 +176,14 @@ class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class ServerInfo(Serializable, Struct, frozen=True, kw_only=True):
-    """What a server is and can do; see `client.server`.
+    """Identity and features of a server; see `client.server`.
 
     Attributes:
-        features: What it can do. Its `generation` is a name for people.
-        instance: Which of several servers it is; None before play, and from servers that do not tell.
-        urlab_version: Its version; not to be relied on.
-        mujoco_version: Version of its MuJoCo.
-        step_mode: What it called the step mode when the mode was last set; empty before.
+        features: What the server supports. `generation` is only for display.
+        instance: Identity among several servers; None before play, and if the server does not send it.
+        urlab_version: Version of the plugin, for display only.
+        mujoco_version: Version of the server's MuJoCo.
+        step_mode: The server's name of the step mode when the mode was last set; empty before that.
     """
 
     features: Features

@@ -1,7 +1,7 @@
 """Bytes to structs and back, with the plugin's conventions. No I/O.
 
 The plugin emits every number as a float64 and accepts any number; arrays of numbers are NumPy arrays in structs.
-Replies are msgpack unless the session asked for JSON, in which case binary values travel as base64 text under their
+Replies are msgpack unless the session requested JSON, in which case binary values travel as base64 text under their
 key plus `__b64__`. Unknown fields are ignored, so that an old client can talk to a newer server.
 """
 
@@ -48,14 +48,14 @@ MAX_REQUEST_BYTES = 64 * 1024 * 1024
 MAX_REPLY_BYTES = 2 * 1024 * 1024 * 1024
 
 _BINARY_SUFFIX = "__b64__"
-_COPY_SUFFIX = "_base64"  # a second copy of what is there as binary; see `HelloOk.mjb_base64`
+_COPY_SUFFIX = "_base64"  # a second copy of a binary field; see `HelloOk.mjb_base64`
 
 R = TypeVar("R", bound=Reply)
 Buffer = bytes | bytearray | memoryview
 
 _SHORT = 256  # values of a robot, not pixels
 
-# `_thread` and not `threading`: nothing here starts threads, but clients and servers call from several.
+# `_thread` instead of `threading`: this module starts no threads, but is called from several.
 _BUILDING = allocate_lock()
 _BUILD_S = 1.0
 
@@ -64,12 +64,12 @@ _OP_BY_REQUEST = {op.request: op for op in OPS.values()}
 
 @contextmanager
 def building() -> Generator[None]:
-    """Hold while msgspec first looks at a struct, to build a decoder or to convert.
+    """Hold while msgspec first inspects a struct, to build a decoder or to convert.
 
-    msgspec 0.22 keeps the description of a struct while it is still being made, and another thread that takes it then
-    crashes the process. Two clients that connect at the same time from two threads are enough.
+    msgspec 0.22 publishes the description of a struct before it is complete, and another thread that uses it crashes
+    the process. Two clients that connect at the same time from two threads are enough.
     """
-    # Nobody builds for so long: the lock was held in the process that this one is a fork of.
+    # No build takes this long: the lock was held in the parent when this process was forked.
     held = _BUILDING.acquire(timeout=_BUILD_S)
     try:
         yield
@@ -93,7 +93,7 @@ def from_wire_array(kind: type, value: Any) -> Any:
     if type(value) is list:
         numbers: list[Any] = value  # pyright: ignore[reportUnknownVariableType]  # `cast` is a call, for each array
         if len(numbers) <= _SHORT:
-            # Twice as fast as what follows, and it takes only numbers: whatever else there is falls through.
+            # Twice as fast as the code below, but only for numbers; everything else falls through.
             packed = np.empty(len(numbers))
             try:
                 _packer(len(numbers))(packed, 0, *numbers)
@@ -123,15 +123,15 @@ _json_encoder = msgspec.json.Encoder(enc_hook=_to_wire)
 
 
 def encode_message(message: Struct) -> bytes:
-    """Return a published message in msgpack, its numbers as they are."""
+    """Return a published message in msgpack, with unchanged numbers."""
     return _encoder.encode(message)
 
 
 def encode_request(request: Request[Any], session_id: str, *, json: bool = False) -> bytes:
-    """Stamp `session_id` on `request` and return the bytes to send.
+    """Set `session_id` on `request` and return the bytes to send.
 
     Raises:
-        TypeError: A field holds something that cannot be sent.
+        TypeError: A field contains a value that cannot be sent.
         ValueError: The request is larger than `MAX_REQUEST_BYTES`.
     """
     request.session_id = session_id
@@ -147,7 +147,7 @@ def encode_request(request: Request[Any], session_id: str, *, json: bool = False
 
 
 def _json_ascii(request: Request[Any]) -> bytes:
-    # The plugin cuts JSON by byte count after decoding, so anything but ASCII makes it read past the frame.
+    # The plugin truncates JSON by byte count after decoding, so non-ASCII text makes it read past the frame.
     text = _json_encoder.encode(request).decode()
     return re.sub(r"[^\x00-\x7f]", _escape, text).encode("ascii")
 
@@ -166,11 +166,11 @@ def _request_decoder(kind: type[Request[Any]]) -> msgspec.msgpack.Decoder[Reques
 def check_request(request: Request[Any], frame: bytes) -> None:
     """Check an encoded msgpack request against its own declaration.
 
-    msgspec validates on decoding only, so this decodes what is about to travel.
+    msgspec validates only on decoding, so this decodes the encoded request.
 
     Raises:
         TypeError: A field has the wrong type.
-        ValueError: A field has the right type and a wrong length or choice.
+        ValueError: A field has the right type but a wrong length or choice.
     """
     try:
         _request_decoder(type(request)).decode(frame)
@@ -182,10 +182,10 @@ def check_request(request: Request[Any], frame: bytes) -> None:
 
 
 def check_finite(request: Request[Any]) -> None:
-    """Check the numbers of a request: NaN and infinities pass every other check, and in JSON there are none.
+    """Check the numbers of a request: NaN and infinities pass all other checks, and JSON cannot represent them.
 
     Raises:
-        ValueError: Names the first one that is not finite, unless the op takes infinities there.
+        ValueError: A number is not finite, and the op does not accept infinities there. The message names it.
     """
     op = op_of(request)
     for name in request.__struct_fields__:
@@ -211,13 +211,13 @@ def _not_finite(value: Any, path: str) -> str | None:
     return next(filter(None, (_not_finite(item, where) for item, where in inside)), None)
 
 
-# Which of the editor's ops are jobs shows in the answer alone. That of `op_status` is never another job.
+# Only the answer shows whether an editor op is a job. The answer of `op_status` is never another job.
 _MAY_START = frozenset(op.reply for op in OPS.values() if op.needs is Needs.EDITOR) - {OpStatusOk}
 
 
 @cache
 def _answers(reply: type[Reply]) -> Any:
-    """Return the union of what may come instead of a reply."""
+    """Return the union of possible answers other than the reply."""
     return reply | ErrorReply | OpStarted if reply in _MAY_START else reply | ErrorReply
 
 
@@ -229,13 +229,13 @@ def _reply_decoder(reply: type[Reply]) -> msgspec.msgpack.Decoder[Reply]:
 
 
 def decode_answer(op: Op, reply: type[R], frame: Buffer) -> R | OpStarted:
-    """Decode the server's answer to `op`; whether it is msgpack or JSON shows in its first byte.
+    """Decode the server's answer to `op`; the first byte shows whether it is msgpack or JSON.
 
     Returns:
-        The reply, or the start of the job that will deliver it: `decode_job` then reads it.
+        The reply, or the start of the job that will deliver it; `decode_job` then decodes the reply.
 
     Raises:
-        URLabRPCError: The server refused.
+        URLabRPCError: The server refused the request.
         ProtocolError: The frame is not an answer to `op`.
     """
     if len(frame) > MAX_REPLY_BYTES:
@@ -253,10 +253,10 @@ def decode_answer(op: Op, reply: type[R], frame: Buffer) -> R | OpStarted:
 
 
 def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
-    """Decode the server's reply to `op`, as `decode_answer` does, where a job is not expected.
+    """Decode the server's reply to `op` like `decode_answer`, if no job is expected.
 
     Raises:
-        URLabRPCError: The server refused.
+        URLabRPCError: The server refused the request.
         ProtocolError: The frame is not the reply to `op`.
     """
     answer = decode_answer(op, reply, frame)
@@ -266,11 +266,11 @@ def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
 
 
 def decode_job(op: Op, reply: type[R], result: dict[str, Any]) -> R:
-    """Read what `op_status` hands over at the end of a job as if it had been the answer to `op`.
+    """Decode the result of a job from `op_status` as the answer to `op`.
 
     Raises:
-        URLabRPCError: The server refused.
-        ProtocolError: It is not an answer to `op`.
+        URLabRPCError: The server refused the request.
+        ProtocolError: The result is not an answer to `op`.
     """
     try:
         answer = _converted(reply, result)
@@ -284,7 +284,7 @@ def decode_job(op: Op, reply: type[R], result: dict[str, Any]) -> R:
 
 
 def _converted(reply: type[Reply], plain: Any) -> Reply:
-    _reply_decoder(reply)  # so that `convert` finds the structs described
+    _reply_decoder(reply)  # so that the structs are inspected before `convert`
     return msgspec.convert(plain, _answers(reply), strict=False, dec_hook=from_wire_array)
 
 
@@ -322,9 +322,9 @@ def _restore_binary(value: Any) -> Any:
 
 
 def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
-    """Return the bytes of a reply as the plugin would send it: every number a float64.
+    """Return the bytes of a reply as the plugin sends it, with every number as a float64.
 
-    `reply` is consumed: its integers are widened in place.
+    Modifies `reply`: its integers are widened in place.
     """
     widen = _widener(type(reply))
     if widen is not None:
@@ -336,7 +336,7 @@ def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
 
 
 def _spelled(value: Any) -> Any:
-    """Return a reply as the plugin spells it in JSON: bytes in base64 under a key of their own, numbers as `%.17g`."""
+    """Return a reply as the plugin encodes it in JSON: bytes as base64 under a separate key, numbers as `%.17g`."""
     match value:
         case dict():
             items = cast("dict[str, Any]", value).items()
@@ -350,18 +350,18 @@ def _spelled(value: Any) -> Any:
         case float() if math.isfinite(value):
             return msgspec.Raw(b"%.17g" % value)
         case _:
-            return value  # what is not finite becomes null: the plugin's JSON would be invalid
+            return value  # numbers that are not finite become null; the plugin's JSON would be invalid
 
 
-# Widening integers. Structs declare counters as `int` for the people who read them, the wire wants float64. Which
-# fields need it is worked out once per struct type; most structs need nothing or one assignment.
+# Widening integers. Structs declare counters as `int` for readability, but the wire uses float64. The affected fields
+# are determined once per struct type; most structs need no or one assignment.
 
 Widener = Callable[[Any], Any]
 
 
 @cache
 def _widener(struct: type[Struct]) -> Widener | None:
-    """Return a function that widens the numbers of a `struct` in place, or None if it can hold none."""
+    """Return a function that widens the integers of a `struct` in place, or None if it cannot contain any."""
     plan = [(f.name, widen) for f in msgspec.structs.fields(struct) if (widen := _plan(f.type, struct)) is not None]
     if not plan:
         return None
@@ -396,7 +396,7 @@ def _plan_info(info: msgspec.inspect.Type, owner: type[Struct]) -> Widener | Non
         case msgspec.inspect.DictType(value_type=item):
             return _each_value(_plan_info(item, owner))
         case msgspec.inspect.StructType(cls=cls):
-            # A struct that contains itself is looked up when it is met, not while its plan is being made.
+            # A recursive struct is looked up when it occurs, not while its plan is being built.
             return _widen_struct if cls is owner else _widener(cls)
         case msgspec.inspect.AnyType():
             return _widen_any

@@ -1,4 +1,4 @@
-"""Messages of the control and info sockets: streamed set-points, gains, and what each articulation has."""
+"""Messages of the control and info sockets: streamed set-points, gains, and descriptions of articulations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ControlPayload(Struct, frozen=True, eq=False):
     """Setpoints streamed to the server on a control topic.
 
     Attributes:
-        actuator_ids: Shape (n,), MuJoCo actuator ids. They are global: the topic's articulation does not limit them.
+        actuator_ids: Shape (n,), MuJoCo actuator ids. They are global and not limited to the topic's articulation.
         values: Shape (n,), setpoints in the actuators' own units.
     """
 
@@ -39,7 +39,7 @@ class ControlPayload(Struct, frozen=True, eq=False):
 
     @classmethod
     def decode(cls, payload: BytesLike, where: object = "") -> ControlPayload:
-        """Read a payload; bytes beyond its n entries are ignored. `where` names its source in errors."""
+        """Decode a payload; bytes beyond its n entries are ignored. `where` names its source in errors."""
         if len(payload) < INT32.size:
             raise damaged("control payload", where, f"{len(payload)} bytes, expected 4 + 8*n", payload)
         (n,) = INT32.unpack_from(payload)
@@ -67,12 +67,12 @@ class ControlPayload(Struct, frozen=True, eq=False):
 
 
 class JointGains(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """PD gains of one joint; what is None stays as it is.
+    """PD gains of one joint; None keeps the current value.
 
     Attributes:
         kp: Proportional gain.
         kv: Derivative gain.
-        torque_limit: Bound of the output, newton metres or newtons.
+        torque_limit: Limit of the output, newton metres or newtons.
     """
 
     kp: float | None = None
@@ -89,7 +89,7 @@ def encode_gains(gains: Mapping[str, JointGains]) -> bytes:
     Raises:
         ValueError: If a gain is NaN or infinite, which JSON cannot carry.
     """
-    # Escaped to ASCII: the plugin cuts JSON text by its byte count.
+    # Escaped to ASCII: the plugin truncates JSON text by its byte count.
     return json.dumps(msgspec.to_builtins(gains), separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
@@ -117,7 +117,7 @@ def gains_by_parameter(gains: Mapping[str, JointGains]) -> dict[str, dict[str, f
 
 
 class CameraEndpoint(Struct, frozen=True):
-    """Where a camera publishes.
+    """Endpoint of a camera's stream.
 
     Attributes:
         name: Camera name.
@@ -131,7 +131,7 @@ class CameraEndpoint(Struct, frozen=True):
 class _ActuatorList(Struct, tag_field="type", tag="actuator_list"):
     robot: str
     names: list[str]
-    # Floats: how the plugin's JSON writer prints whole numbers is not known.
+    # Floats, because the format of whole numbers in the plugin's JSON is not known.
     ids: list[float]
     mins: list[float]
     maxs: list[float]
@@ -142,14 +142,14 @@ _INFO = msgspec.json.Decoder(_ActuatorList)
 
 
 class ActuatorInfo(Struct, frozen=True, eq=False):
-    """What the info socket says about one articulation, a single JSON frame without topic.
+    """Description of one articulation on the info socket, a single JSON frame without a topic.
 
     Attributes:
         robot: Articulation key.
         names: Compiled actuator names, the articulation's prefix included.
         ids: Shape (n,), MuJoCo actuator ids, in the order of `names`.
-        mins: Shape (n,), lower control limits in the actuators' own units; -100 where there is none.
-        maxs: Shape (n,), upper control limits; 100 where there is none.
+        mins: Shape (n,), lower control limits in the actuators' own units; -100 if there is none.
+        maxs: Shape (n,), upper control limits; 100 if there is none.
         cameras: All cameras of the scene, not only this robot's.
     """
 

@@ -1,6 +1,7 @@
 """Controllers as a line of text: `pd`, `pd,kp=100,kv=5`, `passthrough`.
 
-The same on the command line, in level files and in an MJCF's `<custom><text name="urlab_controller" …/></custom>`.
+The syntax is the same on the command line, in level files and in an MJCF's `<custom><text name="urlab_controller"
+…/></custom>`.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ class ControllerText(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> ControllerText:
-        """Read a line.
+        """Parse a line.
 
         Raises:
-            ValueError: An unknown kind or gain, or a gain that is not a number of at least 0.
+            ValueError: The kind or a gain is unknown, or a gain is not a number of at least 0.
         """
         kind, *gains = (part.strip() for part in text.split(","))
         if kind not in [*ControllerKind]:

@@ -1,4 +1,4 @@
-"""What `client.describe()` and `articulation.describe()` return: robots as typed values that JSON can hold."""
+"""What `client.describe()` and `articulation.describe()` return: robots as typed, JSON-compatible values."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = [
 ]
 
 JointKind = Literal["free", "ball", "slide", "hinge"]
-"""What a joint allows: all of six degrees of freedom, three rotations, one translation, one rotation."""
+"""Kind of a joint: six degrees of freedom, three rotations, one translation, or one rotation."""
 
 SetPointMeaning = Literal["force", "position", "velocity", ""]
-"""What an actuator does with a set-point: make a force of it, or pull towards it; empty where that is not known."""
+"""What a set-point of an actuator means: a force, or a target to approach; empty if unknown."""
 
 
 class Pose(Serializable, Struct, frozen=True, kw_only=True):
-    """Where something is, in the world frame.
+    """Pose in the world frame.
 
     Attributes:
         position: Metres.
@@ -43,7 +43,7 @@ class Pose(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class JointDescription(Serializable, Struct, frozen=True, kw_only=True):
-    """One joint and where it is.
+    """One joint and its state.
 
     Attributes:
         name: Short name, without the articulation's prefix.
@@ -63,19 +63,19 @@ class JointDescription(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class ActuatorDescription(Serializable, Struct, frozen=True, kw_only=True):
-    """One actuator and what it is told.
+    """One actuator and its set-point.
 
     Attributes:
         name: Short name, without the articulation's prefix.
         kind: `motor`, `position`, `velocity`, …; None if unknown.
         joint: The joint that it drives, or None for other transmissions.
-        takes: What a set-point means: `force`, `position`, `velocity`, or empty where that is not known. While a PD
-            controller is in force every set-point is a `position`.
-        unit: Unit of a set-point, where it is known.
+        takes: What a set-point means: `force`, `position`, `velocity`, or empty if unknown. While a PD
+            controller is active, every set-point is a `position`.
+        unit: Unit of a set-point; empty if unknown.
         limits: (low, high) of a set-point, or None if unlimited.
         force_limits: (low, high) of the force in N or N m, or None if unlimited.
         gear: Ratio from the actuator's force to that on the joint; None for other transmissions.
-        set_point: What the next step sends.
+        set_point: Set-point that the next step sends.
     """
 
     name: str
@@ -90,14 +90,14 @@ class ActuatorDescription(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class SensorDescription(Serializable, Struct, frozen=True, kw_only=True):
-    """One sensor and what it reads.
+    """One sensor and its reading.
 
     Attributes:
         name: Short name, without the articulation's prefix.
         kind: MJCF element: `accelerometer`, `framepos`, ….
         unit: Unit of its reading; empty for directions, quaternions and sensors of unknown meaning.
-        dim: Numbers in a reading.
-        reading: The last one, or None.
+        dim: Size of a reading.
+        reading: The last reading, or None.
     """
 
     name: str
@@ -111,7 +111,7 @@ class CameraDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One camera.
 
     Attributes:
-        name: Name that `step(include_cameras=…)` and `capture()` take.
+        name: Name for `step(include_cameras=…)` and `capture()`.
         mode: `real`, `depth`, `semantic` or `instance`.
         width: Pixels.
         height: Pixels.
@@ -129,8 +129,8 @@ class ControllerDescription(Serializable, Struct, frozen=True, kw_only=True):
     """The controller of an articulation.
 
     Attributes:
-        kind: `pd`, or another that the server names.
-        in_force: Whether set-points go through it: the control mode is `ue_controller`.
+        kind: `pd`, or another kind from the server.
+        in_force: Whether set-points pass through it, because the control mode is `ue_controller`.
     """
 
     kind: str
@@ -138,21 +138,21 @@ class ControllerDescription(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class ArticulationDescription(Serializable, Struct, frozen=True, kw_only=True):
-    """One robot: what it is made of, where it is, what it is told.
+    """One robot: its elements, pose and set-points.
 
-    Joints and sensors are known with a local model only.
+    Joints and sensors are known only with a local model.
 
     Attributes:
         name: Key in `client.articulations`.
-        actor_id: Stable id given when it was spawned; empty if none.
-        free_base: Whether its root moves freely.
+        actor_id: Stable id given when it was spawned; empty if none was given.
+        free_base: Whether its root has a free joint.
         pose: Pose of its root, or None without a local model.
-        joints: In id order.
-        actuators: In id order.
-        sensors: In id order.
+        joints: Its joints in id order.
+        actuators: Its actuators in id order.
+        sensors: Its sensors in id order.
         cameras: Its cameras.
         controller: Its controller, or None.
-        control_owner: Who controls it, as far as this client knows; see `URLabArticulation.control_owner`.
+        control_owner: Client that controls it, if known; see `URLabArticulation.control_owner`.
     """
 
     name: str
@@ -172,7 +172,7 @@ class EntityDescription(Serializable, Struct, frozen=True, kw_only=True):
 
     Attributes:
         name: Key in `client.entities`.
-        free_base: Whether it moves freely.
+        free_base: Whether it has a free joint.
         pose: Its pose, or None without a local model.
     """
 
@@ -182,11 +182,11 @@ class EntityDescription(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class SceneDescription(Serializable, Struct, frozen=True, kw_only=True):
-    """Everything that moves, as of the last reply.
+    """All robots and other dynamic bodies as of the last reply.
 
     Attributes:
-        address: The server.
-        playing: Whether a play session runs, as far as this client knows.
+        address: Address of the server.
+        playing: Whether a play session is running, as far as this client knows.
         step_mode: `direct`, `puppet` or `live`.
         sim_time: Simulation time, seconds.
         timestep: Seconds per physics step, or None without a local model.

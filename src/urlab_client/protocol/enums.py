@@ -1,7 +1,7 @@
-"""Enumerations of the wire, for every layer. Each member is a `str` equal to what travels.
+"""Enumerations of the wire, for every layer. Each member is a `str` equal to the value on the wire.
 
-A server may send a value that no enum knows; such a value stays a plain `str` wherever a type reads
-`SomeEnum | str`, see `known`.
+A server may send a value that no enum contains. Where a type is `SomeEnum | str`, such a value stays a plain `str`; see
+`known`.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ LATER_MODE_NAMES: Final[Mapping[StepMode, str]] = {
     StepMode.DIRECT: "stepped",
     StepMode.PUPPET: "statepushed",
 }
-"""What servers after the beta call the modes."""
+"""Names of the modes on servers after the beta."""
 
 
 class ControlMode(StrEnum):
-    """Who turns set-points into actuator signals."""
+    """What turns set-points into actuator signals."""
 
     UE_CONTROLLER = "ue_controller"
     RAW = "raw"
 
 
 class ActuatorType(StrEnum):
-    """MJCF actuator element. The plugin reports `<general>` as `MOTOR`; the client goes by its gain and bias."""
+    """MJCF actuator element. The plugin reports `<general>` as `MOTOR`; the client classifies it by gain and bias."""
 
     MOTOR = "motor"
     POSITION = "position"
@@ -83,7 +83,7 @@ class ControllerKind(StrEnum):
 
 
 class CameraMode(StrEnum):
-    """What a camera's pixels mean."""
+    """Meaning of a camera's pixels."""
 
     REAL = "real"
     DEPTH = "depth"
@@ -92,14 +92,14 @@ class CameraMode(StrEnum):
 
 
 class CameraTiming(StrEnum):
-    """Which frame a step reply carries: one rendered after the step, or the newest at hand."""
+    """Which frame a step reply carries: one rendered after the step, or the newest available."""
 
     SYNC = "sync"
     LATEST = "latest"
 
 
 class ObservationLevel(StrEnum):
-    """How much state the server serialises per step."""
+    """Amount of state in each step reply."""
 
     MINIMAL = "minimal"
     STANDARD = "standard"
@@ -107,18 +107,18 @@ class ObservationLevel(StrEnum):
 
 
 class OutOfRange(StrEnum):
-    """What becomes of a set-point outside the range of its actuator. Not of the wire."""
+    """Handling of a set-point outside the range of its actuator. Client-side only."""
 
     ERROR = "error"
-    """It is refused."""
+    """Raise an error."""
     CLAMP = "clamp"
-    """The nearest value in the range takes its place."""
+    """Use the nearest value in the range."""
     ALLOW = "allow"
-    """It is sent as it is; MuJoCo clamps controls that have a range."""
+    """Send it unchanged; MuJoCo clamps controls that have a range."""
 
 
 class PIEState(StrEnum):
-    """Where Play-In-Editor stands."""
+    """State of Play-In-Editor."""
 
     READY = "ready"
     COMPILE_FAILED = "compile_failed"
@@ -128,14 +128,14 @@ class PIEState(StrEnum):
 
 
 class Transport(StrEnum):
-    """How requests travel."""
+    """Transport of requests."""
 
     ZMQ = "zmq"
     SHM = "shm"
 
 
 def known(enum: type[E], value: str) -> E | str:
-    """Return the member of `enum` equal to `value`, or `value` itself when a newer server invented it."""
+    """Return the member of `enum` equal to `value`, or `value` itself if it is unknown."""
     try:
         return enum(value)
     except ValueError:

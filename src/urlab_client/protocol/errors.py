@@ -1,7 +1,7 @@
-"""Every exception this package raises on purpose, and the table from wire codes to exception classes.
+"""All exceptions of this package, and the table from wire codes to exception classes.
 
-`str()` of each says what failed, on what, and what to do next. All of them pickle, so they cross worker pools.
-Mistakes in arguments are plain `ValueError` or `TypeError`, raised before anything is sent.
+`str()` of each states what failed, on what, and what to do next. All of them can be pickled, so they cross process
+pools. Invalid arguments raise plain `ValueError` or `TypeError` before anything is sent.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ class URLabRPCError(URLabError):
 
     Attributes:
         code: Short stable code, for example `unknown_articulation`.
-        message: The server's text; its wording is not stable.
-        details: What else the server said, by the name of the field.
+        message: The server's text, whose wording may change.
+        details: Further fields of the error reply, by name.
     """
 
     advice: ClassVar[str | None] = None
@@ -165,7 +165,7 @@ class URLabRPCError(URLabError):
         self.details = dict(details or {})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the error as data that JSON can hold; besides what every error has, `details`."""
+        """Return the error as JSON-compatible data; in addition to the common fields, `details`."""
         from urlab_client.protocol.serializable import plain  # noqa: PLC0415  # errors alone need no NumPy
 
         return {**super().to_dict(), "details": plain(self.details, "list")}
@@ -174,7 +174,7 @@ class URLabRPCError(URLabError):
 def rpc_error(
     code: str, message: str, *, op: str | None = None, details: Mapping[str, Any] | None = None
 ) -> URLabRPCError:
-    """Make the exception for an error reply: the class declared for `code`, else `URLabRPCError`."""
+    """Create the exception for an error reply: the class declared for `code`, otherwise `URLabRPCError`."""
     return RPC_ERRORS.get(code, URLabRPCError)(code, message, op=op, details=details)
 
 
@@ -182,8 +182,8 @@ class URLabPIEError(URLabRPCError):
     """`sim.start()` did not reach Playing.
 
     Attributes:
-        state: Where Play-In-Editor stands.
-        message: MuJoCo's compile log when the model was rejected, else an explanation.
+        state: State of Play-In-Editor.
+        message: MuJoCo's compile log if the model was rejected, otherwise an explanation.
     """
 
     state: PIEState
@@ -206,29 +206,29 @@ class SessionTakenOver(
 
 
 class NoSession(SessionTakenOver, advice="Call discover() first."):
-    """No session is open, or what it is about is not known: `discover()` was not called, or did not finish.
+    """No session is open, or the client does not know the play world: `discover()` was not called, or did not finish.
 
     The op was not executed.
     """
 
     def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:
         super().__init__("session_expired", message, op=op, hint=hint)
-        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would say something else
+        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would mislead
 
 
 class ServerRestarted(
     SessionTakenOver,
     advice="Call discover() to open a session with the server as it is now; keep_session=True does so by itself.",
 ):
-    """The server was started again, so that the session, its play and the simulation's state are gone.
+    """The server was restarted, so the session, the play session and the simulation's state are lost.
 
-    The op was not executed. Raised where that shows: nothing listened at the address for a while before the server
-    refused the session. Else a restart looks like another client's `hello`, and `SessionTakenOver` is raised.
+    The op was not executed. Raised if the restart is visible: connections were refused for a while before the server
+    refused the session. Otherwise a restart looks like another client's `hello`, and `SessionTakenOver` is raised.
     """
 
     def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:
         super().__init__("session_expired", message, op=op, hint=hint)
-        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would say something else
+        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would mislead
 
 
 class BadRequest(URLabRPCError, code="bad_request"):
@@ -240,7 +240,7 @@ class MissingOp(URLabRPCError, code="missing_op"):
 
 
 class UnknownOp(URLabRPCError, code="unknown_op", advice="This server does not offer the op; see `meta` for its list."):
-    """The server has no op of that name; a packaged build answers this to every editor op."""
+    """The server does not have this op; a packaged build answers every editor op with this."""
 
 
 class NotInEditor(URLabRPCError, code="not_in_editor"):
@@ -256,11 +256,11 @@ class ReplyTooLarge(URLabRPCError, code="reply_too_large"):
 
 
 class InternalError(URLabRPCError, code="internal_error", advice="The server's log has the details."):
-    """The simulated server failed in a way that nobody foresaw; it goes on serving."""
+    """The simulated server failed unexpectedly; it continues to serve."""
 
 
 class Unsupported(URLabRPCError, code="unsupported"):
-    """Only a server without Unreal answers this: it cannot do what was asked."""
+    """The request is not supported without Unreal; only the simulated server answers this."""
 
 
 class MissingField(URLabRPCError, code="missing_field"):
@@ -291,15 +291,15 @@ class ShuttingDown(URLabRPCError, code="shutting_down"):
 
 
 class UnknownKeyframe(URLabRPCError, code="unknown_keyframe"):
-    """The compiled model has no keyframe of that name; nothing was reset."""
+    """The compiled model has no keyframe with this name; nothing was reset."""
 
 
 class ModeLocked(URLabRPCError, code="mode_locked_by_server"):
-    """The project pins the step mode."""
+    """The project locks the step mode."""
 
     @property
     def pinned(self) -> StepMode | None:
-        """The mode it is pinned to; None when the server's text names none, or more than one."""
+        """The locked mode; None if the server's text names none or several."""
         named = {mode for mode in _PINNABLE if re.search(rf"\b{mode}\b", self.message, re.IGNORECASE)}
         return named.pop() if len(named) == 1 else None
 
@@ -324,11 +324,11 @@ class NotControlOwner(
     code="not_control_owner",
     advice="articulation.claim(force=True) takes the robot over; its present owner is then refused.",
 ):
-    """Another client controls the robot, or nobody does; nothing was written."""
+    """Another client controls the robot, or no client does; nothing was written."""
 
     @property
     def owner(self) -> str:
-        """Who controls the robot, or `(unclaimed)`; empty when the server does not say."""
+        """The client that controls the robot, or `(unclaimed)`; empty if the server does not send it."""
         return str(self.details.get("owner", ""))
 
 
@@ -339,28 +339,28 @@ class ControlClaimed(NotControlOwner, code="control_claimed"):
 class LeaseBusy(
     URLabRPCError, code="busy", advice="Use another server, or wait until the lease is given back or runs out."
 ):
-    """Somebody holds the server's driver lease."""
+    """Another client holds the server's driver lease."""
 
     @property
     def lease_id(self) -> str:
-        """The holder's lease; empty when the server does not say."""
+        """Lease of the holder; empty if the server does not send it."""
         return str(self.details.get("lease_id", ""))
 
 
 class UnknownJob(URLabRPCError, code="unknown_job"):
-    """The editor has no such job: there never was one, or its end was told already."""
+    """The editor does not know this job: it never existed, or its result was already fetched."""
 
 
 class UnknownUpload(URLabRPCError, code="unknown_upload"):
-    """The server has no such upload: it was committed, or nothing was sent for too long."""
+    """The server does not know this upload: it was committed, or has expired."""
 
 
 class HashMismatch(URLabRPCError, code="hash_mismatch"):
-    """A file arrived changed; it has to be sent anew."""
+    """A file was corrupted in transit; send it again."""
 
 
 class PayloadTooLarge(URLabRPCError, code="payload_too_large"):
-    """A file or a model is larger than the server takes."""
+    """A file or a model exceeds the server's limit."""
 
 
 class NoController(URLabRPCError, code="no_controller"):
@@ -384,7 +384,7 @@ class DimMismatch(URLabRPCError, code="dim_mismatch"):
 
 
 class UnknownBody(URLabRPCError, code="unknown_body"):
-    """The compiled model has no body of that name."""
+    """The compiled model has no body with this name."""
 
 
 class NotMocapBody(URLabRPCError, code="not_mocap_body"):
@@ -404,7 +404,7 @@ class PathNotWritable(URLabRPCError, code="path_not_writable"):
 
 
 class PathNotReadable(URLabRPCError, code="path_not_readable"):
-    """The recording is missing or is not one."""
+    """The recording does not exist, or the file is not a recording."""
 
 
 class ReplaySessionNotFound(URLabRPCError, code="replay_session_not_found"):
@@ -422,15 +422,15 @@ class ImportFailed(URLabRPCError, code="import_failed"):
 
 
 class CreateLevelFailed(URLabRPCError, code="create_level_failed"):
-    """The level exists already, a play session runs, or it could not be saved."""
+    """The level already exists, a play session is running, or it could not be saved."""
 
 
 class LoadLevelFailed(URLabRPCError, code="load_level_failed"):
-    """The level does not exist, cannot be read, or a play session runs."""
+    """The level does not exist, cannot be read, or a play session is running."""
 
 
 class SaveLevelFailed(URLabRPCError, code="save_level_failed"):
-    """The level has no path yet, a play session runs, or it could not be written."""
+    """The level has no path yet, a play session is running, or it could not be written."""
 
 
 class SpawnFailed(URLabRPCError, code="spawn_failed"):
@@ -454,7 +454,7 @@ class DestroyAssetFailed(URLabRPCError, code="destroy_asset_failed"):
 
 
 class SetActorTransformFailed(URLabRPCError, code="set_actor_transform_failed"):
-    """No actor matches, or the rotation is not one."""
+    """No actor matches, or the rotation is invalid."""
 
 
 class DuplicateFailed(URLabRPCError, code="duplicate_failed"):
@@ -514,7 +514,7 @@ class NoViewport(URLabRPCError, code="no_viewport"):
 
 
 class UnknownActor(URLabRPCError, code="unknown_actor"):
-    """No actor matches; the message is the key."""
+    """No actor matches; the message contains the key."""
 
 
 class NoBounds(URLabRPCError, code="no_bounds"):

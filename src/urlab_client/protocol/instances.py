@@ -1,7 +1,7 @@
-"""The registry of running servers: where their files are, and what they say. No I/O beyond looking at the environment.
+"""The registry of running servers: location and format of its files. No I/O except reading the environment.
 
-Each server keeps one file of JSON in a folder that all of a machine share. A file says that there was a server when it
-was written last; whether there still is one shows only by asking it.
+Each server keeps one JSON file in a folder shared by all servers of a machine. A file shows that the server existed
+when it was last written; only a request shows whether it still does.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from urlab_client.protocol.messages.session import InstanceInfo
 __all__ = ["REWRITE_S", "STALE_S", "RegisteredInstance", "decode", "encode", "registry_directory"]
 
 REWRITE_S: Final = 10.0
-"""Seconds after which a server writes its file again."""
+"""Seconds after which a server renews its file."""
 
 STALE_S: Final = 30.0
-"""Seconds after which a server whose file was not written is taken for dead."""
+"""Seconds after which a server whose file was not renewed is considered dead."""
 
 
 class RegisteredInstance(InstanceInfo, kw_only=True):
-    """What the file of a server says. `manager_present` is never true in the plugin's."""
+    """Contents of a server's file. In the plugin's files, `manager_present` is never true."""
 
     registry_written_at: Annotated[
         str | float | None, doc("When it was written: ISO 8601 text in UTC, or Unix seconds.")
@@ -35,7 +35,7 @@ class RegisteredInstance(InstanceInfo, kw_only=True):
 
     @property
     def written_at(self) -> float | None:
-        """When it was written, Unix seconds; None where it does not say so in a way that is understood."""
+        """When it was written, Unix seconds; None if missing or unreadable."""
         said = self.registry_written_at
         if not isinstance(said, str):
             return said
@@ -47,7 +47,7 @@ class RegisteredInstance(InstanceInfo, kw_only=True):
 
 
 def registry_directory() -> Path:
-    """Return the folder of the registry, which need not exist."""
+    """Return the folder of the registry, which may not exist."""
     named = os.environ.get("URLAB_REGISTRY_DIR")
     if named:
         return Path(named)
@@ -61,7 +61,7 @@ def registry_directory() -> Path:
 
 
 def encode(instance: InstanceInfo, now: dt.datetime) -> bytes:
-    """Return what a server's file says."""
+    """Return the contents of a server's file."""
     told = {name: getattr(instance, name) for name in instance.__struct_fields__}
     entry = RegisteredInstance(**told, registry_written_at=now.astimezone(dt.UTC).isoformat())
     return msgspec.json.encode(entry)
@@ -71,6 +71,6 @@ def decode(data: bytes) -> RegisteredInstance:
     """Read a server's file.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The file is not a server's file.
     """
     return msgspec.json.decode(data, type=RegisteredInstance, strict=False)

@@ -1,4 +1,4 @@
-"""Pictures as files: PNG and JPEG. Needs Pillow, which is loaded when the first one is encoded."""
+"""Pictures as files: PNG and JPEG. Requires Pillow, which is imported on first use."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _DEEPEST: Final = 65_535
 
 
 def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
-    """Return a picture as PNG, without loss: colours as RGB, depth as 16-bit grey in millimetres.
+    """Return a picture as lossless PNG: colours as RGB, depth as 16-bit grey in millimetres.
 
-    Depths of 65.535 m and more, and those that are not numbers, are 0, as depth cameras say "nothing there".
+    Depths of 65.535 m and more, and NaN, become 0, which depth cameras use for "no measurement".
 
     Args:
         pixels: As in `CameraSample`.
-        mode: What they mean.
+        mode: Meaning of the pixels.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -47,17 +47,17 @@ def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
 
 
 def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
-    """Return a picture as JPEG, to be looked at: colours, or depth as grey, near is bright.
+    """Return a picture as JPEG for display: colours, or depth as grey, with near pixels bright.
 
     Args:
         pixels: As in `CameraSample`.
-        mode: What they mean.
+        mode: Meaning of the pixels.
         quality: 1 to 100.
-        max_size: Pixels that the longer side may have; None leaves the picture as large as it is.
+        max_size: Longest side of the result, pixels; None keeps the size.
 
     Raises:
         MissingExtra: Pillow is not installed.
-        ValueError: There is no such quality or size.
+        ValueError: Quality or size is out of range.
     """
     if not 1 <= quality <= 100:
         raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
@@ -72,14 +72,14 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
 
 
 def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:
-    """Return a picture of colours or of a segmentation as Pillow's, RGB or RGBA.
+    """Return a colour or segmentation picture as a Pillow image, RGB or RGBA.
 
-    Pillow picks the channels as it takes the picture over, at a tenth of what NumPy takes to rearrange them.
+    Pillow selects the channels while it copies the picture, in a tenth of the time of NumPy.
 
     Args:
         pixels: As in `CameraSample`.
-        mode: What they mean.
-        alpha: Whether to keep that channel.
+        mode: Meaning of the pixels.
+        alpha: Whether to keep the alpha channel.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -94,7 +94,7 @@ def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False)
 
 
 def _in_place(pixels: Pixels) -> Image.Image:
-    """Return a picture of colours as Pillow's in the same memory. JPEG takes such ones; PNG does not."""
+    """Return a colour picture as a Pillow image that shares its memory. JPEG supports this; PNG does not."""
     need("PIL", extra="pillow")
     from PIL import Image  # noqa: PLC0415
 
@@ -110,12 +110,12 @@ def _image(array: NDArray[Any]) -> Image.Image:
 
 
 def encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
-    """Return a picture of Pillow's as a file.
+    """Return a Pillow image as the bytes of a file.
 
     Args:
         image: The picture.
-        kind: Pillow's name of the format.
-        options: Its options.
+        kind: Format name of Pillow.
+        options: Options of the format.
     """
     with _target() as target:
         image.save(target, kind, **options)
@@ -124,7 +124,7 @@ def encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
 
 
 def _target() -> IO[bytes]:
-    # Pillow lets other threads run while it encodes a JPEG into a file of the system's, and only then.
+    # Pillow releases the interpreter lock while it encodes a JPEG only if it writes to a file descriptor.
     if sys.platform == "linux":
         return os.fdopen(os.memfd_create("urlab-picture"), "w+b")
     return io.BytesIO()

@@ -1,4 +1,4 @@
-"""Memory of pictures that is used again for later ones."""
+"""Reuse of picture memory."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from numpy.typing import NDArray
 
 __all__ = ["PictureMemory"]
 
-# Of a stream's reader: one picture is looked at, one is the stream's last, one is being made.
+# For a stream's reader: one picture in use, the stream's latest, and one being converted.
 _KEPT = 2
 
 
 class PictureMemory:
-    """Memory of one camera's pictures, used again once nobody has a view of the picture in it any more.
+    """Memory of one camera's pictures, reused once no view of the picture exists.
 
-    Memory that is fresh from the system is cleared page by page, which takes as long as copying a picture. What the
-    user keeps stays the user's: only memory whose last view is gone comes back, and of that no more than two pictures
-    are kept. From any thread.
+    The system clears fresh memory page by page, which takes as long as copying a picture. Pictures that the user keeps
+    are never overwritten: only memory without any view is reused, and at most two pictures of it are kept. Thread-safe.
     """
 
     def __init__(self) -> None:
         self._unused: deque[NDArray[np.uint32]] = deque(maxlen=_KEPT)
 
     def words(self, count: int) -> NDArray[np.uint32]:
-        """Return an array of so many words, whatever is in them."""
+        """Return an uninitialised array of this many words."""
         try:
             block = self._unused.pop()
         except IndexError:
@@ -36,7 +35,7 @@ class PictureMemory:
 
 
 class _Loan:
-    """What every view of a block holds, and nobody else: NumPy takes it for the owner of the memory."""
+    """Base object of all views of a block, which NumPy treats as the owner of the memory."""
 
     def __init__(self, block: NDArray[np.uint32], unused: deque[NDArray[np.uint32]]) -> None:
         self.__array_interface__ = block.__array_interface__

@@ -1,4 +1,4 @@
-"""Camera pictures: from the wire's pixels to arrays, and back."""
+"""Camera pictures: conversion between the pixels on the wire and arrays."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
-_MAX_SIDE = 16_384  # what graphics cards render at most
-_CACHED = 65_536  # pixels that are still in a core's cache when they are looked at for the second time
+_MAX_SIDE = 16_384  # maximum of graphics cards
+_CACHED = 65_536  # pixels that stay in a core's cache between two passes
 _CENTIMETRES = np.float32(100)
 
 
@@ -44,9 +44,9 @@ class CameraImage(Serializable, Struct, frozen=True, eq=False):
     Attributes:
         pixels: Top row first. Mode `real`: uint8 (H, W, 4) RGBA with alpha 255. `depth`: float32 (H, W), metres along
             the optical axis. `semantic`, `instance` and modes unknown here: uint8 (H, W, 4) BGRA as sent.
-        frame_id: The server's number of the frame; None where the server sends no header.
-        sim_time: Simulation time of the frame, seconds; None where the server does not say.
-        capture_time: Unix time of the capture, seconds; None where the server does not say.
+        frame_id: Frame number from the server; None if the server sends no header.
+        sim_time: Simulation time of the frame, seconds; None if the server does not send it.
+        capture_time: Unix time of the capture, seconds; None if the server does not send it.
     """
 
     pixels: Pixels
@@ -56,12 +56,12 @@ class CameraImage(Serializable, Struct, frozen=True, eq=False):
 
 
 class PictureStamp(NamedTuple):
-    """What the header of a picture says.
+    """Header of a picture.
 
     Attributes:
-        frame_id: The server's number of the frame.
+        frame_id: Frame number from the server.
         sim_time: Simulation time of the frame, seconds.
-        size: Bytes of the header; the pixels follow.
+        size: Size of the header, bytes.
     """
 
     frame_id: int
@@ -70,10 +70,10 @@ class PictureStamp(NamedTuple):
 
 
 def check_picture_size(width: int, height: int) -> None:
-    """Check the size of a picture as a peer gives it.
+    """Check the picture size that a peer sent.
 
     Raises:
-        ValueError: No camera has pictures of this size.
+        ValueError: The size is impossible.
     """
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
         raise ValueError(f"pictures of {width}x{height} pixels; each side has 1 to {_MAX_SIDE}")
@@ -88,21 +88,21 @@ def decode_camera(
     memory: PictureMemory | None = None,
     where: object = "",
 ) -> CameraImage:
-    """Read a picture: a camera message, a slot of a camera region or the `data` of a step reply's camera block.
+    """Decode a picture: a camera message, a slot of a camera region or the `data` of a step reply's camera block.
 
-    Newer servers put a header before the pixels. It is recognised by its magic number and by the length together, so
-    that pixels cannot be mistaken for one.
+    Newer servers send a header before the pixels. It is recognised by its magic number together with the length, so
+    that pixels cannot be mistaken for a header.
 
     Args:
         payload: Pixels, with or without header.
-        mode: Mode of the camera; decides what the pixels mean.
-        width: Columns, as the handshake or the camera block says.
+        mode: Mode of the camera.
+        width: Columns, from the handshake or the camera block.
         height: Rows.
-        memory: Where the array comes from; None for memory fresh from the system.
-        where: Names the camera in errors.
+        memory: Memory for the array; None allocates it.
+        where: Name of the camera in errors.
 
     Raises:
-        ProtocolError: If the payload does not have the size of such a picture, or there is no picture of this size.
+        ProtocolError: If the payload does not have the size of such a picture, or the size is impossible.
     """
     try:
         check_picture_size(width, height)
@@ -129,9 +129,9 @@ def picture_stamp(payload: BytesLike, width: int, height: int, *, where: object 
 
     Args:
         payload: Pixels, with or without header.
-        width: Columns, as the handshake says.
+        width: Columns, from the handshake.
         height: Rows.
-        where: Names the camera in errors.
+        where: Name of the camera in errors.
 
     Raises:
         ProtocolError: If the payload does not have the size of such a picture.
@@ -148,14 +148,14 @@ def picture_stamp(payload: BytesLike, width: int, height: int, *, where: object 
 
 
 def camera_header(frame_id: int, sim_time: float, width: int, height: int, captured: float) -> bytes:
-    """Return what newer servers put before the pixels of a streamed picture.
+    """Return the header that newer servers send before the pixels of a streamed picture.
 
     Args:
-        frame_id: Number of the snapshot that it shows.
-        sim_time: Simulation time of that, seconds.
+        frame_id: Number of the snapshot in the picture.
+        sim_time: Simulation time of the snapshot, seconds.
         width: Columns.
         height: Rows.
-        captured: When it was taken, Unix seconds.
+        captured: Capture time, Unix seconds.
     """
     return _FRAME_HEADERS[2].pack(_FRAME_MAGIC, 2, frame_id, sim_time, width, height, captured)
 
@@ -175,7 +175,7 @@ def _frame_header(payload: BytesLike, width: int, height: int, where: object) ->
 
 
 def _pixels(source: NDArray[np.uint32], words: NDArray[np.uint32], mode: CameraMode | str) -> Pixels:
-    """Fill `words`, which has one to spare; return the pixels in it, flat."""
+    """Fill `words`, which has one spare element; return the pixels in it, flat."""
     if mode == CameraMode.DEPTH:
         metres = words[:-1].view("<f4")
         with np.errstate(invalid="ignore"):
@@ -183,8 +183,9 @@ def _pixels(source: NDArray[np.uint32], words: NDArray[np.uint32], mode: CameraM
     if mode != CameraMode.REAL:
         words[:-1] = source.view("<u4")
         return words[:-1].view(np.uint8)
-    # BGRA read big-endian is ARGB written little-endian; beginning one byte later, RGB and the next pixel's alpha. At
-    # the speed of one and a half copies, against four for shifting each pixel into its place.
+    # BGRA read as big-endian words is ARGB written as little-endian; one byte later it is RGB and the next pixel's
+    # alpha.
+    # This takes as long as 1.5 copies; shifting each pixel takes 4.
     for start in range(0, source.size, _CACHED):
         piece = words[start : min(start + _CACHED, source.size)]
         piece[:] = source[start : start + _CACHED]
@@ -194,25 +195,25 @@ def _pixels(source: NDArray[np.uint32], words: NDArray[np.uint32], mode: CameraM
 
 
 def without_alpha(pixels: Pixels) -> NDArray[np.uint8]:
-    """Return the first three channels of pictures as an array of their own, shape (…, 3)."""
+    """Return a copy of the first three channels of pictures, shape (…, 3)."""
     opaque = np.empty((*pixels.shape[:-1], 3), np.uint8)
-    for channel in range(3):  # a slice of three is copied pixel by pixel, which takes four times as long
+    for channel in range(3):  # NumPy copies a slice of three pixel by pixel, four times slower
         opaque[..., channel] = pixels[..., channel]
     return opaque
 
 
 def observed_pixels(pixels: Pixels, mode: CameraMode | str) -> Pixels:
-    """Return a picture as policies see it: colours as RGB, shape (H, W, 3); the others as they are.
+    """Return a picture as policies observe it: colours as RGB, shape (H, W, 3); other modes unchanged.
 
     Args:
         pixels: As in `CameraSample`.
-        mode: What they mean.
+        mode: Meaning of the pixels.
     """
     return without_alpha(pixels) if mode == CameraMode.REAL else pixels
 
 
 def grey(depth: Pixels) -> NDArray[np.uint8]:
-    """Return a picture of depths to be looked at, shape (H, W): near is bright."""
+    """Return a depth picture for display, shape (H, W), with near pixels bright."""
     seen = depth[np.isfinite(depth)]
     if not seen.size:
         return np.zeros(depth.shape, np.uint8)
@@ -222,11 +223,11 @@ def grey(depth: Pixels) -> NDArray[np.uint8]:
 
 
 def to_rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[np.uint8]:
-    """Return a picture to be looked at, shape (H, W, 3), RGB: colours as they are, depths in grey.
+    """Return a picture for display, shape (H, W, 3), RGB: colours unchanged, depths in grey.
 
     Args:
         pixels: As in `CameraSample`.
-        mode: What they mean.
+        mode: Meaning of the pixels.
     """
     if mode == CameraMode.DEPTH:
         return np.repeat(grey(pixels)[..., None], 3, axis=2)
@@ -241,7 +242,7 @@ def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:
         mode: Mode of the camera.
 
     Raises:
-        ValueError: If the array has not the shape and type of the mode.
+        ValueError: The array does not have the shape and type of the mode.
     """
     if mode == CameraMode.DEPTH:
         if pixels.ndim != 2 or pixels.dtype != np.float32:

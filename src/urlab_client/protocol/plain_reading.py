@@ -1,4 +1,4 @@
-"""Typed values from plain data: the way back from `Serializable.to_dict()`. No I/O."""
+"""Typed values from plain data, the inverse of `Serializable.to_dict()`. No I/O."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ __all__ = ["kinds_of", "read", "read_array", "read_bytes"]
 
 
 def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for each kind of type
-    """Return the value of a type that plain data stands for.
+    """Create a value of a type from plain data.
 
     Args:
         kind: The type, as a field of a struct is annotated.
-        data: What `plain` made of a value, or a JSON parser of that.
-        where: What the data are of, for errors.
+        data: Result of `plain`, or of a JSON parser on it.
+        where: Location of the data, for errors.
 
     Raises:
-        ValueError: They do not fit; the text says what, where.
+        ValueError: The data do not match the type; the message says where.
     """
     origin: Any = get_origin(kind)
     arguments = get_args(kind)
@@ -77,11 +77,11 @@ def _named(kind: Any) -> str:
 
 
 def _key(kind: Any, key: Any) -> Any:
-    return int(key) if kind is int else key  # JSON makes text of them
+    return int(key) if kind is int else key  # JSON keys are strings
 
 
 def _read_one_of(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
-    """Read what fits one of several types; of several structs the one with these fields."""
+    """Read a value of one of several types; of several structs, the one with these fields."""
     problems: list[str] = []
     for kind in sorted(kinds, key=lambda one: not _has_fields_of(one, data)):
         try:
@@ -132,9 +132,9 @@ def _read_struct(struct: type[Struct], data: Any, where: str) -> Struct:
 
 
 def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:
-    """Return the structs that a base stands for, by tag; none if it stands for itself."""
+    """Return the structs of a base class by tag; empty if it is not a base class."""
     config = struct.__struct_config__
-    if config.tag_field is None or config.tag != struct.__name__:  # which is what a struct gets that names no tag
+    if config.tag_field is None or config.tag != struct.__name__:  # the default tag
         return {}
     kinds: dict[str, type[Struct]] = {}
     for child in struct.__subclasses__():
@@ -143,10 +143,10 @@ def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:
 
 
 def read_bytes(data: Any) -> bytes:
-    """Read bytes from base64 text, or take them as they are.
+    """Read bytes from base64 text, or return bytes unchanged.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The data are neither.
     """
     if isinstance(data, bytes):
         return data
@@ -156,10 +156,10 @@ def read_bytes(data: Any) -> bytes:
 
 
 def read_array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Read an array from either form, or take one as it is.
+    """Read an array from either form, or return an array unchanged.
 
     Raises:
-        ValueError: It is neither, or its numbers do not fit the type.
+        ValueError: The data are neither, or the numbers do not fit the type.
     """
     try:
         match data:
@@ -172,11 +172,11 @@ def read_array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
                 array = np.array(data, dtype if dtype.kind == "f" or not data else None)
             case _:
                 raise ValueError("an array is a list of numbers, or has dtype, shape and base64")
-    except TypeError as error:  # numbers that are none
+    except TypeError as error:  # not numbers
         raise ValueError(str(error)) from None
     with np.errstate(invalid="ignore"):
         exact = array.astype(dtype, copy=False)
-    # Numbers with a point are none of a picture's bytes, even if they are whole: they are depths.
+    # Floating-point numbers are depths, even if they are whole, because colours are bytes.
     if not np.can_cast(array.dtype, dtype, "same_kind") and (array.dtype.kind == "f" or (array != exact).any()):
         raise ValueError(f"the numbers are not {dtype.name}")
     return exact

@@ -1,6 +1,6 @@
-"""Structs as fields of pydantic models: what pydantic asks for, as the plain dictionaries that it takes. No I/O.
+"""Structs as fields of pydantic models: core schemas and JSON schemas as plain dictionaries. No I/O.
 
-Pydantic is not imported: it calls this, from the hooks of `Serializable`. Values go out as `plain` makes them.
+Pydantic is not imported; it calls these functions through the hooks of `Serializable`. `plain` serialises values.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def core_schema(struct: type[Struct], handler: Any) -> Schema:
     """Return the schema by which pydantic validates and serialises a struct.
 
     Args:
-        struct: The struct, or the base of several kinds, which then stands for any of them.
+        struct: The struct, or the base class of several kinds, which accepts any of them.
         handler: Pydantic's `GetCoreSchemaHandler`.
     """
     ref = f"{struct.__module__}.{struct.__qualname__}:{id(struct)}"
@@ -55,7 +55,7 @@ def json_schema(struct: type[Struct], schema: Schema, handler: Any) -> Schema:
 
     Args:
         struct: The struct.
-        schema: What `core_schema` returned.
+        schema: Result of `core_schema`.
         handler: Pydantic's `GetJsonSchemaHandler`.
     """
     made = handler(schema)
@@ -106,23 +106,23 @@ def _of_fields(struct: type[Struct], handler: Any) -> Schema:
 
 
 def _serialized(value: Any, info: Any) -> Any:
-    """Serialise for pydantic; whoever wants other arrays says so: `dump_json(…, context={"arrays": "base64"})`."""
+    """Serialise for pydantic. To select the form of arrays: `dump_json(…, context={"arrays": "base64"})`."""
     context: dict[str, Any] = info.context or {}
     return plain(value, context.get("arrays", "list") if info.mode == "json" else None)
 
 
-# Types that JSON, or pydantic, spells otherwise.
+# Types that JSON or pydantic represents differently.
 
 
 def _understood(annotation: Any) -> Any:
-    """Return a type with everything in it that pydantic does not know made known."""
+    """Return a type in which everything is known to pydantic."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if annotation in _LEAVES:
         return _LEAVES[annotation]
     if origin is np.ndarray:
         return Annotated[Any, _Array(np.dtype(get_args(arguments[1])[0]))]
     if origin is Annotated:
-        return _understood(arguments[0])  # msgspec's notes, which mean nothing to it
+        return _understood(arguments[0])  # msgspec's metadata, which pydantic does not know
     if origin is Literal or not arguments:
         return annotation
     inner = tuple(map(_understood, arguments))
@@ -130,11 +130,11 @@ def _understood(annotation: Any) -> Any:
 
 
 class Number:
-    """A number, which need not be finite."""
+    """A number, possibly not finite."""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Schema:
-        return {"type": "float", "ref": f"{cls.__module__}.{cls.__qualname__}"}  # a name of its own in JSON schemas
+        return {"type": "float", "ref": f"{cls.__module__}.{cls.__qualname__}"}  # a separate name in JSON schemas
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Schema:
@@ -146,7 +146,7 @@ class Number:
 
 
 class _Bytes:
-    """Bytes, in JSON base64 text."""
+    """Bytes; base64 text in JSON."""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Schema:
@@ -158,13 +158,13 @@ class _Bytes:
 
 
 class _Array:
-    """A NumPy array, in JSON in one of two forms."""
+    """A NumPy array, with two forms in JSON."""
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
         self._dtype = dtype
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Schema:
-        # Arrays of the wire are float64 and flat; others are pictures.
+        # Arrays from the wire are flat float64; others are pictures.
         items = handler.generate_schema(Number if self._dtype == np.float64 else list[Any])
 
         def read(value: Any, inner: object) -> NDArray[Any]:

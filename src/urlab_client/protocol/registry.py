@@ -40,11 +40,11 @@ ENVELOPE_ERRORS = (
     "no_active_manager",
     "shutting_down",
 )
-"""Codes that any op can get, in the order in which a server checks."""
+"""Error codes of every op, in the order in which a server checks."""
 
 
 def registry(*ops: Op) -> Mapping[str, Op]:
-    """Index `ops` by name, refusing at import whatever a reader or a tool would later trip over."""
+    """Index `ops` by name and check the declarations, so that mistakes fail at import."""
     index: dict[str, Op] = {}
     methods: set[tuple[str, str]] = set()
     for op in ops:
@@ -74,7 +74,7 @@ def _check(op: Op) -> None:
 
 
 def _described(annotation: Any) -> bool:
-    # Not by msgspec.inspect, which takes a third of the package's import time for this alone.
+    # Without msgspec.inspect, which would take a third of the package's import time.
     if get_origin(annotation) is Annotated:
         return any(isinstance(extra, msgspec.Meta) for extra in get_args(annotation)[1:])
     return get_origin(annotation) in {Union, UnionType} and any(map(_described, get_args(annotation)))
@@ -99,5 +99,5 @@ OPS: Mapping[str, Op] = registry(
 
 @cache
 def dialect_ops(dialect: DialectName) -> Mapping[str, Op]:
-    """Return the ops that a generation of the plugin offers, by name."""
+    """Return the ops of a dialect by name."""
     return MappingProxyType({name: op for name, op in OPS.items() if dialect in op.dialects})

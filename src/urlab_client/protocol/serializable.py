@@ -1,8 +1,8 @@
 """Typed values as plain data: dictionaries, JSON, and fields of pydantic models. No I/O.
 
-Plain data is what every JSON parser takes and gives back: numbers that are not finite are the strings `NaN`,
-`Infinity` and `-Infinity`, arrays are lists, bytes are base64 text, enumerations their values. Names are those of the
-attributes; a struct that is one of several kinds has its tag besides.
+Plain data survives a round trip through any JSON parser: numbers that are not finite become the strings `NaN`,
+`Infinity` and `-Infinity`, arrays become lists, bytes base64 text, and enumerations their values. Keys are attribute
+names; a struct that is one of several kinds also contains its tag.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 __all__ = ["ArrayForm", "Serializable", "plain"]
 
 ArrayForm: TypeAlias = Literal["list", "base64"]
-"""How plain data holds arrays: lists, nested by dimension, or `{"dtype": …, "shape": […], "base64": …}`."""
+"""Form of arrays in plain data: lists, nested by dimension, or `{"dtype": …, "shape": […], "base64": …}`."""
 
 
 class Serializable:
-    """Base of the structs that users get."""
+    """Base class of the structs that calls return."""
 
     __slots__ = ()
 
     def to_dict(self, *, arrays: ArrayForm = "list") -> dict[str, Any]:
-        """Return the fields as plain data, which any JSON encoder takes.
+        """Return the fields as plain data for any JSON encoder.
 
         Args:
-            arrays: `list` makes nested lists of arrays. `base64` makes `{"dtype", "shape", "base64"}` of them, with
-                the numbers little-endian, the last index running fastest: use it for pictures.
+            arrays: `list` converts arrays to nested lists. `base64` converts them to `{"dtype", "shape", "base64"}`,
+                with little-endian numbers in C order; use it for pictures.
 
         Raises:
-            ValueError: Unknown form of arrays.
+            ValueError: The form of arrays is unknown.
         """
         if arrays not in {"list", "base64"}:
             raise ValueError(f"arrays={arrays!r} is unknown; it is 'list' or 'base64'")
@@ -51,13 +51,13 @@ class Serializable:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the value that plain data stand for: the way back from `to_dict()`, with arrays in either form.
+        """Create a value from plain data, the inverse of `to_dict()`, with arrays in either form.
 
-        What has no type of its own comes back as it is; NaN and infinities in it stay strings. The base of several
-        kinds, such as `ClientEvent`, finds the kind by its tag.
+        Untyped parts are returned unchanged; NaN and infinities in them stay strings. A base class of several kinds,
+        such as `ClientEvent`, selects the kind by its tag.
 
         Raises:
-            ValueError: A field is missing, unknown or of another type; the text says which.
+            ValueError: A field is missing, unknown or of the wrong type; the message names it.
         """
         from urlab_client.protocol.plain_reading import read  # noqa: PLC0415  # which few programs need
 
@@ -65,10 +65,10 @@ class Serializable:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Self:
-        """Return the value that JSON stands for: the way back from `to_json()`.
+        """Create a value from JSON text, the inverse of `to_json()`.
 
         Raises:
-            ValueError: It is not JSON, or not that of such a value.
+            ValueError: The text is not JSON, or not that of such a value.
         """
         try:
             data = msgspec.json.decode(text)
@@ -77,16 +77,16 @@ class Serializable:
         return cls.from_dict(data)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy in which some fields have other values.
+        """Return a copy with some fields replaced.
 
         Raises:
-            TypeError: There is no field of that name.
+            TypeError: There is no field with this name.
         """
         return cast("Self", msgspec.structs.replace(cast("Struct", self), **changes))
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
-        # Only pydantic calls this. What follows makes plain dictionaries and imports nothing of it.
+        # Only pydantic calls this. The code below builds plain dictionaries and does not import pydantic.
         from urlab_client.protocol.pydantic_schema import core_schema  # noqa: PLC0415
 
         return core_schema(cast("type[Struct]", cls), handler)
@@ -102,11 +102,11 @@ def plain(value: Any, arrays: ArrayForm | None) -> Any:  # noqa: PLR0911
     """Return a value as plain data.
 
     Args:
-        value: Anything that a field of a struct may hold.
-        arrays: Their form. None opens structs and containers only, and leaves what is in them as it is.
+        value: Any value that a field of a struct may have.
+        arrays: Form of arrays. None converts only structs and containers, and leaves their contents unchanged.
 
     Raises:
-        TypeError: A value has no form in plain data.
+        TypeError: A value cannot be represented as plain data.
     """
     kind: type = type(cast("object", value))
     if kind in _ALREADY_PLAIN:
@@ -151,9 +151,9 @@ def _fields(struct: Struct, arrays: ArrayForm | None) -> dict[str, Any]:
     for name in struct.__struct_fields__:
         value = getattr(struct, name)
         if isinstance(value, msgspec.Raw):
-            continue  # undecoded on purpose: it says nothing that another field does not
+            continue  # deliberately not decoded: another field has the same information
         if isinstance(value, dict) and value:
-            # What the beta names otherwise is there under both names; data has it once, as from any generation.
+            # Fields that the beta renames exist under both names; plain data has them once, as for every dialect.
             mapping: int = id(cast("object", value))
             if mapping in maps:
                 value = None
@@ -163,7 +163,7 @@ def _fields(struct: Struct, arrays: ArrayForm | None) -> dict[str, Any]:
 
 
 def _array(array: NDArray[Any], form: ArrayForm) -> Any:
-    """Return an array in the form asked for."""
+    """Return an array in the given form."""
     if form == "list":
         listed = array.tolist()
         return listed if array.dtype.kind != "f" or np.isfinite(array).all() else plain(listed, form)

@@ -1,7 +1,7 @@
 """Domain randomisation, noise and delay: declared once, for simulated servers, environments and batches.
 
-A `Randomisation` says what varies from episode to episode and by how much; the seed of an episode decides on the
-numbers, which are the same wherever it runs.
+A `Randomisation` declares what varies between episodes and by how much. The numbers depend only on the seed of the
+episode, so they are the same wherever it runs.
 """
 
 from urlab_client.randomise.declaration import (

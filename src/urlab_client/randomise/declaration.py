@@ -1,4 +1,4 @@
-"""What varies, and by how much: as Python objects, TOML or JSON. Knows nothing of MuJoCo."""
+"""The declaration of variations, as Python objects, TOML or JSON. Independent of MuJoCo."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 MODEL_TEXT: Final = "urlab_randomise"
-"""Name of the custom text element with which a server's compiled model tells what it varies, as JSON."""
+"""Name of the custom text element of a server's compiled model that contains its declaration as JSON."""
 
 Vector = tuple[float, float, float]
 Bound = float | Vector
@@ -40,7 +40,7 @@ Range = tuple[Bound, Bound]
 """Lowest and highest value: numbers, or three numbers each for vectors, whose components are drawn separately."""
 
 Steps = int | tuple[int, int]
-"""A number of actions, or the lowest and highest one of a draw for each episode."""
+"""A number of actions, or a range from which one is drawn for each episode."""
 
 Field = Literal["qpos", "qvel", "ctrl", "act", "sensors", "task"]
 
@@ -77,7 +77,7 @@ _NO_SCALE: Final = frozenset({"position", "base_position", "base_yaw", "light_po
 
 
 def steps_range(steps: Steps) -> tuple[int, int]:
-    """Return the lowest and highest of a number of actions."""
+    """Return a number of actions as a range."""
     return (steps, steps) if isinstance(steps, int) else steps
 
 
@@ -90,11 +90,11 @@ def _check_range(what: str, given: Range) -> None:
 
 
 class UnsupportedRandomisation(URLabError):
-    """A server cannot vary what a `Randomisation` declares: its protocol has no op for it.
+    """A server cannot apply a `Randomisation`, because its protocol lacks an op.
 
     Attributes:
-        quantities: What it cannot vary, as `Vary.what`.
-        address: The server.
+        quantities: Quantities that it cannot vary, as in `Vary.what`.
+        address: Address of the server.
     """
 
     def __init__(self, quantities: tuple[str, ...], address: str) -> None:
@@ -114,20 +114,20 @@ class UnsupportedRandomisation(URLabError):
 
 
 class _Declared(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Base of all parts."""
+    """Base class of all parts of a declaration."""
 
 
 class Vary(_Declared, frozen=True, kw_only=True):
-    """Something that has another value in each episode. Exactly one of `scale`, `add` and `set` is given.
+    """A quantity whose value varies between episodes. Give exactly one of `scale`, `add` and `set`.
 
     Attributes:
         what: The quantity.
-        on: Elements that have it, `ARTICULATION/NAME` with `*` and `?`, or several of those; `*` for all.
+        on: Elements, as `ARTICULATION/NAME` with wildcards `*` and `?`, or a list of these; `*` for all.
         scale: Factors.
-        add: Offsets, in the quantity's unit.
-        set: Values, in the quantity's unit.
+        add: Offsets, in the unit of the quantity.
+        set: Values, in the unit of the quantity.
         distribution: `uniform`, or `log-uniform` for factors and values above 0.
-        together: One draw for all elements, instead of one for each.
+        together: Use one draw for all elements instead of one for each.
     """
 
     what: Quantity
@@ -163,12 +163,12 @@ class Vary(_Declared, frozen=True, kw_only=True):
 
     @property
     def by(self) -> Literal["scale", "add", "set"]:
-        """Which of the three is given."""
+        """The one of `scale`, `add` and `set` that is given."""
         return "scale" if self.scale is not None else "add" if self.add is not None else "set"
 
     @property
     def range(self) -> Range:
-        """The range that is given."""
+        """The given range."""
         found = self.scale or self.add or self.set
         if found is None:
             raise ValueError(f"{self.what} has no range")
@@ -176,7 +176,7 @@ class Vary(_Declared, frozen=True, kw_only=True):
 
     @property
     def width(self) -> int:
-        """How many numbers are drawn for an element: 3 for vectors, else 1. A vector is scaled by one factor."""
+        """Numbers drawn per element: 3 for vectors, otherwise 1. A vector is scaled by one factor."""
         low, _ = self.range
         return 3 if isinstance(low, tuple) or (self.what in _VECTORS and self.by != "scale") else 1
 
@@ -187,13 +187,13 @@ class Vary(_Declared, frozen=True, kw_only=True):
 
 
 class Push(_Declared, frozen=True, kw_only=True):
-    """Pushes against a body, again and again. Environments apply them, on any server.
+    """Repeated pushes against a body. Environments apply them, on any server.
 
     Attributes:
         body: The body, `ARTICULATION/NAME`.
         force: Lowest and highest force along each axis of the world frame, N.
         every: Lowest and highest number of actions from the end of a push, or the start, to the next one.
-        lasts: Actions that a push lasts.
+        lasts: Duration of a push in actions.
     """
 
     body: str
@@ -210,14 +210,14 @@ class Push(_Declared, frozen=True, kw_only=True):
 
 
 class Noise(_Declared, frozen=True, kw_only=True):
-    """What is wrong with the numbers of an observed field. Rewards and ends are judged without it.
+    """Noise on an observed field. Rewards and terminations are computed without it.
 
     Attributes:
-        field: `qpos`, `qvel`, `ctrl`, `act` or `sensors`, or `task` for what a task adds.
-        articulation: Key of the articulation, with `*` and `?`.
-        std: Standard deviation of what is added to each number of each sample.
-        uniform: Largest deviation of what is added, uniformly, to each number of each sample.
-        bias: Largest deviation of what is added to each number for a whole episode.
+        field: `qpos`, `qvel`, `ctrl`, `act` or `sensors`, or `task` for the task's part of the observation.
+        articulation: Key of the articulation, with wildcards `*` and `?`.
+        std: Standard deviation of Gaussian noise on each number of each sample.
+        uniform: Largest deviation of uniform noise on each number of each sample.
+        bias: Largest deviation of an offset of each number, constant during an episode.
     """
 
     field: Field
@@ -233,12 +233,12 @@ class Noise(_Declared, frozen=True, kw_only=True):
 
 
 class Delay(_Declared, frozen=True, kw_only=True):
-    """What comes late, in actions. A range is drawn from for each episode.
+    """Delays in actions. From a range, one value is drawn for each episode.
 
     Attributes:
-        observation: How many actions ago what is observed was so; cameras have a latency of their own.
-        action: How many actions later an action has effect; set-points are zero until then.
-        drop: Probability that an observation is lost, and the one before is seen again.
+        observation: Age of observations in actions; cameras have a separate latency.
+        action: Number of actions after which an action takes effect; set-points are zero until then.
+        drop: Probability that an observation is lost, so that the previous one is repeated.
     """
 
     observation: Steps = 0
@@ -255,12 +255,12 @@ class Delay(_Declared, frozen=True, kw_only=True):
 
 
 class CameraLatency(_Declared, frozen=True, kw_only=True):
-    """How late pictures come, by the simulation's clock. For batches, and servers with the op `set_camera_delay`.
+    """Latency of cameras in simulation time. For batches, and servers with the op `set_camera_delay`.
 
     Attributes:
-        camera: The camera, `ARTICULATION/CAMERA` with `*` and `?`.
+        camera: The camera, `ARTICULATION/CAMERA` with wildcards `*` and `?`.
         delay_s: Latency, seconds.
-        jitter_s: Largest deviation from that, seconds.
+        jitter_s: Largest deviation from the latency, seconds.
     """
 
     camera: str = "*"
@@ -274,13 +274,13 @@ class CameraLatency(_Declared, frozen=True, kw_only=True):
 
 
 class Randomisation(_Declared, frozen=True, kw_only=True):
-    """What varies from episode to episode, and what is wrong with sensors and actuators.
+    """Variations between episodes, and imperfections of sensors and actuators.
 
     Attributes:
-        vary: Quantities of the model and the start.
+        vary: Quantities of the model and the initial state.
         push: Pushes.
         noise: Noise on observations.
-        delay: What comes late.
+        delay: Delays of observations and actions.
         camera: Latency of cameras.
     """
 
@@ -292,12 +292,12 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
 
     @property
     def disturbs_observations(self) -> bool:
-        """Whether what is seen differs from what is."""
+        """Whether observations differ from the true state."""
         return bool(self.noise) or steps_range(self.delay.observation)[1] > 0 or self.delay.drop > 0
 
     @property
     def delays_actions(self) -> bool:
-        """Whether actions have effect later."""
+        """Whether actions are delayed."""
         return steps_range(self.delay.action)[1] > 0
 
     @classmethod
@@ -305,27 +305,27 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
         """Read a TOML file.
 
         Raises:
-            OSError: It cannot be read.
-            ValueError: It declares something that there is not; the message says where.
+            OSError: The file cannot be read.
+            ValueError: The declaration is invalid; the message says where.
         """
         return cls._decoded(Path(path).read_bytes(), msgspec.toml.decode, str(Path(path)))
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Self:
-        """Read what `to_json` returned.
+        """Parse the result of `to_json`.
 
         Raises:
-            ValueError: It declares something that there is not.
+            ValueError: The declaration is invalid.
         """
         return cls._decoded(text, msgspec.json.decode, "randomisation")
 
     @classmethod
     def of(cls, given: str | os.PathLike[str] | Randomisation) -> Randomisation:
-        """Return a declaration as given, from JSON (which begins with a brace), or from a TOML file.
+        """Return a declaration given as object, as JSON (which begins with a brace), or as a TOML file.
 
         Raises:
             OSError: The file cannot be read.
-            ValueError: It declares something that there is not.
+            ValueError: The declaration is invalid.
         """
         if isinstance(given, Randomisation):
             return given
@@ -353,7 +353,7 @@ MODEST: Final = Randomisation(
         Vary(what="position", add=(-0.05, 0.05)),
     )
 )
-"""A little of what robots with actuated joints vary in, for whoever declares nothing of their own."""
+"""A small default randomisation for robots with actuated joints."""
 
 QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
-"""Everything that can vary."""
+"""All quantities that can vary."""

@@ -1,4 +1,4 @@
-"""Where the quantities that vary stand in a MuJoCo model, and which elements have them."""
+"""The fields of a MuJoCo model and the elements for each quantity that can vary."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Fields = Callable[[str], NDArray[Any]]
 """Returns the array of a model's field, to be written in place; options are called `opt.NAME`."""
 
 START: Final[frozenset[Quantity]] = frozenset({"position", "base_position", "base_yaw"})
-"""Quantities of the state in which an episode starts."""
+"""Quantities of the initial state of an episode."""
 
 FIELDS: Final[dict[Quantity, tuple[str, ...]]] = {
     "friction": ("geom_friction",),
@@ -43,12 +43,12 @@ FIELDS: Final[dict[Quantity, tuple[str, ...]]] = {
     "camera_rotation": ("cam_quat",),
     "camera_fovy": ("cam_fovy",),
 }
-"""Fields of the model that a quantity is written to."""
+"""Fields of the model for each quantity."""
 
 DERIVED_FROM: Final = frozenset(
     {"body_mass", "body_inertia", "body_ipos", "dof_armature", "cam_pos", "cam_quat", "light_pos"}
 )
-"""Fields that `mj_setConst` computes others from."""
+"""Fields from which `mj_setConst` computes others."""
 
 _KINDS: Final[dict[Quantity, str]] = {
     **dict.fromkeys(("friction", "colour"), "geom"),
@@ -79,7 +79,7 @@ class Elements:
 
     Attributes:
         ids: Their ids.
-        names: What they are called in what is recorded, parallel.
+        names: Their names in recordings, in the same order.
     """
 
     ids: Ints
@@ -97,7 +97,7 @@ def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -
         controlled: Actuators that a controller with gains drives.
 
     Raises:
-        ValueError: There are none.
+        ValueError: No element matches.
     """
     if vary.what == "gravity":
         return Elements(np.zeros(1, dtype=np.intp), ("scene",))
@@ -114,14 +114,14 @@ def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -
 
 
 def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, fields: Fields) -> None:
-    """Write what was drawn into the fields of a model, on top of what they hold.
+    """Apply drawn numbers to the current fields of a model.
 
     Args:
-        vary: What varies, which is not in `START`.
-        elements: Where.
+        vary: The entry, whose quantity is not in `START`.
+        elements: The elements to change.
         drawn: The numbers, shape (n elements, width).
-        model: The compiled scene, for what does not vary.
-        fields: Returns the fields.
+        model: The compiled scene, for values that do not vary.
+        fields: Returns the fields by name.
     """
     ids = elements.ids
     match vary.what:
@@ -183,7 +183,7 @@ def _write_gain(what: str, ids: Ints, factors: Floats, model: mujoco.MjModel, fi
             bias[i, 1] *= factor
         else:
             bias[i, 2] *= factor
-            if not by_position:  # a velocity servo, whose gain is kv
+            if not by_position:  # a velocity servo, with gain kv
                 gain[i, 0] *= factor
 
 
@@ -211,12 +211,12 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     objects, count = _OBJECTS[kind]
     number = getattr(model, count, None)
     if number is None:
-        number = model.nu  # a release whose actuators all have one control
+        number = model.nu  # a MuJoCo release without actuators with several controls
     return [mujoco.mj_id2name(model, objects, i) or "" for i in range(number)]
 
 
 def _aliases(model: mujoco.MjModel, kind: str, names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return what each element may be called: a geom or free joint also after its body."""
+    """Return the possible names of each element; a geom or free joint also has that of its body."""
     owners = {"geom": "geom_bodyid", "free joint": "jnt_bodyid"}.get(kind)
     if owners is None:
         return [(name,) for name in names]
@@ -225,7 +225,7 @@ def _aliases(model: mujoco.MjModel, kind: str, names: Sequence[str]) -> list[tup
 
 
 def _dofs(model: mujoco.MjModel, joints: Ints) -> tuple[Ints, Ints]:
-    """Return the degrees of freedom of joints, and whose each is."""
+    """Return the degrees of freedom of joints, and the joint of each."""
     which = [np.flatnonzero(model.dof_jntid == joint) for joint in joints]
     owners = np.repeat(np.arange(len(joints)), [len(found) for found in which])
     return np.concatenate(which).astype(np.intp), owners.astype(np.intp)

@@ -1,4 +1,4 @@
-"""The numbers of an episode: drawn from its seed, and written into a model and a start."""
+"""The numbers of an episode: drawn from its seed, and applied to a model and an initial state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from urlab_client.randomise.quantities import DERIVED_FROM, FIELDS, START, Eleme
 __all__ = ["EpisodeDraws", "Variation", "declared_in", "draw_range", "field_of", "model_text", "stream"]
 
 MODEL_STREAM: Final = 0
-"""First number of the streams of random numbers that `Vary` draws from; other parts have others."""
+"""First part of the seed of the random streams for `Vary`; other parts of a declaration use other values."""
 
 _VISIBLE: Final = {
     "light_diffuse": (),
@@ -28,11 +28,11 @@ _VISIBLE: Final = {
     "cam_pos": ("cam_pos0", "cam_poscom0"),
     "cam_quat": ("cam_mat0",),
 }
-"""Fields that pictures depend on, with what `mj_setConst` computes from them."""
+"""Fields that affect pictures, including those that `mj_setConst` computes from them."""
 
 
 def stream(seed: int, *path: int) -> np.random.Generator:
-    """Return the generator of one part of an episode: what one part draws leaves the numbers of others alone."""
+    """Return the generator of one part of an episode, independent of the other parts."""
     return np.random.default_rng([seed, *path])
 
 
@@ -45,13 +45,13 @@ def draw_range(rng: np.random.Generator, given: Range, shape: tuple[int, ...], *
 
 
 def declared_in(model: mujoco.MjModel) -> Randomisation | None:
-    """Return what the server of a compiled scene varies, None for nothing."""
+    """Return the declaration in a compiled scene; None if there is none."""
     text = model_text(model, MODEL_TEXT)
     return None if text is None else Randomisation.from_json(text)
 
 
 def model_text(model: mujoco.MjModel, name: str) -> bytes | None:
-    """Return a custom text element of a compiled model, None without it."""
+    """Return a custom text element of a compiled model; None if there is none."""
     found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
     if found < 0:
         return None
@@ -61,19 +61,19 @@ def model_text(model: mujoco.MjModel, name: str) -> bytes | None:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeDraws:
-    """What was drawn for one episode.
+    """The draws of one episode.
 
     Attributes:
         seed: The episode's seed.
-        varied: What varied, in the order of the declaration: the entry, its elements, and the numbers that were drawn,
-            shape (n elements, width).
+        varied: In the order of the declaration: the entry, its elements, and the drawn numbers, shape
+            (n elements, width).
     """
 
     seed: int
     varied: tuple[tuple[Vary, Elements, Floats], ...]
 
     def told(self) -> dict[str, Any]:
-        """Return plain data: `seed`, and per entry of `varied` the quantity, what was done to it, and the numbers."""
+        """Return plain data: `seed`, and for each entry of `varied` the quantity, the operation and the numbers."""
         return {
             "seed": self.seed,
             "varied": [
@@ -91,26 +91,27 @@ class EpisodeDraws:
 
 
 class Variation:
-    """How one compiled scene varies. The same declaration, model and seed give the same numbers everywhere.
+    """Applies a declaration to one compiled scene. The same declaration, model and seed give the same numbers
+    everywhere.
 
     Attributes:
-        declaration: What was declared.
+        declaration: The declaration.
         fields: Fields of the model that vary; options are called `opt.NAME`.
-        derives: Whether constants follow from those fields, so that `mj_setConst` is due after a change.
+        derives: Whether constants depend on these fields, so that `mj_setConst` is required after a change.
     """
 
     def __init__(
         self, declaration: Randomisation, model: mujoco.MjModel, controlled: frozenset[int] = frozenset()
     ) -> None:
-        """Look up what varies.
+        """Find the elements that vary.
 
         Args:
-            declaration: What to vary.
-            model: The compiled scene, as it is without variation; a copy is kept of what varies.
+            declaration: The declaration.
+            model: The compiled scene without variation; the varying fields are copied.
             controlled: Actuators that a controller with gains drives.
 
         Raises:
-            ValueError: A name fits no element.
+            ValueError: A name matches no element.
         """
         self.declaration = declaration
         self._model = model
@@ -122,11 +123,11 @@ class Variation:
 
     @property
     def visible_fields(self) -> tuple[str, ...]:
-        """Varied fields of the model that pictures depend on, and what is computed from them."""
+        """Varying fields of the model that affect pictures, and fields computed from them."""
         return tuple(name for field, derived in _VISIBLE.items() if field in self.fields for name in (field, *derived))
 
     def draw(self, seed: int) -> EpisodeDraws:
-        """Return the numbers of the episode with a seed."""
+        """Return the draws for a seed."""
         varied: list[tuple[Vary, Elements, Floats]] = []
         for i, (vary, elements) in enumerate(zip(self.declaration.vary, self._elements, strict=True)):
             count = 1 if vary.together else len(elements.ids)
@@ -136,10 +137,10 @@ class Variation:
         return EpisodeDraws(seed, tuple(varied))
 
     def write(self, draws: EpisodeDraws, fields: Fields) -> None:
-        """Write the model of an episode: the fields as they are without variation, and the draws on top.
+        """Write the model of an episode: the original fields with the draws applied.
 
         Args:
-            draws: Of this variation.
+            draws: Draws of this variation.
             fields: Returns the arrays of the model to write, by the names in `fields`.
         """
         self.restore(fields)
@@ -148,15 +149,15 @@ class Variation:
                 write(vary, elements, drawn, self._model, fields)
 
     def restore(self, fields: Fields) -> None:
-        """Write the fields as they are without variation."""
+        """Restore the original fields."""
         for name, values in self._nominal.items():
             fields(name)[...] = values
 
     def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
-        """Vary where an episode starts, in place. Joints stay within their ranges.
+        """Vary the initial state of an episode in place. Joints stay within their ranges.
 
         Args:
-            draws: Of this variation.
+            draws: Draws of this variation.
             qpos: Positions of the whole scene, shape (nq,), after a reset.
         """
         model = self._model
@@ -175,7 +176,7 @@ class Variation:
                     _turn(qpos[at + 3 : at + 7], float(yaw), afresh=vary.by == "set")
 
     def gain_factors(self, draws: EpisodeDraws, actuators: NDArray[np.intp]) -> Mapping[str, NDArray[np.float32]]:
-        """Return by what the gains `kp` and `kv` of controllers of actuators are multiplied, shape (n actuators,)."""
+        """Return the factors of the gains `kp` and `kv` of controllers, shape (n actuators,)."""
         factors = {name: np.ones(len(actuators), dtype=np.float32) for name in self.varied_gains}
         for vary, elements, drawn in draws.varied:
             if vary.what in factors:
@@ -185,7 +186,7 @@ class Variation:
 
     @cached_property
     def varied_gains(self) -> tuple[str, ...]:
-        """Gains that vary, `kp` and `kv`."""
+        """The gains that vary, of `kp` and `kv`."""
         return tuple(sorted({vary.what for vary in self.declaration.vary if vary.what in ("kp", "kv")}))
 
 
@@ -195,7 +196,7 @@ def field_of(model: mujoco.MjModel, name: str) -> NDArray[Any]:
 
 
 def _turn(quaternion: Floats, yaw: float, *, afresh: bool) -> None:
-    """Turn an orientation about the world's z axis, or put it upright with that yaw; (w, x, y, z), in place."""
+    """Rotate an orientation about the world's z axis, or make it upright with that yaw; (w, x, y, z), in place."""
     turn = np.array([np.cos(yaw / 2.0), 0.0, 0.0, np.sin(yaw / 2.0)])
     if afresh:
         quaternion[:] = turn

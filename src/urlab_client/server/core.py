@@ -1,6 +1,6 @@
-"""What the op handlers of a server work on, in one object.
+"""The state that the op handlers of a server share.
 
-For the handlers, which get it as their first argument, and for `SimulatedServer`, which makes it.
+Handlers get it as their first argument; `SimulatedServer` creates it.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ _SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
-    """How play sessions of a server are set up.
+    """Configuration of the play sessions of a server.
 
     Attributes:
-        step_mode: The mode every session is pinned to; `auto` starts live and lets clients choose.
+        step_mode: Mode that every session is locked to; `auto` starts live and lets clients choose.
         unpaused: Let physics run from the start.
-        controllers: Controller by actor id or articulation key; `*` stands for all others. Before what the level or
-            the MJCF says.
-        camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`, where the actor is an id or a key.
-        camera_size: Width and height of cameras whose MJCF gives none, pixels.
-        mjcf_options: Honour the `<option>` of the first model.
-        render_quality: How well cameras and the viewport are drawn.
-        user_channels: First value of the user channels that the level declares, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
-        randomise: What varies from reset to reset.
+        controllers: Controller by actor id or articulation key; `*` matches all others. Takes precedence over the
+            level and the MJCF.
+        camera_modes: Meaning of the pixels by `ACTOR/CAMERA`; the actor is an id or a key.
+        camera_size: Width and height of cameras without a resolution in their MJCF, pixels.
+        mjcf_options: Use the `<option>` of the first model.
+        render_quality: Rendering quality of cameras and the viewport.
+        user_channels: Initial values of the level's user channels, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
+        randomise: Variations drawn at each reset.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -80,14 +80,15 @@ class PhysicsConfig:
     randomise: Randomisation | None = None
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
-        """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
+        """Return the controller of an articulation: the one configured here, otherwise that of the level or its
+        MJCF."""
         for name in (index.actor_id, index.key, "*"):
             if name and name in self.controllers:
                 return self.controllers[name]
         return None if index.controller is None else ControllerConfig.of(index.controller)
 
     def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
-        """Return what the pixels of an articulation's camera mean."""
+        """Return the mode of an articulation's camera."""
         for name in (index.actor_id, index.key):
             if name and f"{name}/{camera}" in self.camera_modes:
                 return self.camera_modes[f"{name}/{camera}"]
@@ -95,7 +96,7 @@ class PhysicsConfig:
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
-    """Stand in for the streams of a server without any."""
+    """Do nothing, for servers without streams."""
 
 
 @dataclass(kw_only=True)
@@ -104,21 +105,21 @@ class ServerCore:
 
     Attributes:
         world: The level being edited.
-        physics: How play sessions are set up.
-        camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
-        switch_camera: Lets a camera, by `ARTICULATION/CAMERA`, stream on its socket and in shared memory, or not.
-        dialect: What the generation of the plugin that it speaks for says differently.
-        shm_directory: Directory of the shared-memory regions; None without.
+        physics: Configuration of play sessions.
+        camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
+        switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
+        dialect: Wire dialect.
+        shm_directory: Directory of the shared-memory regions; None without shared memory.
         session: The client's session.
         play: The play session.
         viewport: The viewport's camera.
-        drawings: Debug drawing.
+        drawings: Debug drawings.
         health: Whether the server's threads run.
-        compiled: What the last play session was started with.
-        jobs: Editor ops that are carried out beside the requests.
+        compiled: The level that the last play session was started with.
+        jobs: Editor ops that run in the background.
         lease: The driver lease.
-        uploads: Models that clients send in pieces.
-        instance: Which of several servers it is; None in dialects that do not tell.
+        uploads: Models that clients upload in chunks.
+        instance: Returns the identity of this server among several; None in dialects without one.
     """
 
     world: EditorWorld
@@ -148,11 +149,11 @@ class ServerCore:
 
     @property
     def limits(self) -> Limits:
-        """How much is done for clients."""
+        """Limits on what clients can request."""
         return self.world.content.limits
 
     def least_reply_bytes(self, request: Request[Any] | None) -> int:
-        """Return how long the reply to a request is at least, as far as that shows before it is executed."""
+        """Return a lower bound of the size of the reply, as far as it is known before the request is executed."""
         running = self.play.current
         if running is None:
             return 0
@@ -163,10 +164,10 @@ class ServerCore:
         return 0
 
     def begin_play(self, *, names_fit: bool = False) -> None:
-        """Start play with the level as it is now; `play.wait` says how it ends.
+        """Start play with the current level; `play.wait` returns the outcome.
 
         Args:
-            names_fit: Whether it fails if a configured controller or camera mode is for something that is not there.
+            names_fit: Whether to fail if a configured controller or camera mode matches nothing in the level.
         """
         actors = self.world.freeze()
         physics = self.physics
@@ -186,13 +187,13 @@ class ServerCore:
         self.world.pie_running = True
 
     def begin_play_again(self, timeout: float) -> bool:
-        """Start play afresh with the scene that was compiled last, in place of what runs, and return when it is ready.
+        """Restart play with the scene that was compiled last, and return when it is ready.
 
         Args:
-            timeout: Seconds that the end of what runs may take.
+            timeout: Longest time for stopping the current session, seconds.
 
         Returns:
-            False when that took longer, or the level is not the one that was compiled.
+            False if stopping took longer, or the level has changed since it was compiled.
         """
         compiled, actors = self.compiled, self.world.freeze()
         if compiled is None or compiled.actors != actors:
@@ -256,7 +257,7 @@ class ServerCore:
         return "merged" if self.dialect.options_merged else "ignored"
 
     def authored_renderer(self) -> CameraRenderer:
-        """Compile the level as it is now and return what draws it; the caller closes it.
+        """Compile the current level and return its renderer; the caller closes it.
 
         Raises:
             CompileFailed: MuJoCo rejects the level.
@@ -287,7 +288,7 @@ class ServerCore:
         return Appearance(quality=self.physics.render_quality, classes={actor.name: _kind(actor) for actor in actors})
 
     def _texts(self, actors: Sequence[Actor]) -> dict[str, str]:
-        """Return what the compiled model tells clients of this server, as far as they cannot know it."""
+        """Return the handshake's facts about the compiled model."""
         physics, appearance = self.physics, self._appearance(actors)
         if not any(mode in _SEGMENTATIONS for mode in physics.camera_modes.values()):
             appearance = Appearance(quality=appearance.quality)
@@ -295,7 +296,7 @@ class ServerCore:
         return varied | appearance.texts()
 
     def stop_play(self) -> None:
-        """End play, if it runs."""
+        """Stop play if it is running."""
         self.play.stop()
         self.world.pie_running = False
         self.drawings.clear(in_play=True)
@@ -304,7 +305,7 @@ class ServerCore:
 
 @dataclass(frozen=True)
 class _Compiled:
-    """A level that was compiled, and the options its model had before anybody changed them."""
+    """A compiled level, and the original options of its model."""
 
     actors: tuple[Actor, ...]
     scene: CompiledScene
@@ -312,13 +313,13 @@ class _Compiled:
 
 
 def _kind(actor: Actor) -> str:
-    """Return what has one colour in a semantic image: the class, or the mesh."""
+    """Return the label of an actor in a semantic image: its class, or its mesh."""
     mesh = actor.mesh
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
 def _unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
-    """Return what is wrong with configured names that fit nothing in a scene: most likely they are misspelt."""
+    """Return messages for configured names that match nothing in a scene; most likely they are misspelt."""
     actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {
         f"{name}/{camera.name}"

@@ -1,4 +1,4 @@
-"""The level a server starts with: saved, or made of models placed side by side."""
+"""The initial level of a server: a saved one, or models placed side by side."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ GAP_M: Final = 1.0
 
 
 class ModelError(URLabError, ValueError):
-    """A model or level that a server was to start with is missing or cannot be used."""
+    """A model or level given at the start is missing or cannot be used."""
 
 
 def is_level(model: str) -> bool:
-    """Whether a name that a server starts with is that of a saved level."""
+    """Whether a name given at the start is that of a saved level."""
     return model.lower().endswith(".json")
 
 
 def populate(world: EditorWorld, models: Sequence[str]) -> None:
-    """Open the level among `models`, place the others, and see to a manager."""
+    """Open the level among `models`, place the other models, and add a manager if there is none."""
     for level in filter(is_level, models):
         world.levels.load_file(Path(level))
     names = [row.name for row in world.list_actors()]
@@ -35,14 +35,14 @@ def populate(world: EditorWorld, models: Sequence[str]) -> None:
     for model in models:
         if is_level(model):
             continue
-        for name in names:  # not before something follows: finding where a model ends may take compiling it
+        for name in names:  # only if another model follows, because the bounding box may require compilation
             edge = _beyond(world, name, edge)
         names = [_place(world, model, sources, edge)]
     world.ensure_manager()
 
 
 def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> str:
-    """Import a model and place it beyond `edge`, the largest y in use, if there is any; return the actor's name.
+    """Import a model, place it beyond `edge`, the largest y in use, if any, and return the actor's name.
 
     `sources` holds the files imported so far by blueprint.
     """
@@ -50,7 +50,7 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
         raise ModelError(unknown_model(model))
     path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
-    # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
+    # Files named on the command line are imported anew, even if an earlier run imported them.
     blueprint, _ = world.blueprints.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
@@ -72,7 +72,7 @@ def _free_id(world: EditorWorld, stem: str) -> str:
 
 
 def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | None:
-    """Return the larger of `edge` and the actor's largest y; an actor without a box has none."""
+    """Return the larger of `edge` and the actor's largest y; an actor without a bounding box has none."""
     bounds = world.get_actor_bounds(actor_name, components_only=True)
     if bounds.extents == (0.0, 0.0, 0.0):
         return edge

@@ -1,4 +1,4 @@
-"""The driver lease: by it clients tell each other that a server is in use. Nothing is enforced by it."""
+"""The driver lease, by which clients announce that a server is in use. It is advisory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["DriverLease"]
 
 
 class DriverLease:
-    """One lease at a time, which ends by itself after a time without requests.
+    """One lease at a time, which expires after some time without requests.
 
     Args:
-        clock: Tells the time, seconds.
+        clock: Returns the time, seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -28,7 +28,7 @@ class DriverLease:
 
     @property
     def held(self) -> bool:
-        """Whether somebody holds it."""
+        """Whether it is held."""
         with self._lock:
             return self._holds()
 
@@ -40,7 +40,7 @@ class DriverLease:
         """
         with self._lock:
             if self._holds():
-                raise Refusal("busy", "somebody holds the driver lease", lease_id=self._id)
+                raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
             self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
             return self._id
 
@@ -56,7 +56,7 @@ class DriverLease:
             self._id = ""
 
     def touch(self) -> None:
-        """Note that the server is in use."""
+        """Renew the lease: the server is in use."""
         if self._id:
             with self._lock:
                 if self._holds():

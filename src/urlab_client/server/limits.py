@@ -1,6 +1,6 @@
-"""How much a server does for its clients: every limit in one place.
+"""All limits on what clients can request.
 
-A request beyond a limit is refused with an error that names the limit by its name here.
+A request that exceeds one is refused with an error that contains the name of the limit.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ _MIB = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a `SimulatedServer` accepts.
+    """The limits of a `SimulatedServer`.
 
     Attributes:
-        request_bytes: Size of a request; one twice as large costs its sender the connection.
+        request_bytes: Size of a request; the connection is closed for one twice as large.
         request_depth: Levels of nesting in a request.
         string_chars: Length of a string in a request: names, ids, paths, labels.
-        n_steps: Physics steps of one request. They run in slices, between which the server can be stopped.
+        n_steps: Physics steps of one request. They run in slices, between which the server can stop.
         grid_cells: Cells of one `spawn_grid`.
         actors: Actors of a level.
-        scene_bytes: Memory of all the models of a level together, as MuJoCo compiles and simulates each.
-        sensor_values: Numbers that the sensors of a level give together; each step reports them.
-        solver_iterations: Iterations of the solver, of its line search, and of collision detection.
-        markers: Debug primitives kept per world; the oldest give way.
-        recording_bytes: Memory of a live recording; the oldest frames give way.
+        scene_bytes: Memory of all compiled models of a level and their simulation, together.
+        sensor_values: Total size of all sensor readings of a level, in numbers; each step reports them.
+        solver_iterations: Iterations of the solver, of its line search, and of collision detection, each.
+        markers: Debug primitives per world; the oldest are removed.
+        recording_bytes: Memory of a live recording; the oldest frames are removed.
         recording_file_bytes: Size of a recording that is loaded.
         model_file_bytes: Size of an XML file that a client names, and of each that it includes.
         model_files: Files that a model may consist of.
         model_bytes: Memory of a model that a client names, once compiled.
-        data_bytes: Memory that its simulation takes: MuJoCo's `mjData`, with its arena.
-        model_memory_bytes: Memory its compilation may take besides.
-        model_cpu_s: Processor time its compilation may take, seconds.
-        model_wall_s: Seconds it may take altogether.
+        data_bytes: Memory of its simulation: MuJoCo's `mjData`, including the arena.
+        model_memory_bytes: Memory that its compilation may use in addition.
+        model_cpu_s: Processor time of its compilation, seconds.
+        model_wall_s: Wall time of its compilation, seconds.
         upload_cache_bytes: Size of the cache of files that clients have sent.
         camera_side: Width and height of a camera's pictures, pixels.
     """

@@ -1,4 +1,4 @@
-"""Everything that an open server holds: sockets, threads, play, folders; opening, restoring and closing it."""
+"""The resources of an open server: sockets, threads, play session, folders; opening, restoring and closing them."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 CLOSE_S: Final = 1.0
-"""Longest time that closing takes, whatever is under way."""
+"""Longest time for closing the server."""
 
 _NO_LIMIT: Final = float("inf")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerPorts:
-    """Numbers as asked for; 0 for any free one."""
+    """Port numbers; 0 for any free port."""
 
     step: int
     state: int
@@ -70,7 +70,7 @@ class ServerPorts:
 
 @dataclass(frozen=True, kw_only=True)
 class ServerConfig:
-    """What a server is to be; see `SimulatedServer`."""
+    """Configuration of a server; see `SimulatedServer`."""
 
     models: tuple[str, ...]
     play: bool
@@ -91,7 +91,7 @@ class ServerConfig:
 
 
 class OpenServer:
-    """Everything an open server holds. Knows nothing of the `SimulatedServer`, which can so be collected."""
+    """The resources of an open server. Does not refer to its `SimulatedServer`, so that it can be collected."""
 
     def __init__(self, config: ServerConfig) -> None:
         self.host: str = numeric_host(config.host)
@@ -101,7 +101,7 @@ class OpenServer:
                 f"{config.host} ({self.host}) can be reached from other machines, and a client can read and write "
                 "files of this one.",
                 hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
-                "or say --insecure-no-auth (insecure_no_auth=True).",
+                "or pass --insecure-no-auth (insecure_no_auth=True).",
             )
         self.health: Health = Health()
         self.request_callbacks: list[Callable[[ServedRequest], None]] = []
@@ -124,7 +124,7 @@ class OpenServer:
 
     @classmethod
     def open(cls, config: ServerConfig) -> OpenServer:
-        """Open a server, or leave nothing behind."""
+        """Open a server; release everything if that fails."""
         opened = cls(config)
         try:
             opened._start(config)
@@ -156,12 +156,12 @@ class OpenServer:
 
     @property
     def memory(self) -> SharedMemoryServer | None:
-        """The shared memory, if there is any."""
+        """The shared memory, if any."""
         return self._memory
 
     @property
     def scene_warnings(self) -> tuple[str, ...]:
-        """What compiling the scene gave occasion to say; nothing outside play."""
+        """Warnings from compiling the scene; empty outside play."""
         core = self._core
         return core.play.running().scene.warnings if core is not None and core.world.pie_running else ()
 
@@ -214,7 +214,7 @@ class OpenServer:
         core.play.listeners += [cameras.show, self._streams.show]  # the second announces the first's ports
         cameras.start()
         self._streams.start()
-        # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
+        # Bound before the models are read, which takes longer; requests wait in the socket until then.
         self._dispatcher = Dispatcher(core, HANDLERS)
         self._dispatcher.callbacks = self.request_callbacks
         answer = self._dispatcher.answer
@@ -229,7 +229,7 @@ class OpenServer:
         except Refusal as refusal:
             raise ModelError(refusal.message) from None
         if config.play:
-            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
+            # Here all actors exist already; with a later begin_pie, more may be spawned first.
             core.begin_play(names_fit=True)
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
@@ -290,7 +290,7 @@ class OpenServer:
         return None if running is None else running.engine.time
 
     def restore(self) -> bool:
-        """Return to the state after the start, or return False if that takes another start."""
+        """Restore the state after the start, or return False if that requires a restart."""
         core, dispatcher = self._core, self._dispatcher
         if core is None or dispatcher is None:
             return False
@@ -321,7 +321,7 @@ class OpenServer:
         return take_snapshot(core, dispatcher, size, frame_all=frame_all)
 
     def _mark(self, core: ServerCore) -> object:
-        """Return something that compares equal for as long as nothing was authored or written."""
+        """Return a value that compares equal until something is authored or written."""
         files: set[tuple[Path, int, int]] = set()
         if self._temporary_folder is not None:
             for file in self._temporary_folder.path.rglob("*"):
@@ -330,12 +330,12 @@ class OpenServer:
         return core.world.authored(), files
 
     def _served(self) -> list[Watchdog | RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
-        """Return what has a thread; shared memory last, since the streams write to it."""
+        """Return all parts with a thread; shared memory last, because the streams write to it."""
         every = (self._watchdog, self._endpoint, self._streams, self._cameras, self._memory)
         return [served for served in every if served is not None]
 
     def close(self) -> None:
-        """Release everything. Safe to call twice; a forked child, which has none of it, leaves it alone."""
+        """Release everything. Idempotent; does nothing in a forked child, which does not own the resources."""
         if self._closed or os.getpid() != self._pid:
             return
         self._closed = True

@@ -1,4 +1,4 @@
-"""The way a handler of the simulated server answers with an error."""
+"""The exception by which a handler answers with an error."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ class Refusal(Exception):
 
     Attributes:
         code: Stable wire code, for example `spawn_failed`.
-        message: What was wrong, where, and what would be right; one line.
+        message: What is wrong, where, and how to correct it; one line.
         absolute_path: The file that could not be written; `recording_save` only.
-        owner: Who owns the robot that the request is about.
-        lease_id: The lease that somebody holds.
+        owner: Owner of the robot that the request is about.
+        lease_id: The lease that another client holds.
     """
 
     code: str

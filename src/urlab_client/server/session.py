@@ -1,7 +1,7 @@
 """The one session of a server: its id, the encoding of replies and the observation level.
 
-For the dispatcher and the handlers. It outlives play sessions and level changes, ends with the server or with the next
-`hello`, and never by time.
+For the dispatcher and the handlers. It survives play sessions and level changes, and ends with the server or the next
+`hello`. It does not time out.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ __all__ = ["ServerSession"]
 
 
 class ServerSession:
-    """What the server remembers between requests, apart from the world.
+    """State that the server keeps between requests, apart from the world.
 
     Attributes:
         id: Active session id, a lower-case GUID; empty before the first `hello`.
-        json: Whether replies are JSON instead of msgpack, whoever asks.
+        json: Whether replies are JSON instead of msgpack, for all clients.
         level: Observation level of replies that carry state.
     """
 
@@ -33,8 +33,8 @@ class ServerSession:
         """Start a new session, which ends the previous one, and return its id.
 
         Args:
-            observations: Level name in any case, where an unknown one means standard; None keeps the level.
-            encoding: `json` in any case for JSON replies; anything else means msgpack.
+            observations: Level name, case-insensitive; an unknown name means standard, None keeps the level.
+            encoding: `json`, case-insensitive, for JSON replies; anything else means msgpack.
         """
         self.id = str(uuid.uuid4())
         self.json = encoding is not None and encoding.lower() == "json"
@@ -47,7 +47,7 @@ class ServerSession:
         return session_id != "" and session_id == self.id
 
     def level_of(self, observations: str | None) -> ObservationLevel:
-        """Return the level that a step names; the session's, if it names none or an unknown one."""
+        """Return the level that a step requests; the session's, if it requests none or an unknown one."""
         return self.level if observations is None else _level(observations) or self.level
 
 

@@ -1,4 +1,4 @@
-"""A picture of the viewport, as the ops of a server have set it up.
+"""A picture of the viewport as it is set up on the server.
 
 For `SimulatedServer.snapshot`; the wire has no op for it.
 """
@@ -22,10 +22,10 @@ from urlab_client.server.rpc.dispatch import Dispatcher
 __all__ = ["LARGEST_PIXELS", "take_snapshot"]
 
 LARGEST_PIXELS: Final = 16384
-"""Most pixels of a side, the most that usual drivers draw."""
+"""Longest side in pixels, the maximum of common drivers."""
 
-PATIENCE_S: Final = 10.0
-"""Longest wait for a request that is being answered."""
+IDLE_DEADLINE_S: Final = 10.0
+"""Longest wait for the request in progress."""
 
 _FRAMING_FOV: Final = 40.0
 
@@ -37,20 +37,20 @@ def take_snapshot(
 
     Args:
         server: The server.
-        dispatcher: What answers its requests, none of which is answered while the state is read.
+        dispatcher: Dispatcher of its requests, which is paused while the state is read.
         size: Width and height, pixels.
-        frame_all: Look at everything, from the viewport camera's direction.
+        frame_all: Frame everything, keeping the direction of the viewport camera.
 
     Returns:
         Red, green, blue and alpha from the top, shape (height, width, 4).
 
     Raises:
-        RenderingUnavailable: It cannot be drawn.
+        RenderingUnavailable: The picture cannot be drawn.
     """
     need_backend()
-    with dispatcher.standstill(PATIENCE_S) as idle:
+    with dispatcher.standstill(IDLE_DEADLINE_S) as idle:
         if not idle:
-            raise RenderingUnavailable(f"a request was being answered for more than {PATIENCE_S:g} s")
+            raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
         view = look(server)
         picture = ViewportPicture(
             size=size,

@@ -1,7 +1,7 @@
-"""The base of the generated façade: blocking objects that stand for asynchronous ones.
+"""The base classes of the generated façade, whose blocking objects wrap asynchronous ones.
 
-Everything blocking-only lives in the modules of `urlab_client.sync` that begin with an underscore; the others are
-generated and hold no behaviour.
+All blocking-only code is in the modules of `urlab_client.sync` whose names start with an underscore; the others are
+generated and contain no behaviour.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FACADES: dict[type, type[Facade]] = {}
 class Facade:
     """Base of the generated classes: the blocking twin of one asynchronous object.
 
-    A subclass names the class it stands for: `class Scene(Facade, twin=aio.Scene)`. It is made by `wrap` only.
+    A subclass names the class that it wraps: `class Scene(Facade, twin=aio.Scene)`. Only `wrap` creates instances.
     """
 
     __slots__ = ("__weakref__", "_aio", "_maps", "_portal")
@@ -53,9 +53,9 @@ class Facade:
         return None if aio is None else wrap(self._portal, cls, aio)
 
     def _map(self, name: str, cls: type[F], source: NameMap[Any]) -> NameMap[F]:
-        """Return the twins of the entries of `source`, as the same map as long as property `name` has this `source`.
+        """Return the twins of the entries of `source`; the same map while property `name` has this `source`.
 
-        Remembered here, not in the map: the loop's tasks keep `source` alive, which must not keep the twins.
+        Cached here, not in the map: the loop's tasks keep `source` alive, which must not keep the twins alive.
         """
         known, twins = self._maps.get(name, (None, None))
         if twins is None or known is not source:
@@ -71,17 +71,17 @@ class Facade:
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise TypeError(
-            f"{type(self).__name__} cannot be pickled or copied: it belongs to a connection of this process. "
-            "Make a client where it is needed."
+            f"{type(self).__name__} cannot be pickled or copied: its connection belongs to this process. "
+            "Create a client in the process that needs one."
         )
 
 
 def wrap(portal: Portal, cls: type[F], aio: object) -> F:
-    """Return the façade twin of `aio`, always the same one.
+    """Return the façade twin of `aio`, always the same object.
 
     Args:
-        portal: The way into the loop on which it lives.
-        cls: Façade class of the declared type; the twin's is that of `aio`'s own class, which may be derived.
+        portal: Portal to the loop of `aio`.
+        cls: Façade class of the declared type; for a derived class of `aio` the twin has its façade class.
         aio: The asynchronous object.
     """
 
@@ -100,12 +100,12 @@ class _Twin(Protocol[A_co]):
 
 
 def aio_of(twin: _Twin[A_co]) -> A_co:
-    """Return the async object that a façade object stands for."""
+    """Return the async object that a façade object wraps."""
     return twin._aio  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
 
 def portal_of(twin: Facade) -> Portal:
-    """Return the way into the event loop of a façade object's client."""
+    """Return the portal to the event loop of a façade object's client."""
     return twin._portal  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
 

@@ -1,4 +1,4 @@
-"""The way from blocking code into an event loop."""
+"""Calls from blocking code into an event loop."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ A_co = TypeVar("A_co", covariant=True)
 
 
 class _Stream(Protocol[A_co]):
-    """Something asynchronous whose waiting items can be read from any thread."""
+    """An asynchronous stream whose buffered items can be read from any thread."""
 
     def receive_nowait(self) -> A_co | None: ...
 
@@ -32,14 +32,14 @@ class _Stream(Protocol[A_co]):
 
 
 class Portal:
-    """The way from blocking code into one client's event loop.
+    """Runs coroutines of blocking code on one client's event loop.
 
-    Cheap to make: the loop and the daemon thread that runs it between calls start with the first `call`. They end
-    with `close`, when the portal is garbage collected, or at interpreter exit; then `at_stop` runs, remaining tasks are
+    Cheap to create: the loop and the daemon thread that runs it between calls start with the first `call`. They end
+    with `close`, when the portal is garbage-collected, or at interpreter exit. Then `at_stop` runs, remaining tasks are
     cancelled and awaited, asynchronous generators are closed and the thread is joined, each in bounded time.
 
     Args:
-        at_stop: Makes the coroutine that releases what lives on the loop. It must not refer to the portal.
+        at_stop: Returns the coroutine that releases the resources on the loop. It must not refer to the portal.
 
     Raises:
         URLabError: gevent or Eventlet has replaced Python's threads or sockets.
@@ -55,7 +55,7 @@ class Portal:
         self._io: CallerDrivenLoop | None = None
         self._finalizer: weakref.finalize[[], Portal] | None = None
         self._closed = False
-        # Weak: twins refer to the portal, so a strong reference back would leave closing to the cycle collector.
+        # Weak: twins refer to the portal, so with strong references only the cycle collector would close it.
         self._twins: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
 
     @property
@@ -64,47 +64,47 @@ class Portal:
         return self._io is not None and not self._io.stopping and self._pid == os.getpid()
 
     def call(self, function: Callable[P, Coroutine[Any, Any, T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run the coroutine that `function` makes on the loop, and return its result; block until then.
+        """Run the coroutine that `function` returns on the loop, block until it is done, and return its result.
 
-        Where possible this thread runs the loop. An exception that a signal handler raises meanwhile, such as
-        `KeyboardInterrupt`, cancels the coroutine, gives its `finally` blocks up to `GRACE` seconds, and goes on. The
-        portal stays usable.
+        If possible, this thread runs the loop. An exception that a signal handler raises during the call, such as
+        `KeyboardInterrupt`, cancels the coroutine, gives its `finally` blocks up to `GRACE` seconds, and propagates.
+        The portal stays usable.
 
         Raises:
-            ForkedError: If this process is a fork of the one that made the portal.
-            ClientClosed: If the portal is closed, before or during the call.
-            URLabError: If called from inside the loop, where waiting would never end.
+            ForkedError: This process is a fork of the one that created the portal.
+            ClientClosed: The portal was closed before or during the call.
+            URLabError: Called from inside the loop, where waiting would never end.
         """
         with DeferredSignals() as signals:
             io = self._ready()
             job = Job(function(*args, **kwargs))
             io.run(job, signals)
-        # Since Python 3.13 the traceback leads to frames that refer to the job.
+        # Since Python 3.13 the traceback contains frames that refer to the job.
         error, job.error = job.error, None
         if error is None:
             return job.value
-        # A refusal by the server is told by its message and its notes; frames of the client would only bury them.
+        # The message and notes of a refusal by the server are enough; frames of the client would hide them.
         trace = None if isinstance(error, URLabRPCError) else _without_earlier_raise(error.__traceback__)
         try:
             raise error.with_traceback(trace)
         finally:
-            del error, job, trace  # The traceback refers to this frame: leave no cycle.
+            del error, job, trace  # The traceback refers to this frame: avoid a cycle.
 
     def next(self, function: Callable[[], Coroutine[Any, Any, T]]) -> T:
-        """`call` for a façade's `__next__`: the end of the asynchronous iteration ends the blocking one."""
+        """`call` for a façade's `__next__`: `StopAsyncIteration` becomes `StopIteration`."""
         try:
             return self.call(function)
         except StopAsyncIteration:
             raise StopIteration from None
 
     def next_of(self, stream: _Stream[A]) -> A:
-        """`next` for a stream. All of a batch but its first item takes no way through the loop."""
+        """`next` for a stream. Buffered items are returned without entering the loop."""
         with DeferredSignals():
             item = stream.receive_nowait()
         return self.next(stream.__anext__) if item is None else item
 
     def release(self, function: Callable[P, Coroutine[Any, Any, object]], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """`call` for what only lets go: after the client was closed, or in a forked child, there is nothing to do."""
+        """`call` for releasing resources; does nothing after the client was closed, or in a forked child."""
         with contextlib.suppress(ClientClosed, ForkedError):
             self.call(function, *args, **kwargs)
 
@@ -113,9 +113,9 @@ class Portal:
     ) -> None:
         """Run `last`, then end the loop and its thread. Later calls raise `ClientClosed`; closing again does nothing.
 
-        An exception that a signal handler raises meanwhile cuts `last` short; the end is the same, in bounded time.
+        An exception that a signal handler raises during `last` cancels it; the loop still ends in bounded time.
 
-        In a forked child, too, this does nothing: what there is to release belongs to the parent.
+        Does nothing in a forked child, because the resources belong to the parent.
         """
         if self._closed or os.getpid() != self._pid:
             return
@@ -139,7 +139,7 @@ class Portal:
             raise error
 
     def twin(self, aio: object, make: Callable[[], A]) -> A:
-        """Return what stands for `aio` in blocking code: always the same object while it is held, made if need be."""
+        """Return the blocking twin of `aio`: the same object while it is referenced, otherwise a new one."""
         found = self._twins.get(id(aio))
         if found is None:
             if os.getpid() != self._pid:
@@ -151,7 +151,7 @@ class Portal:
         return found
 
     def _ready(self) -> CallerDrivenLoop:
-        """Return the running loop, or raise the reason why there cannot be one."""
+        """Return the loop, started if necessary, or raise if it cannot be used."""
         if os.getpid() != self._pid:
             raise _forked()
         if self._io is None:
@@ -169,39 +169,39 @@ class Portal:
 
 
 def _refuse_greenlets() -> None:
-    """Raise if what the loop and its thread stand on is not what it seems: calls would hang, or blame each other."""
+    """Raise if gevent or Eventlet has replaced threads or sockets, with which calls would hang or fail."""
     gevent: Any = sys.modules.get("gevent.monkey")
     eventlet: Any = sys.modules.get("eventlet.patcher")
     if gevent is not None and any(map(gevent.is_module_patched, ("threading", "select"))):
-        who = "gevent"
+        library = "gevent"
     elif eventlet is not None and any(map(eventlet.is_monkey_patched, ("thread", "select"))):
-        who = "Eventlet"
+        library = "Eventlet"
     else:
         return
     raise URLabError(
-        f"The blocking client needs Python's own threads and sockets, which {who} has replaced in this process.",
-        hint="Use it in a process of its own, or urlab_client.aio with asyncio.run().",
+        f"The blocking client needs Python's own threads and sockets, which {library} has replaced in this process.",
+        hint="Use it in a separate process, or use urlab_client.aio with asyncio.run().",
     )
 
 
 def _forked() -> ForkedError:
     return ForkedError(
-        "This client was made before the process forked: its thread and sockets stayed with the parent.",
-        hint="Make a client in the child, or start workers with multiprocessing's 'spawn' method.",
+        "This client was created before the process forked. Its thread and sockets belong to the parent.",
+        hint="Create a client in the child, or start workers with multiprocessing's 'spawn' method.",
     )
 
 
 def _on_io_thread() -> URLabError:
     return URLabError(
         "A blocking call was made on the client's own I/O thread, which would wait for itself.",
-        hint="Hand the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
+        hint="Move the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
     )
 
 
 def _without_earlier_raise(trace: TracebackType | None) -> TracebackType | None:
-    """Cut off what raising the same exception object through an earlier call left at the end of `trace`.
+    """Remove the part of `trace` that an earlier raise of the same exception object left at its end.
 
-    The leftover begins in a frame of that call's callers and goes on through `Portal.call`.
+    That part begins in a frame of the earlier call's callers and continues through `Portal.call`.
     """
     entry = trace
     while entry is not None and entry.tb_frame.f_code is not Portal.call.__code__:
@@ -214,7 +214,7 @@ def _without_earlier_raise(trace: TracebackType | None) -> TracebackType | None:
         callers.add(frame)
         frame = frame.f_back
     if trace.tb_frame in callers:
-        return trace  # A coroutine of this loop made a blocking call into another one: nothing is left over.
+        return trace  # A coroutine of this loop made a blocking call into another loop: nothing to remove.
     last = trace
     while last.tb_next is not None and last.tb_next.tb_frame not in callers:
         last = last.tb_next

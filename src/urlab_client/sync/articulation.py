@@ -25,8 +25,8 @@ __all__ = ["URLabArticulation", "URLabEntity"]
 class URLabEntity(Facade, twin=aio.URLabEntity):
     """A dynamic body, or the root of an articulation.
 
-    State is that of the last reply. Arrays are fresh copies, yours to keep. Read from a thread other than the one
-    that steps, several values belong together only under `client._data_lock`.
+    The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread
+    other than the one that steps, hold `client._data_lock`.
     """
 
     __slots__ = ()
@@ -39,12 +39,12 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
 
     @property
     def body_id(self) -> int:
-        """Global MuJoCo id of the (root) body; -1 for an articulation without a local model."""
+        """Global MuJoCo id of the body (of the root body for an articulation, -1 without a local model)."""
         return self._aio.body_id
 
     @property
     def has_free_base(self) -> bool:
-        """True when the (root) body has a free joint; False for an articulation without a local model."""
+        """True if the body or root body has a free joint; False for an articulation without a local model."""
         return self._aio.has_free_base
 
     @property
@@ -89,7 +89,7 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
 
     @property
     def projected_gravity_b(self) -> Floats:
-        """Unit vector of gravity's direction, shape (3,), body frame; (0, 0, -1) when upright."""
+        """Unit vector in the direction of gravity, shape (3,), body frame; (0, 0, -1) when upright."""
         return self._aio.projected_gravity_b
 
     def apply_xfrc(self, *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)) -> None:
@@ -108,15 +108,15 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
         self._aio.apply_xfrc(force=force, torque=torque)
 
     def describe(self) -> EntityDescription | ArticulationDescription:
-        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
+        """Return name, kind and pose as of the last reply, in a form that encodes directly to JSON."""
         return self._aio.describe()
 
 
 class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     """A robot imported from MJCF.
 
-    Dictionaries are keyed by short names, without the articulation's prefix; compiled names and original MJCF names
-    are found, too. Without a local model only actuators and cameras are known.
+    Dictionaries are keyed by short names, without the articulation's prefix. Lookups also accept compiled names and
+    original MJCF names. Without a local model only actuators and cameras are known.
     """
 
     __slots__ = ()
@@ -129,17 +129,17 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def compiled_prefix(self) -> str:
-        """What its compiled names start with, before an underscore: the key, or the engine's name of the actor."""
+        """Prefix of its compiled names, without the underscore: the key, or the engine's name of the actor."""
         return self._aio.compiled_prefix
 
     @property
     def user(self) -> dict[str, Any]:
-        """Values of the user channels that the level declares for it, by name; empty on servers without them."""
+        """Values of the user channels that the level declares for it, by name; empty if the server has none."""
         return self._aio.user
 
     @property
     def actor_id(self) -> str:
-        """Stable id given when it was spawned; empty if none."""
+        """Stable id given when it was spawned; empty if none was given."""
         return self._aio.actor_id
 
     @property
@@ -169,12 +169,12 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def controller(self) -> URLabController | None:
-        """The controller, or None for an articulation whose set-points go straight to its actuators."""
+        """The controller, or None if the set-points go directly to the actuators."""
         return self._wrap(URLabController, self._aio.controller)
 
     @property
     def control_mode(self) -> ControlMode:
-        """Whether the controller turns set-points into actuator signals. May be assigned before `step()`.
+        """Whether the controller turns set-points into actuator signals. Assign it before `step()`.
 
         Raises:
             ValueError: On assigning anything but `ue_controller` or `raw`.
@@ -192,8 +192,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
 
         Raises:
-            TypeError: On assigning what is not numbers.
-            ValueError: On assigning NaN, infinities or another number of values.
+            TypeError: On assigning values that are not numbers.
+            ValueError: On assigning NaN, infinities or the wrong number of values.
         """
         return self._aio.ctrl_array
 
@@ -203,7 +203,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def last_applied_ctrl(self) -> Floats:
-        """`mjData.ctrl` as the server applied it last, after any controller, shape (n_actuators,)."""
+        """`mjData.ctrl` that the server applied last, after any controller, shape (n_actuators,)."""
         return self._aio.last_applied_ctrl
 
     @property
@@ -218,7 +218,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def qvel_array(self) -> Floats:
-        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; of a free base linear world, angular body."""
+        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; a free base's linear in world, angular in body."""
         return self._aio.qvel_array
 
     @property
@@ -255,13 +255,13 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point; of an actuator with several inputs, the first.
-            out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
+            values: Actuator name to set-point; the first input of an actuator with several.
+            out_of_range: Handling of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
             KeyError: A name is unknown; nothing was set.
             TypeError: A value is not a number; nothing was set.
-            ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
+            ValueError: A value is NaN or infinite or, with `error`, out of range; nothing was set.
         """
         self._aio.set_ctrl(values, out_of_range=out_of_range)
 
@@ -278,18 +278,18 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         return self._aio.get_sensors()
 
     def describe(self) -> ArticulationDescription:
-        """Return its parts, its state and its set-points, as of the last reply.
+        """Return its parts, state and set-points as of the last reply.
 
-        `to_dict()` and `to_json()` of the result make plain data of it.
+        `to_dict()` and `to_json()` of the result return plain data.
         """
         return self._aio.describe()
 
     def resolve_joint(self, name: str) -> str | None:
-        """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
+        """Return the live key of a joint for its live, compiled or original MJCF name, or None."""
         return self._aio.resolve_joint(name)
 
     def resolve_actuator(self, name: str) -> str | None:
-        """Return the live key of an actuator given its live, compiled or original MJCF name, or None."""
+        """Return the live key of an actuator for its live, compiled or original MJCF name, or None."""
         return self._aio.resolve_actuator(name)
 
     def apply_xfrc(
@@ -297,8 +297,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     ) -> None:
         """Buffer a wrench on one of its bodies for the next `step()`, which clears it.
 
-        It acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where the
-        server ignores wrenches.
+        The wrench acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where
+        the server ignores wrenches.
 
         Args:
             body: Short body name; the root body if empty.
@@ -308,54 +308,54 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         Raises:
             KeyError: The articulation has no such body.
             TypeError: A component is not a number.
-            ValueError: A vector does not have three finite components, or the body must be named.
+            ValueError: A vector does not have three finite components, or `body` is empty and the root is not known.
         """
         self._aio.apply_xfrc(body, force=force, torque=torque)
 
     def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
-        """Move joints to positions with their position servos, and return when they have settled there.
+        """Move joints to positions with their position servos, and return when they have settled.
 
-        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        Sets the set-points immediately, without an intermediate path, and then steps in `direct` and `puppet` or waits
         in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
         Other set-points do not change, and the new ones stay in force afterwards.
 
         Args:
             targets: Joint name to position, radians or metres.
-            tolerance: How far from its target a joint may be, in its unit.
+            tolerance: Largest distance of a joint from its target, in the unit of the joint.
             timeout: Seconds of simulation time after which to give up.
 
         Returns:
-            Seconds of simulation time that it took.
+            Simulation time that passed, seconds.
 
         Raises:
-            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
-                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
+            NotSettled: The joints did not settle in time; `.remaining` has the remaining distance of each joint, and
+                the message contains the findings of `explain()`. A servo that works against gravity may need a larger
+                tolerance.
             KeyError: The articulation has no such joint; nothing was set.
-            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
-                joint at a position; nothing was set.
-            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
+            ValueError: A target is not finite or outside the range of its joint or actuator, or the joint has no
+                position servo; nothing was set.
+            URLabTimeoutError: Simulation time does not advance, for example while paused in live mode.
         """
         return self._portal.call(self._aio.move_to, targets, tolerance=tolerance, timeout=timeout)
 
     def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
         """Become the only client that controls the articulation, before the first write does so automatically.
 
-        A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
-        server whose robots have no owner this does nothing.
+        The client renews the claim until `release()` or `close()`. Does nothing on a server whose robots have no owner.
 
         Args:
-            force: Take it from the client that controls it; that one's next write is refused.
-            ttl: Seconds after which the claim ends when this process is gone; 0 for never.
+            force: Take the articulation from the client that controls it; the next write of that client is refused.
+            ttl: Seconds after which the claim expires if this process has died; 0 for never.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` names it.
+            ControlClaimed: Another client controls the articulation; `.owner` names that client.
             ValueError: `ttl` is negative or not a number.
         """
         self._portal.call(self._aio.claim, force=force, ttl=ttl, timeout=timeout)
 
     def release(self, *, timeout: Timeout = DEFAULT) -> None:
-        """Let others control the articulation. The next write claims it again.
+        """Let other clients control the articulation. The next write claims it again.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -364,8 +364,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def control_owner(self) -> str | None:
-        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it: `HOST/PROCESS/…` for this process, otherwise the name of the other client.
 
-        None if no client controls it, if it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if the owner is not known, and on servers whose robots have no owner.
         """
         return self._aio.control_owner

@@ -26,29 +26,29 @@ __all__ = ["ClientState"]
 
 
 class ClientState(Facade, twin=aio.ClientState):
-    """The attributes of a client; reading them sends nothing and waits for nothing."""
+    """The attributes of a client. Reading them sends nothing and does not block."""
 
     __slots__ = ()
     _aio: aio.ClientState
 
     @property
     def address(self) -> str:
-        """The address the client was made with."""
+        """The address given to the constructor."""
         return self._aio.address
 
     @property
     def config(self) -> ClientConfig:
-        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
+        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
         return self._aio.config
 
     @property
     def connected(self) -> bool:
-        """Whether a server is on the line right now."""
+        """Whether the client is connected to a server at the moment."""
         return self._aio.connected
 
     @property
     def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
+        """Counters of requests, replies and connections, and with `transport="shm"` of the path that each took."""
         return self._aio.transport_stats
 
     @property
@@ -68,7 +68,7 @@ class ClientState(Facade, twin=aio.ClientState):
 
     @property
     def server(self) -> ServerInfo:
-        """What the server is and can do, as far as its answers have shown."""
+        """The server's versions and features, as far as its replies have shown them."""
         return self._aio.server
 
     @property
@@ -78,7 +78,7 @@ class ClientState(Facade, twin=aio.ClientState):
 
     @property
     def manager_present(self) -> bool:
-        """Whether a play session runs, as far as this client knows."""
+        """Whether a play session is running, as far as this client knows."""
         return self._aio.manager_present
 
     @property
@@ -95,20 +95,20 @@ class ClientState(Facade, twin=aio.ClientState):
     def data(self) -> MjData | None:
         """Local state that mirrors the server's after each reply, or None without a model.
 
-        Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read
-        after a reply, so read it again after each step; whoever does not read it pays nothing. Forces and contacts are
-        not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
+        Reading this property computes the poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`,
+        …), so read it again after each step. A client that does not read it saves the computation. Forces and contacts
+        are not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
         """
         return self._aio.data
 
     @property
     def model_is_approximate(self) -> bool:
-        """True when the model was compiled here because the server runs another MuJoCo build."""
+        """True if this client compiled the model because the server runs another MuJoCo build."""
         return self._aio.model_is_approximate
 
     @property
     def articulations(self) -> NameMap[URLabArticulation]:
-        """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
+        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
         return self._map("articulations", URLabArticulation, self._aio.articulations)
 
     @property
@@ -128,12 +128,12 @@ class ClientState(Facade, twin=aio.ClientState):
 
     @property
     def step_count(self) -> int:
-        """Steps since `discover()` or `reset()`, as the server counts; constant in live mode."""
+        """Steps since `discover()` or `reset()`, as counted by the server; constant in live mode."""
         return self._aio.step_count
 
     @property
     def reset_seed(self) -> int | None:
-        """The seed that the last `reset()` gave, which decides what a server varies; None without one."""
+        """Seed of the last `reset()`, which determines what the server randomises; None if it had none."""
         return self._aio.reset_seed
 
     @property
@@ -167,17 +167,17 @@ class ClientState(Facade, twin=aio.ClientState):
         return self._aio.recv_wall_time_ns
 
     def describe(self) -> SceneDescription:
-        """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
+        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
 
-        Sends nothing. `to_dict()` and `to_json()` of the result make plain data of it.
+        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
         """
         return self._aio.describe()
 
     def handshake(self) -> bytes:
-        """Return what a client with `read_only=True` has to know: names, limits, cameras and the model.
+        """Return the names, limits, cameras and the model that a client with `read_only=True` needs.
 
-        For another process or machine, which passes it to its own client's `discover(handshake=…)`. It describes the
-        play session of the last handshake, and does not let anybody into this client's session.
+        Another process or machine passes the result to `discover(handshake=…)` of its own client. It describes the play
+        session of the last handshake and gives no access to this client's session.
 
         Raises:
             NoSession: `discover()` was not called.
@@ -185,26 +185,26 @@ class ClientState(Facade, twin=aio.ClientState):
         return self._aio.handshake()
 
     def camera(self, name: str) -> URLabCameraView:
-        """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
 
         Raises:
-            UnknownName: A `KeyError`: there is no such camera, or there are several.
+            UnknownName: No camera or more than one has this name. It is a `KeyError`.
         """
         return self._wrap(URLabCameraView, self._aio.camera(name))
 
     def matches(self, snapshot: StateSnapshot) -> bool:
-        """Return whether a published state is of the world that the last handshake described, as far as it shows.
+        """Return whether a published state belongs to the world of the last handshake, as far as its fields show.
 
-        Right after play began anew, a stream may bring states of a world that `discover()` has not been told of.
+        Right after play restarts, a stream may deliver states of a world that `discover()` has not seen yet.
         """
         return self._aio.matches(snapshot)
 
     def add_observer(self, observer: ClientObserver) -> None:
-        """Tell `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
+        """Notify `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
         self._aio.add_observer(observer)
 
     def remove_observer(self, observer: ClientObserver) -> None:
-        """Tell `observer` nothing more. Idempotent."""
+        """Stop notifying `observer`. Idempotent."""
         self._aio.remove_observer(observer)
 
     @property

@@ -23,17 +23,17 @@ class URLabController(Facade, twin=aio.URLabController):
 
     @property
     def articulation_prefix(self) -> str:
-        """Key of the articulation it drives."""
+        """Key of the articulation that it drives."""
         return self._aio.articulation_prefix
 
     @property
     def kind(self) -> ControllerKind | str:
-        """`pd`, `passthrough`, or what a newer server calls it."""
+        """`pd`, `passthrough`, or a plain string for a kind that this client does not know."""
         return self._aio.kind
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """Parameters as the server acknowledged them last; a read-only view that stays current."""
+        """Parameters that the server acknowledged last; a read-only view that stays current."""
         return self._aio.params
 
     @property
@@ -42,11 +42,11 @@ class URLabController(Facade, twin=aio.URLabController):
         return self._aio.schema
 
     def configure(self, *, timeout: Timeout = DEFAULT, **params: Any) -> dict[str, Any]:
-        """Check parameters against the schema, push them, and return all that are in force now.
+        """Check parameters against the schema, push them, and return all parameters in force.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-            **params: Parameters to change; a mapping patches the actuators it names.
+            **params: Parameters to change; a mapping changes only the actuators that it names.
 
         Raises:
             ControllerSchemaViolation: A parameter does not fit the schema; nothing was sent.
@@ -90,7 +90,7 @@ class URLabPDController(URLabController, twin=aio.URLabPDController):
         *,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, Any]:
-        """Change gains of the actuators named; the others keep theirs. Return all parameters in force.
+        """Change gains of the named actuators and return all parameters in force. Others keep their gains.
 
         Raises:
             ControllerSchemaViolation: An unknown actuator or a value below the minimum; nothing was sent.
@@ -105,7 +105,7 @@ class URLabPDController(URLabController, twin=aio.URLabPDController):
         *,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, Any]:
-        """Change the default gains and bind every actuator to them. Return all parameters in force.
+        """Change the default gains, apply them to every actuator, and return all parameters in force.
 
         Raises:
             ControllerSchemaViolation: A value is below the minimum; nothing was sent.

@@ -20,17 +20,18 @@ T = TypeVar("T", bound=StreamItem)
 class Stream(Facade, Generic[T], twin=aio.Stream):
     """Items that the server publishes, as they arrive.
 
-    It opens with the first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
-    stream is closed; when the client is closed, it raises `ClientClosed` after the items that had arrived.
+    The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
+    stream is closed. When the client is closed, iteration raises `ClientClosed` after the items that had arrived.
 
-    The policy decides which items wait for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps the
-    newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next read
-    raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
+    The policy decides which items are kept for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps
+    the newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next
+    read raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
 
-    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. Losses before an item
-    reaches this process, in the queues of the server or the network, are invisible: the wire has no numbers.
+    Each item has `seq`, `dropped` and `gap`, which show what the reader missed. Losses before an item reaches this
+    process, in the queues of the server or the network, cannot be detected: messages on the wire are not numbered.
 
-    One reader at a time; anyone may read `latest`, `stats` and `closed`. An item that nobody reads is not decoded.
+    Only one reader at a time may wait for items. `latest`, `stats` and `closed` may be used from anywhere. Items are
+    decoded only when they are read.
 
     Example:
         with client.state_stream() as states:
@@ -43,7 +44,7 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed here."""
+        """Whether the reader closed the stream."""
         return self._aio.closed
 
     @property
@@ -52,19 +53,21 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
         return self._aio.stats
 
     def latest(self) -> T | None:
-        """Return the newest item without waiting and without taking it away from the reader; None before the first.
+        """Return the newest item without waiting and without removing it from the buffer; None before the first.
 
         The reader gets the same object.
         """
         return self._aio.latest()
 
     def receive_nowait(self) -> T | None:
-        """Return the next item if one waits, else None, as before the stream is opened and after it is closed.
+        """Return the next item if one is buffered, otherwise None.
+
+        Returns None before the stream is opened and after it is closed.
 
         Raises:
             StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Somebody waits for the next item.
-            ClientClosed: The client was closed, and what had arrived is read.
+            ConcurrentReadError: Another reader is waiting for the next item.
+            ClientClosed: The client was closed and all items that had arrived have been read.
         """
         return self._aio.receive_nowait()
 
@@ -72,20 +75,20 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
-                that is less and a server in live mode may still be preparing its first picture.
+            timeout: Seconds to wait; None waits without limit. The default is the client's `rcv_timeout_ms`; it is at
+                least 30 s while a server in live mode may still be preparing its first picture.
 
         Raises:
-            URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.
+            URLabTimeoutError: No item arrived in time; the message names the stage that failed and what to check.
             StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Somebody else waits for the next item.
-            ClientClosed: The client was closed, and what had arrived is read.
+            ConcurrentReadError: Another reader is waiting for the next item.
+            ClientClosed: The client was closed and all items that had arrived have been read.
             URLabError: The stream was closed.
         """
         return self._portal.call(self._aio.receive, timeout=timeout)
 
     def close(self) -> None:
-        """Stop receiving and drop what waits. A reader's iteration ends. Idempotent."""
+        """Stop receiving and discard buffered items. A running iteration ends. Idempotent."""
         self._portal.release(self._aio.aclose)
 
     def __enter__(self) -> Self:
@@ -100,5 +103,5 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
         return self
 
     def __next__(self) -> T:
-        """Return the next item; see `receive` for what it raises."""
+        """Return the next item; see `receive` for the errors."""
         return self._portal.next_of(self._aio)

@@ -1,1 +1,1 @@
-"""What arrives without being asked for: published states, pictures and events, on their way to streams."""
+"""Sources of published data for the streams: states, pictures and events."""

@@ -1,4 +1,4 @@
-"""The pictures of one camera: from its socket or its region."""
+"""The pictures of one camera, from its socket or its shared memory region."""
 
 from __future__ import annotations
 
@@ -24,59 +24,59 @@ from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 __all__ = ["CameraSource", "HasCamera"]
 
 FIRST_PICTURE_S = 30.0
-"""How long a server may take for its first picture: it looks for OpenGL before."""
+"""Seconds that a server may take for its first picture, because it initialises OpenGL first."""
 
 
 class HasCamera(Protocol):
-    """A camera as the client knows it; what it says may change with each handshake.
+    """A camera as the client knows it. Its properties may change with each handshake.
 
     Attributes:
-        memory: Where its pictures go.
+        memory: Memory that holds its decoded pictures.
     """
 
     memory: PictureMemory
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the camera."""
         ...
 
     @property
     def info(self) -> CameraInfo:
-        """The handshake's description."""
+        """Description from the handshake."""
         ...
 
     @property
     def mode(self) -> CameraMode | str:
-        """What its pixels mean."""
+        """Meaning of its pixels."""
         ...
 
 
 class CameraSource(PublishedSource):
     """The pictures of one camera, from its region or from its socket.
 
-    A picture from the region is converted when somebody looks at it, straight into an array of the user's.
+    A picture from the region is converted on first access, directly into the user's array.
 
     Args:
-        subscriptions: The client's.
+        subscriptions: Subscriptions of the client.
         view: The camera.
-        host: Tells under which name or address the server was reached.
-        regions: As of the base class.
-        live: Tells whether the server is in live mode, as far as is known.
-        switch: Switches the camera on and off; None where it always streams.
-        asked: Whether the user asked for these pictures, rather than having them received in the background.
+        host: Callback that returns the host name or address of the server.
+        regions: See the base class.
+        live: Callback that returns whether the server is in live mode, as far as the client knows.
+        switch: Switch that turns the camera on and off; None if it always streams.
+        asked: True if the user requested these pictures; False if the client receives them in the background.
     """
 
     name = "frames"
     unreachable = (
-        "The port is open while play runs and the camera streams. A camera that found no free port reports one that "
-        "it does not serve: the plugin serves nine."
+        "The port is open while play runs and the camera streams. The plugin serves nine cameras; any further camera "
+        "reports a port that it does not serve."
     )
     silent = (
-        "Older servers publish pictures in live mode only, and while the camera is switched on in the editor; newer "
-        "ones in every mode, but only while the simulation moves. capture() takes one at any time. A server that "
-        "cannot draw publishes none; before its first picture it looks for OpenGL, which takes seconds, and its log "
-        "says what it found."
+        "Older servers publish pictures only in live mode and while the camera is switched on in the editor. Newer "
+        "servers publish in every mode, but only while the simulation moves. capture() takes a picture at any time. "
+        "A server that cannot render publishes no pictures. It initialises OpenGL before its first picture, which "
+        "takes seconds; its log shows the result."
     )
 
     def __init__(
@@ -100,23 +100,23 @@ class CameraSource(PublishedSource):
         self._taken: SharedPicture | None = None
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop, and switch the camera on."""
+        """Start delivering to `handler` and switch the camera on. Call from the event loop."""
         super().attach(handler)
         if self._switch is not None and handler not in self._users:
             self._users.add(handler)
             self._switch.use(self.view.info, asked=self._asked)
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop delivering to `handler`. Idempotent."""
         super().detach(handler)
         if self._switch is not None and handler in self._users:
             self._users.discard(handler)
             self._switch.leave(self.view.info)
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return how long a server may take until it can draw, where it is there and publishes; else 0.
+        """Return the seconds that a connected, publishing server may take until it can render; otherwise 0.
 
-        Sockets bring pictures in live mode only, regions in every mode.
+        Sockets deliver pictures only in live mode, regions in every mode.
         """
         if self.region(handler) is not None:
             return FIRST_PICTURE_S
@@ -137,7 +137,7 @@ class CameraSource(PublishedSource):
         return Place(camera_file(articulation, camera), camera_filter(topic), doorbell.CAMERA)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Leave out a picture that was read already, in place of the one before it."""
+        """Skip a picture that was already read in place of its predecessor."""
         taken = self._taken
         return not (
             isinstance(payload, SharedPicture)
@@ -147,7 +147,7 @@ class CameraSource(PublishedSource):
         )
 
     def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
-        """Read a picture. Raises `ProtocolError`."""
+        """Decode a picture. Raises `ProtocolError`."""
         if not isinstance(payload, SharedPicture):
             return self._sample(topic, payload)
         found = payload.read(lambda slot: self._sample(topic, slot))

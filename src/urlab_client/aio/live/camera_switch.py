@@ -1,11 +1,11 @@
-"""Switching cameras on for as long as somebody here receives their pictures, on servers whose cameras rest otherwise.
+"""Switching cameras on while this client receives their pictures, on servers whose cameras are off by default.
 
-For the publishers and `client.runtime.set_camera_streaming`. The switch of a server is one for all its clients, so a
-camera that nobody here looks at any more is switched off only by the client that switched it on.
+For the publishers and `client.runtime.set_camera_streaming`. All clients of a server share its switches, so only the
+client that switched a camera on switches it off when it no longer uses the pictures.
 
-What the user sets goes before what streams need: a camera that was switched on stays on when its streams end, and one
-that was switched off brings its open streams nothing, until another stream asks for its pictures. All of this ends with
-play.
+The user's setting takes precedence over the streams: a camera that the user switched on stays on when its streams end.
+A camera that the user switched off delivers nothing to its open streams until another stream requests its pictures.
+The settings last until play ends.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OFF_S = 1.0
 
-# What is not mentioned is switched off, so both transports are.
+# Name both transports: the server switches off any that is missing.
 _ON = CameraTransports(zmq=True, shm=True)
 _OFF = CameraTransports(zmq=False, shm=False)
 
@@ -35,14 +35,14 @@ class CameraSwitch:
     """The cameras that one client has switched on.
 
     Args:
-        session: What the switching is sent over.
-        refresh: Called when pictures come from elsewhere than before.
+        session: Session that sends the requests.
+        refresh: Callback invoked when the source of pictures may have changed.
     """
 
     def __init__(self, session: Session, refresh: Callable[[], None]) -> None:
         self._session = session
         self._refresh = refresh
-        # All by topic.
+        # All keyed by topic.
         self._infos: dict[str, CameraInfo] = {}
         self._users: dict[str, int] = {}
         self._set: dict[str, CameraTransports] = {}  # by the user
@@ -52,11 +52,11 @@ class CameraSwitch:
         self._closed = False
 
     def use(self, info: CameraInfo, *, asked: bool) -> None:
-        """Switch a camera on, unless it is; from the event loop.
+        """Switch a camera on if it is off. Call from the event loop.
 
         Args:
             info: The camera.
-            asked: Whether the user asks for its pictures now, rather than having them received in the background.
+            asked: True if the user requests its pictures; False if the client receives them in the background.
         """
         topic = info.zmq_topic
         self._users[topic] = self._users.get(topic, 0) + 1
@@ -66,7 +66,7 @@ class CameraSwitch:
         self._follow()
 
     def leave(self, info: CameraInfo) -> None:
-        """Switch a camera off, unless somebody else here uses it; from the event loop."""
+        """Switch a camera off unless this client still uses it elsewhere. Call from the event loop."""
         topic = info.zmq_topic
         left = self._users.get(topic, 0) - 1
         if left > 0:
@@ -76,7 +76,7 @@ class CameraSwitch:
         self._follow()
 
     def restart(self, infos: list[CameraInfo]) -> None:
-        """Follow a handshake: a play session begins with its cameras switched off."""
+        """Adopt the cameras of a handshake; a play session starts with its cameras off."""
         self._on.clear()
         self._infos = {info.zmq_topic: info for info in infos}
         self._follow()
@@ -86,29 +86,29 @@ class CameraSwitch:
         return self._on.get(info.zmq_topic, _OFF) != _OFF
 
     def forget(self) -> None:
-        """Note that play ended, and with it whatever cameras were told."""
+        """Discard all settings because play ended."""
         self._set.clear()
         self._on.clear()
 
     async def set(
         self, wanted: Mapping[str, CameraTransports], *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraStreaming]:
-        """Switch cameras as the user says.
+        """Switch cameras as the user requests.
 
         Args:
-            wanted: Where each is to stream, by topic.
+            wanted: Transports that each camera should use, by topic.
             timeout: Seconds for the request.
 
         Returns:
-            What the server says of those that it knows, by topic.
+            The server's reply for each camera that it knows, by topic.
         """
         async with self._sending:
             before = self._set
-            self._set = {**before, **wanted}  # so that a stream opened meanwhile has the last word
+            self._set = {**before, **wanted}  # a stream opened during the request takes precedence
             try:
                 return await self._send(wanted, timeout)
             except BaseException:
-                for topic in wanted:  # it may have come about all the same
+                for topic in wanted:  # the server may have applied it despite the error
                     self._on.pop(topic, None)
                     if topic in before:
                         self._set[topic] = before[topic]
@@ -119,12 +119,12 @@ class CameraSwitch:
                 self._follow()
 
     async def settled(self) -> None:
-        """Wait until the server has been told of what is used now."""
+        """Wait until the current settings have been sent to the server."""
         if self._task is not None:
             await asyncio.wait((self._task,))
 
     async def aclose(self, *, connected: bool) -> None:
-        """Switch off what is on for streams alone, as far as the server listens. Idempotent."""
+        """Switch off the cameras that are on only for streams, if the server is connected. Idempotent."""
         self._closed = True
         if self._task is not None:
             self._task.cancel()
@@ -135,7 +135,7 @@ class CameraSwitch:
         if due and connected:
             try:
                 await self._send(due, _OFF_S)
-            except URLabError as error:  # a courtesy: the server may have moved on
+            except URLabError as error:  # best effort: play may have ended
                 log.debug("cameras could not be switched off: %s", error)
 
     def _follow(self) -> None:
@@ -151,7 +151,7 @@ class CameraSwitch:
         by_user = self._set.get(topic)
         if topic not in self._users:
             return _OFF if by_user is None else by_user
-        # A stream has to have the socket, which is also what shared memory falls back on.
+        # A stream needs the socket, which is also the fallback for shared memory.
         return _ON if by_user is None or (by_user.shm and not by_user.zmq) else by_user
 
     async def _switch(self) -> None:
@@ -176,20 +176,20 @@ class CameraSwitch:
             else:
                 self._on[topic] = wanted
         found: dict[str, CameraStreaming] = {}
-        for name, told in reply.cameras.items():
-            topic = _topic(name, told, due)
+        for name, streaming in reply.cameras.items():
+            topic = _topic(name, streaming, due)
             info = self._infos.get(topic)
-            if info is not None and told.zmq_endpoint is not None:
-                info.zmq_endpoint = told.zmq_endpoint
-            found[topic] = told
+            if info is not None and streaming.zmq_endpoint is not None:
+                info.zmq_endpoint = streaming.zmq_endpoint
+            found[topic] = streaming
         self._refresh()
         return found
 
 
-def _topic(name: str, told: CameraStreaming, asked: Mapping[str, CameraTransports]) -> str:
-    """Return which of the topics that were asked for an entry of a reply is about; some servers call it by its part."""
-    if told.zmq_topic:
-        return told.zmq_topic
-    if name in asked:
+def _topic(name: str, streaming: CameraStreaming, requested: Mapping[str, CameraTransports]) -> str:
+    """Return the requested topic that an entry of a reply refers to; some servers use only its last part."""
+    if streaming.zmq_topic:
+        return streaming.zmq_topic
+    if name in requested:
         return name
-    return next((topic for topic in asked if topic.rpartition("/")[2] == name), name)
+    return next((topic for topic in requested if topic.rpartition("/")[2] == name), name)

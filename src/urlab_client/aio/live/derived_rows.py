@@ -1,4 +1,4 @@
-"""Rows made of whole snapshots, for servers that publish no rows."""
+"""Rows derived from whole snapshots, for servers that publish no rows."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _HasSensor(Protocol):
 
 
 class HasRows(Protocol):
-    """An articulation as the client knows it: what its state consists of."""
+    """An articulation as the client knows it, with the elements of its state."""
 
     @property
     def joints(self) -> Mapping[str, _HasJoint]:
@@ -49,15 +49,15 @@ class HasRows(Protocol):
 
 
 class DerivedRowSource(RowSource):
-    """The rows that a server would publish which sends nothing but snapshots.
+    """Rows for the clients of a server that publishes only snapshots.
 
     Args:
-        states: What brings the snapshots.
-        articulations: Tells the articulations by key.
+        states: Source of the snapshots.
+        articulations: Callback that returns the articulations by key.
         wanted: Keys of the articulations whose rows are wanted.
-        kinds: As of the base class; likewise the others.
-        components: See there.
-        entities: See there.
+        kinds: See the base class.
+        components: See the base class.
+        entities: See the base class.
     """
 
     def __init__(
@@ -76,27 +76,27 @@ class DerivedRowSource(RowSource):
         self._feeds: dict[MessageHandler, _RowFeed] = {}
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop."""
+        """Start delivering to `handler`. Call from the event loop."""
         feed = _RowFeed(handler, self._topics)
         self._states.attach(feed)
         self._feeds[handler] = feed
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop delivering to `handler`. Idempotent."""
         feed = self._feeds.pop(handler, None)
         if feed is not None:
             self._states.detach(feed)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Return True: there are rows of what is in the model only."""
+        """Return True: only elements of the model have rows."""
         return True
 
     def first_after(self, handler: MessageHandler) -> float:
-        """See the source of the snapshots."""
+        """Return what the source of the snapshots returns."""
         return self._states.first_after(self._feeds[handler])
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        """See the source of the snapshots."""
+        """Return what the source of the snapshots returns."""
         return self._states.silence(self._feeds[handler], seconds)
 
     def _topics(self, snapshot: StateSnapshot) -> Iterator[tuple[bytes, Row]]:
@@ -128,7 +128,7 @@ def _rows_of(key: str, robot: HasRows, state: ArticulationState) -> Iterator[tup
     if state.twist is not None:
         vx, vy, _ = state.twist.linear
         yield StreamTopic(TopicKind.TWIST, key), TwistRow(vx, vy, state.twist.angular[2])
-    if state.actions:  # else the plugin sends none either
+    if state.actions:  # the plugin sends no row for 0, either
         yield StreamTopic(TopicKind.ACTIONS, key), ActionsRow(state.actions)
 
 
@@ -145,18 +145,18 @@ def _rows_of_entity(name: str, state: EntityState) -> Iterator[tuple[StreamTopic
 
 
 class _RowFeed(MessageHandler):
-    """Hands the rows of each snapshot on to a reader of rows."""
+    """Passes the rows of each snapshot to a reader of rows."""
 
     def __init__(self, reader: MessageHandler, rows: Callable[[StateSnapshot], Iterator[tuple[bytes, Row]]]) -> None:
         self._reader = reader
         self._rows = rows
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one snapshot."""
+        """Process one snapshot."""
         try:
             for name, row in self._rows(StateSnapshot.decode(payload, topic.decode())):
                 self._reader.on_message(name, row.encode())
-        except (ProtocolError, ValueError, IndexError) as error:  # of another world than the one that is known
+        except (ProtocolError, ValueError, IndexError) as error:  # the snapshot does not fit the known model
             self._reader.on_malformed(str(error))
 
     def on_malformed(self, problem: str) -> None:

@@ -1,4 +1,4 @@
-"""What happens to a client: to its connection, its session and play."""
+"""Events of a client: of its connection, its session and play."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ _KINDS = {str(kind.__struct_config__.tag): kind for kind in get_args(_Event)}
 
 
 class EventBus:
-    """Tells whoever listens what happens to a client. Publishing without listeners costs nothing and keeps nothing.
+    """Publishes the events of a client to its listeners. Without listeners, events are discarded at no cost.
 
     Attributes:
-        on_listener: Told, on any thread, that somebody began to listen.
+        on_listener: Callback invoked on any thread when a listener is added.
     """
 
     def __init__(self) -> None:
@@ -58,34 +58,34 @@ class EventBus:
         self._closed = False
 
     def stream(self, kinds: Collection[str | type[ClientEvent]], buffer: int) -> Stream[ClientEvent]:
-        """Return a stream of the events from now on, the last `buffer` of which wait for the reader. From any thread.
+        """Return a stream of future events that buffers the last `buffer` of them. Call from any thread.
 
         Args:
             kinds: Names or classes of the events wanted; empty for all.
-            buffer: Events kept.
+            buffer: Number of events kept.
 
         Raises:
             ClientClosed: The client was closed.
-            ValueError: There is no event of such a kind.
-            TypeError: `kinds` is a name by itself.
+            ValueError: A kind of event does not exist.
+            TypeError: `kinds` is a single name instead of a collection.
         """
         source = _EventSource(self, _topics(kinds))
         return Stream(source, policy=StreamPolicy.ALL, buffer=buffer, timeout=None, eager=True, tolerant=True)
 
     def publish(self, event: ClientEvent) -> None:
-        """Let the listeners know; from the event loop."""
+        """Publish an event to all listeners. Call from the event loop."""
         with self._lock:
             handlers = tuple(self._handlers)
         if not handlers:
             return
         topic = str(event.__struct_config__.tag).encode()
-        message = msgspec.msgpack.encode(event)  # each listener gets an event of its own
+        message = msgspec.msgpack.encode(event)  # each listener decodes its own copy
         for handler in handlers:
             handler.on_message(topic, message)
             handler.on_drained()
 
     def close(self) -> None:
-        """End every stream with `ClientClosed`, from the event loop. Idempotent."""
+        """End every stream with `ClientClosed`. Call from the event loop. Idempotent."""
         with self._lock:
             self._closed = True
             handlers = tuple(self._handlers)
@@ -94,7 +94,7 @@ class EventBus:
             handler.on_end(client_closed)
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from any thread."""
+        """Start delivering to `handler`. Call from any thread."""
         with self._lock:
             if self._closed:
                 raise client_closed()
@@ -104,17 +104,17 @@ class EventBus:
 
     @property
     def heard(self) -> bool:
-        """Whether anybody listens."""
+        """Whether there are listeners."""
         return bool(self._handlers)
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`, from any thread. Idempotent."""
+        """Stop delivering to `handler`. Call from any thread. Idempotent."""
         with self._lock:
             self._handlers.pop(handler, None)
 
 
 class _EventSource:
-    """The `Source` of one stream of events; the topics are their kinds."""
+    """The `Source` of one stream of events. Topics are the kinds of events."""
 
     name = "events"
 
@@ -123,19 +123,19 @@ class _EventSource:
         self._topics = topics
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from any thread."""
+        """Start delivering to `handler`. Call from any thread."""
         self._bus.attach(handler)
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`, from any thread. Idempotent."""
+        """Stop delivering to `handler`. Call from any thread. Idempotent."""
         self._bus.detach(handler)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Return whether an event is of a kind that was asked for."""
+        """Return whether an event is of a requested kind."""
         return topic in self._topics
 
     def decode(self, topic: bytes, payload: BytesLike) -> ClientEvent:
-        """Read an event."""
+        """Decode an event."""
         return _EVENTS.decode(payload)
 
     def first_after(self, handler: MessageHandler) -> float:
@@ -143,8 +143,8 @@ class _EventSource:
         return 0.0
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        """Return that nothing happened."""
-        return f"nothing happened within {seconds * 1000:.0f} ms.", ""
+        """Return that no event occurred."""
+        return f"no event within {seconds * 1000:.0f} ms.", ""
 
 
 def _topics(kinds: Collection[str | type[ClientEvent]]) -> frozenset[bytes]:
@@ -153,6 +153,6 @@ def _topics(kinds: Collection[str | type[ClientEvent]]) -> frozenset[bytes]:
         name = kind if isinstance(kind, str) else next((name for name, one in _KINDS.items() if one is kind), None)
         if name not in _KINDS:
             suggested = did_you_mean(str(name), _KINDS)
-            raise ValueError(f"{kind!r} is not a kind of event.{suggested} There are: {', '.join(_KINDS)}.")
+            raise ValueError(f"{kind!r} is not a kind of event.{suggested} The kinds are: {', '.join(_KINDS)}.")
         names.add(name)
     return frozenset(name.encode() for name in names or _KINDS)

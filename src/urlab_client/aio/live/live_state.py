@@ -1,4 +1,4 @@
-"""Live mode in the background: keeps the client's state current while physics runs by itself."""
+"""Background reception in live mode: keeps the client's state current while physics runs on its own."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class LiveStats(Struct):
 
     Attributes:
         received: Snapshots that arrived.
-        absorbed: Snapshots taken over; the others were superseded before their turn.
-        refused: Snapshots that could not be decoded or do not fit the model.
+        absorbed: Snapshots applied; the others were superseded first.
+        refused: Snapshots that could not be decoded or did not fit the model.
     """
 
     received: int = 0
@@ -39,15 +39,16 @@ class LiveStats(Struct):
 
 
 class LiveState(MessageHandler):
-    """Takes over the newest snapshot of each batch, right where it is received: no task, no thread, no queue.
+    """Applies the newest snapshot of each batch in the receiving callback, without a task, thread or queue.
 
     Args:
-        source: The state socket.
-        absorb: Takes a snapshot over, whole or not at all. May raise `ProtocolError`.
-        lock: Guards the state. It is never waited for here: its holder may be waiting for a call on this loop.
+        source: Source of the snapshots.
+        absorb: Callback that applies a snapshot, completely or not at all. May raise `ProtocolError`.
+        lock: Lock that guards the state. The event loop never blocks on it: its holder may be waiting for a call on
+            this loop.
 
     Attributes:
-        stats: Counters since it was made.
+        stats: Counters since construction.
     """
 
     def __init__(self, source: StateSource, absorb: Callable[[StateSnapshot], None], lock: RLock) -> None:
@@ -63,30 +64,30 @@ class LiveState(MessageHandler):
 
     @property
     def running(self) -> bool:
-        """Whether it receives."""
+        """Whether snapshots are received."""
         return self._running
 
     def start(self) -> None:
-        """Receive from now on; from the event loop. Idempotent."""
+        """Start receiving. Call from the event loop. Idempotent."""
         if not self._running:
             self._source.attach(self)
             self._running = True
             self._warned = False
 
     def stop(self) -> None:
-        """Receive no longer; from the event loop. Idempotent."""
+        """Stop receiving. Call from the event loop. Idempotent."""
         self._running = False
         self._source.detach(self)
         self._forget()
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one message."""
+        """Process one message."""
         self.stats.received += 1
         if self._source.wants(topic, payload):
             self._payload = payload
 
     def on_drained(self) -> None:
-        """Take the newest one over."""
+        """Apply the newest snapshot."""
         try:
             if self._payload is not None:
                 payload, self._payload = self._payload, None
@@ -98,12 +99,12 @@ class LiveState(MessageHandler):
             self._refuse(str(error))
 
     def on_malformed(self, problem: str) -> None:
-        """Take note of a malformed message."""
+        """Count and log a malformed message."""
         self.stats.received += 1
         self._refuse(problem)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Take note that the client was closed."""
+        """Stop because the client was closed."""
         self._running = False
         self._forget()
 
@@ -120,7 +121,7 @@ class LiveState(MessageHandler):
         self.stats.absorbed += 1
 
     def _free(self) -> bool:
-        """Acquire the lock, unless it is held, by this thread, too: a blocking call of its holder may run the loop."""
+        """Try to acquire the lock. Fails if this thread owns it: a blocking call of its holder may run the loop."""
         owned: bool = self._lock._is_owned()  # type: ignore[attr-defined]  # noqa: SLF001 - as Condition does
         return not owned and self._lock.acquire(blocking=False)
 
@@ -132,7 +133,7 @@ class LiveState(MessageHandler):
         self.stats.refused += 1
         if not self._warned:
             self._warned = True
-            log.warning("live state was not applied: %s More of these are only counted.", problem)
+            log.warning("live state was not applied: %s Further failures are only counted.", problem)
 
     def _forget(self) -> None:
         self._payload = self._snapshot = None
@@ -142,10 +143,10 @@ class LiveState(MessageHandler):
 
 
 class LatestPicture(MessageHandler):
-    """The newest picture of a camera: from replies and, in live mode, by itself. Converted when somebody looks at it.
+    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access.
 
     Args:
-        source: The camera.
+        source: Source of the camera's pictures.
     """
 
     def __init__(self, source: CameraSource) -> None:
@@ -159,46 +160,46 @@ class LatestPicture(MessageHandler):
         self._warned = False
 
     def start(self) -> None:
-        """Receive from now on; from the event loop. Idempotent."""
+        """Start receiving. Call from the event loop. Idempotent."""
         if not self._running:
             try:
                 self._source.attach(self)
-            except (ProtocolError, ValueError) as error:  # the server says that they come from where nothing can
-                log.warning("a camera's pictures are not received in the background: %s", error)
+            except (ProtocolError, ValueError) as error:  # the server announces an invalid endpoint
+                log.warning("the pictures of a camera are not received in the background: %s", error)
                 return
             self._running = True
 
     def stop(self) -> None:
-        """Receive no longer; from the event loop. Idempotent."""
+        """Stop receiving. Call from the event loop. Idempotent."""
         self._running = False
         self._source.detach(self)
-        self.newest()  # what the camera is like now may not hold when somebody looks
+        self.newest()  # decode now: the camera may change before the next access
 
     def deliver(self, pixels: Pixels, sim_time: float | None, frame_id: int | None = None) -> None:
-        """Take over a picture that a reply carried."""
+        """Store a picture from a reply."""
         with self._lock:
             self._message = None
             self._pixels, self._sim_time, self._frame_id = pixels, sim_time, frame_id
 
     @property
     def came(self) -> bool:
-        """Whether there has been one."""
+        """Whether a picture has arrived."""
         return self._pixels is not None or self._message is not None
 
     def frame_id(self) -> int | None:
-        """Return which snapshot of the state the newest picture shows, as far as it says so. From any thread."""
+        """Return the number of the snapshot that the newest picture shows, or None if unknown. Call from any thread."""
         self.newest()
         return self._frame_id
 
     def newest(self) -> tuple[Pixels | None, float | None]:
-        """Return the newest picture and its simulation time, as far as there is one and it has one. From any thread."""
+        """Return the newest picture and its simulation time, each None if missing. Call from any thread."""
         with self._lock:
             if self._message is not None:
                 (topic, payload), self._message = self._message, None
                 try:
                     sample = self._source.decode(topic, payload)
                 except MessageGone:
-                    pass  # the one before it stays the newest
+                    pass  # keep the previous picture
                 except ProtocolError as error:
                     self._warn(str(error))
                 else:
@@ -207,20 +208,20 @@ class LatestPicture(MessageHandler):
             return self._pixels, self._sim_time
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one message."""
-        if self._lock.acquire(blocking=False):  # held while converting: the next message will do as well
+        """Process one message."""
+        if self._lock.acquire(blocking=False):  # held during conversion: skip this picture, the next one follows
             self._message = topic, payload
             self._lock.release()
 
     def on_malformed(self, problem: str) -> None:
-        """Take note of a malformed message."""
+        """Count and log a malformed message."""
         self._warn(problem)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Take note that the client was closed."""
+        """Stop because the client was closed."""
         self._running = False
 
     def _warn(self, problem: str) -> None:
         if not self._warned:
             self._warned = True
-            log.warning("skipped a malformed picture: %s More of them are skipped silently.", problem)
+            log.warning("skipped a malformed picture: %s Further ones are skipped without a warning.", problem)

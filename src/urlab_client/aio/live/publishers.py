@@ -1,4 +1,4 @@
-"""Where one client's server publishes, and everything the client receives from there."""
+"""The publishing endpoints of one client's server, and the sources that receive from them."""
 
 from __future__ import annotations
 
@@ -28,15 +28,16 @@ __all__ = ["Publishers", "SharedFrame"]
 
 
 class SharedFrame:
-    """The newest picture of a camera where it lies, in the server's shared memory.
+    """A zero-copy view of the newest picture of a camera in the server's shared memory.
 
-    The server overwrites it as soon as the next picture but one begins to come out. Compute from `pixels`, then ask
-    `valid()`: if it says no, what was computed is from a mixture of pictures and worth nothing. The pixels are as on
-    the wire, and must not be touched any more once play has stopped or the server may be gone: the memory goes with it.
+    The server overwrites the picture when it starts to publish the next but one. Compute from `pixels`, then call
+    `valid()`: if it returns False, the computation mixed two pictures and its result is invalid. The pixels have the
+    wire's format. Do not access them after play has stopped or when the server may have exited: the memory is then
+    released.
 
     Attributes:
         pixels: Read-only view: uint8 (H, W, 4) BGRA; for depth float32 (H, W), centimetres.
-        sequence: The region's number of the picture.
+        sequence: Sequence number of the picture in its region.
     """
 
     def __init__(self, pixels: Pixels, sequence: int, valid: Callable[[], bool]) -> None:
@@ -45,30 +46,30 @@ class SharedFrame:
         self._valid = valid
 
     def valid(self) -> bool:
-        """Return whether everything read from `pixels` so far was one whole picture."""
+        """Return whether everything read from `pixels` so far belongs to a single picture."""
         return self._valid()
 
 
 class Publishers:
-    """The publishing side of a server. Nothing is opened before something is received.
+    """The publishing side of a server. Sockets and regions are opened only when something is received.
 
     Args:
-        rpc_endpoint: Tells where requests go: the other ports are on the same host.
-        state_port: Tells the port of the state stream.
-        default_timeout: Seconds that a stream waits for its first item unless told otherwise; None waits.
-        live: Tells whether the server is in live mode, as far as is known.
-        features: Tells what the server can do.
-        keys: What the publishers demand; None for nothing.
-        memory: Where the regions are, for a client that receives from shared memory.
+        rpc_endpoint: Callback that returns the address for requests; the other ports are on the same host.
+        state_port: Callback that returns the port of the state stream.
+        default_timeout: Default number of seconds that a stream waits for its first item; None waits without limit.
+        live: Callback that returns whether the server is in live mode, as far as the client knows.
+        features: Callback that returns the features of the server.
+        keys: Keys for publishers that require encryption; None if they do not.
+        memory: Location of the regions for a client that receives from shared memory.
 
     Attributes:
-        default_timeout: As given.
-        subscriptions: What is being received.
-        events: What happens to the client.
-        regions: What is being received from shared memory; None for a client that does not.
-        camera_switch: Switches cameras on and off; None where they stream anyway.
-        capture: Takes pictures of cameras without a step; the client sets it.
-        own_steps: Feeds those who receive snapshots from the client's own steps.
+        default_timeout: The argument of that name.
+        subscriptions: Active subscriptions.
+        events: Events of the client.
+        regions: Active shared memory regions; None if the client does not use shared memory.
+        camera_switch: Switch that turns cameras on and off; None if they always stream.
+        capture: Callback that takes pictures without a step; set by the client.
+        own_steps: Delivers the client's own steps to receivers of snapshots.
     """
 
     capture: Callable[[Sequence[HasCamera], Timeout], Awaitable[list[CameraSample]]]
@@ -96,7 +97,7 @@ class Publishers:
         self._features = features
 
     def state(self, policy: str = StreamPolicy.LATEST) -> StateSource:
-        """Return what brings snapshots to a stream of that policy."""
+        """Return the source of snapshots for a stream of that policy."""
         return StateSource(
             self.subscriptions,
             self._state_endpoint,
@@ -106,7 +107,7 @@ class Publishers:
         )
 
     def _regions_for(self, policy: str) -> Regions | None:
-        return None if policy == StreamPolicy.ALL else self.regions  # a region keeps the newest only
+        return None if policy == StreamPolicy.ALL else self.regions  # a region keeps only the newest
 
     def _only_own(self) -> bool:
         return not (self._features().publishes_steps or self._live())
@@ -120,17 +121,17 @@ class Publishers:
         entities: bool,
         robots: Callable[[], Mapping[str, HasRows]],
     ) -> RowSource:
-        """Return what brings rows; see `RowSource`, and `DerivedRowSource` for servers that publish none."""
+        """Return the source of rows; see `RowSource`, or `DerivedRowSource` for servers that publish none."""
         if self._features().publishes_rows:
             return RowSource(
                 self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities
             )
-        # From the socket, which brings every snapshot: of a region, the newest counts.
+        # From the socket, which delivers every snapshot; a region holds only the newest.
         states = self.state(StreamPolicy.ALL)
         return DerivedRowSource(states, robots, articulations, kinds, components, entities=entities)
 
     def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
-        """Return what brings a camera's pictures to a stream of that policy; see `CameraSource`."""
+        """Return the source of a camera's pictures for a stream of that policy; see `CameraSource`."""
         return CameraSource(
             self.subscriptions,
             view,
@@ -142,7 +143,7 @@ class Publishers:
         )
 
     def shared_frame(self, view: HasCamera) -> SharedFrame | None:
-        """Return a camera's newest picture in shared memory, None where there is none. From any thread."""
+        """Return a camera's newest picture in shared memory, or None if there is none. Call from any thread."""
         if self.regions is None:
             return None
         found = self.regions.view(CameraSource(self.subscriptions, view, self._host).place())
@@ -159,28 +160,28 @@ class Publishers:
         return SharedFrame(pixels, publication.sequence, valid)
 
     def refresh(self) -> None:
-        """Follow a handshake: publishers may be elsewhere than before."""
+        """Reconnect after a handshake: publishers may have moved."""
         self.subscriptions.refresh()
         if self.regions is not None:
             self.regions.refresh()
 
     def release_regions(self) -> None:
-        """Let go of the shared memory of a play session that ends, or of a server that is gone."""
+        """Release the shared memory of a play session that ends or of a server that has gone."""
         if self.regions is not None:
             self.regions.release()
 
     def resume_regions(self) -> None:
-        """Look for shared memory again: the server is back."""
+        """Look for shared memory again after the server has returned."""
         if self.regions is not None:
             self.regions.refresh()
 
     def check_open(self) -> None:
-        """Raise `ClientClosed` once the client was closed."""
+        """Raise `ClientClosed` if the client was closed."""
         if self.subscriptions.closed:
             raise client_closed()
 
     def close(self) -> None:
-        """End every stream with `ClientClosed`, from the event loop. Idempotent."""
+        """End every stream with `ClientClosed`. Call from the event loop. Idempotent."""
         if self.regions is not None:
             self.regions.close()
         self.subscriptions.close()

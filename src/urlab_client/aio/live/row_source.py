@@ -28,25 +28,25 @@ class RowSource(PublishedSource):
     """The binary rows of the state socket.
 
     Args:
-        subscriptions: The client's.
-        endpoint: Tells where the state socket is.
+        subscriptions: Subscriptions of the client.
+        endpoint: Callback that returns the address of the state socket.
         articulations: Keys of the articulations whose rows are wanted.
-        kinds: Kinds of rows; empty for all that the other arguments allow.
+        kinds: Kinds of rows; empty for all kinds that the other arguments allow.
         components: Component names of joints, free joints and sensors; empty for all.
-        entities: Whether `kinds` left empty includes the scene rows.
+        entities: Whether an empty `kinds` includes the scene rows.
 
     Attributes:
-        articulations: As given.
+        articulations: Keys of the articulations whose rows are wanted.
 
     Raises:
-        ValueError: A kind is not one of rows, a name cannot stand in a topic, or nothing is left to receive.
+        ValueError: A kind has no rows, a name is not valid in a topic, or there is nothing to receive.
     """
 
     name = "row_stream"
     unreachable: str = StateSource.unreachable
     silent = (
-        "Rows come in live mode only: client.runtime.set_mode('live'); paused they repeat. Component names are the "
-        "engine's, not always the compiled ones."
+        "Rows are published only in live mode: call client.runtime.set_mode('live'). While paused they repeat. "
+        "Component names are the engine's, which may differ from the compiled names."
     )
 
     def __init__(
@@ -72,7 +72,7 @@ class RowSource(PublishedSource):
             raise ValueError(f"there are no rows of kind {', '.join(sorted(no_rows))}")
         self._filters = tuple(sorted(self._narrow()))
         if not self._filters:
-            raise ValueError("row_stream: there is no articulation to receive rows of; has discover() found any?")
+            raise ValueError("row_stream: no articulation to receive rows from. Check that discover() found one.")
 
     def _narrow(self) -> set[bytes]:
         filters = {scene_filter()} if self._kinds & _OF_SCENE else set[bytes]()
@@ -95,11 +95,11 @@ class RowSource(PublishedSource):
         try:
             found = StreamTopic.parse(topic)
         except ProtocolError:
-            return False  # a kind of topic that a newer server has
+            return False  # a kind of topic from a newer server
         return self.has(found)
 
     def has(self, found: StreamTopic) -> bool:
-        """Whether rows of a topic are among those that are wanted."""
+        """Return whether rows of a topic are wanted."""
         if found.kind not in self._kinds:
             return False
         if found.kind in _OF_SCENE:
@@ -108,11 +108,11 @@ class RowSource(PublishedSource):
         return named and found.owner in self.articulations
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Leave out components that are not in the compiled model: their rows carry a negative id and zeros."""
+        """Skip components that are not in the compiled model: their rows carry a negative id and zeros."""
         return not (len(payload) >= 4 and payload[3] & 0x80 and StreamTopic.parse(topic).kind in _WITH_ID)
 
     def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
-        """Read a row. Raises `ProtocolError`."""
+        """Decode a row. Raises `ProtocolError`."""
         found = StreamTopic.parse(topic)
         row = decode_row(found, payload)
         return RowSample(kind=found.kind, owner=found.owner, component=found.name, row=row)

@@ -1,4 +1,4 @@
-"""What the sources of published messages have in common: a socket, and a region of shared memory beside it."""
+"""Base class of the sources of published messages: a socket and, optionally, a region of shared memory."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["PublishedSource"]
 
 
 class PublishedSource(ABC):
-    """A `Source` of what a server publishes; see `urlab_client.aio.streams`.
+    """A `Source` of published messages; see `urlab_client.aio.streams`.
 
     Args:
-        subscriptions: The client's sockets.
-        regions: Its shared memory, from which messages come whenever they can; None for sockets alone.
+        subscriptions: Sockets of the client.
+        regions: Shared memory of the client, preferred whenever available; None to use only sockets.
 
     Attributes:
-        name: The call that made the stream, for messages.
-        unreachable: What to look at when there is no connection.
-        silent: What to look at when there is one and nothing comes.
+        name: Name of the call that created the stream, for messages.
+        unreachable: Hint if there is no connection.
+        silent: Hint if there is a connection but no message arrives.
     """
 
     name: str
@@ -36,37 +36,37 @@ class PublishedSource(ABC):
 
     @abstractmethod
     def subscription(self) -> Subscription:
-        """Say what to receive, from where, as things stand."""
+        """Return the current subscription."""
 
     def place(self) -> Place:
-        """Say which region. Raises `ProtocolError` where there can be none."""
-        raise ProtocolError(f"{self.name}: not in shared memory.")
+        """Return the place of the region. Raises `ProtocolError` if there can be none."""
+        raise ProtocolError(f"{self.name} is not available in shared memory.")
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop."""
+        """Start delivering to `handler`. Call from the event loop."""
         if self._regions is None:
             self._subscriptions.attach(handler, self.subscription)
         else:
             self._regions.attach(handler, self.subscription, self.place)
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop delivering to `handler`. Idempotent."""
         (self._regions or self._subscriptions).detach(handler)
 
     def region(self, handler: MessageHandler) -> Path | None:
-        """Return the file of the region that feeds `handler`; None where a socket does, or nothing."""
+        """Return the file of the region that feeds `handler`, or None if no region does."""
         return None if self._regions is None else self._regions.path(handler)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Return whether a message is anything to the reader at all."""
+        """Return whether a message is relevant to the reader."""
         return True
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return 0: what is published comes at once."""
+        """Return 0: published messages arrive without delay."""
         return 0.0
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        """Return why nothing came for so long, and what to do about it."""
+        """Return why no message arrived in that time, and what to do about it."""
         region = self.region(handler)
         if region is not None:
             return f"nothing new in {region} within {seconds * 1000:.0f} ms.", self.silent
@@ -78,4 +78,4 @@ class PublishedSource(ABC):
             return f"no connection to {line.endpoint} {within}: {line.obstacle}.", self.unreachable
         filters = [repr(prefix.decode()) for prefix in self.subscription().filters]
         topics = ", ".join(filters[:3]) + (f" and {len(filters) - 3} more" if len(filters) > 3 else "")
-        return f"connected to {line.endpoint}, but nothing came {within} on topics {topics}.", self.silent
+        return f"connected to {line.endpoint}, but nothing arrived {within} on topics {topics}.", self.silent

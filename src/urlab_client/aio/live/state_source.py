@@ -1,4 +1,4 @@
-"""The snapshots of the simulation: from the state socket, the state region, or the client's own steps."""
+"""Snapshots of the simulation, from the state socket, the state region or the client's own steps."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["OwnSteps", "StateSource"]
 
 
 _ONLY_OWN = (
-    "This server publishes state in live mode only: client.runtime.set_mode('live'). In the other modes it comes with "
-    "this client's own steps."
+    "This server publishes state only in live mode: call client.runtime.set_mode('live'). In the other modes, "
+    "snapshots come only from this client's own steps."
 )
 
 
 class OwnSteps:
-    """Hands the states in replies to those who receive snapshots, where the server publishes in live mode only."""
+    """Delivers the states in replies to receivers of snapshots if the server publishes only in live mode."""
 
     def __init__(self) -> None:
         self._handlers: dict[MessageHandler, None] = {}
@@ -37,15 +37,15 @@ class OwnSteps:
         return bool(self._handlers)
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop."""
+        """Start delivering to `handler`. Call from the event loop."""
         self._handlers[handler] = None
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop delivering to `handler`. Idempotent."""
         self._handlers.pop(handler, None)
 
     def publish(self, reply: StateReply) -> None:
-        """Hand a state over."""
+        """Deliver a state to all handlers."""
         payload = StateSnapshot.of(reply).encode()
         for handler in tuple(self._handlers):
             handler.on_message(STATE_FULL, payload)
@@ -53,25 +53,27 @@ class OwnSteps:
 
 
 class StateSource(PublishedSource):
-    """The snapshots of the state region, or of the state socket.
+    """The snapshots of the state region or the state socket.
 
     Args:
-        subscriptions: The client's.
-        endpoint: Tells where the state socket is.
-        regions: As of the base class.
-        own: What brings the states of the client's own steps, where the server publishes none of them.
-        only_own: Tells whether nothing else comes, as things stand.
+        subscriptions: Subscriptions of the client.
+        endpoint: Callback that returns the address of the state socket.
+        regions: See the base class.
+        own: Delivers the states of the client's own steps if the server does not publish them.
+        only_own: Callback that returns whether snapshots currently come only from the client's own steps.
 
     Attributes:
-        subscriptions: As given.
-        endpoint: As given.
+        subscriptions: The argument of that name.
+        endpoint: The argument of that name.
     """
 
     name = "state_stream"
-    unreachable = "The port is open only while play runs: client.sim.start(). Is it the server's state port?"
+    unreachable = (
+        "The port is open only while play runs: call client.sim.start(). Check that it is the server's state port."
+    )
     silent = (
-        "While play runs a snapshot comes at least every 100 ms, in every mode and paused, too: is this the server's "
-        "state port?"
+        "While play runs, the server publishes a snapshot at least every 100 ms in every mode, even while paused. "
+        "Check that this is the server's state port."
     )
 
     def __init__(
@@ -88,16 +90,16 @@ class StateSource(PublishedSource):
         self.endpoint = endpoint
         self._own = OwnSteps() if own is None else own
         self._only_own = only_own
-        # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
+        # The socket may be one snapshot ahead of the region. Each contains its build time, so no two are equal.
         self._came = deque[BytesLike](maxlen=2)
 
     def attach(self, handler: MessageHandler) -> None:
-        """Begin to feed `handler`, from the event loop."""
+        """Start delivering to `handler`. Call from the event loop."""
         super().attach(handler)
         self._own.attach(handler)
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
+        """Stop delivering to `handler`. Idempotent."""
         super().detach(handler)
         self._own.detach(handler)
 
@@ -110,7 +112,7 @@ class StateSource(PublishedSource):
         return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Leave out what came already: where the region takes over from the socket, both bring it."""
+        """Skip snapshots that already arrived: both deliver them when the region takes over from the socket."""
         if self._regions is None:
             return True
         if payload in self._came:
@@ -119,7 +121,7 @@ class StateSource(PublishedSource):
         return True
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return how long the first snapshot may be in coming: where only steps bring any, for ever."""
+        """Return the seconds to wait for the first snapshot; infinite if snapshots come only from steps."""
         return math.inf if self._only_own() else super().first_after(handler)
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
@@ -128,5 +130,5 @@ class StateSource(PublishedSource):
         return problem, _ONLY_OWN if self._only_own() else advice
 
     def decode(self, topic: bytes, payload: BytesLike) -> StateSnapshot:
-        """Read a snapshot. Raises `ProtocolError`."""
+        """Decode a snapshot. Raises `ProtocolError`."""
         return StateSnapshot.decode(payload, topic.decode())

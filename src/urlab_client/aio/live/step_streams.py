@@ -1,7 +1,7 @@
-"""The streams in which the pictures of steps are looked for, on servers whose replies bring older ones.
+"""Camera streams that deliver the pictures of steps, for servers whose replies carry older pictures.
 
-Such a server draws on its own schedule and numbers the snapshots of the state: the first picture that is not older than
-a step's snapshot is that of the step. Whoever wants it has to receive the stream before the step is taken.
+Such a server renders on its own schedule and numbers the snapshots of the state. The picture of a step is the first one
+that is not older than the step's snapshot. The client must subscribe to the stream before the step.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ __all__ = ["StepStreams"]
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OPENING_S: Final = 2.0
-"""How long the first step waits until a camera streams and the connection to it stands."""
+"""Seconds that the first step waits for a camera to stream and its connection to open."""
 
 _IDLE_S: Final = 5.0
-"""How long a stream stays open after the last step that asked for its pictures."""
+"""Seconds that a stream stays open after the last step that requested its pictures."""
 
 _KEPT: Final = 8
 
 
 class StepStreams:
-    """The streams of one client's steps. They stay open from step to step, and are closed when no more step comes.
+    """The camera streams of one client's steps. They stay open between steps and close after the last step.
 
     Args:
-        publishers: Where pictures come from.
+        publishers: Publishers that deliver the pictures.
 
     Attributes:
-        needed: Whether a reply has brought an older picture than that of its step.
+        needed: Whether a reply has carried a picture older than its step.
     """
 
     def __init__(self, publishers: Publishers) -> None:
@@ -53,14 +53,14 @@ class StepStreams:
         self._closing: asyncio.TimerHandle | None = None
 
     def listen(self, cameras: Iterable[tuple[str, HasCamera]], play: object) -> bool:
-        """Receive the pictures of cameras, and forget those received so far.
+        """Receive the pictures of cameras and discard those received so far.
 
         Args:
-            cameras: Name and view of each.
-            play: What is another object in another play session, where snapshots are numbered anew.
+            cameras: Name and view of each camera.
+            play: Object that identifies the play session; each session numbers its snapshots anew.
 
         Returns:
-            Whether there are new ones, for which `opened` waits.
+            Whether new streams were added; `opened` waits for them.
         """
         if play is not self._play:
             self.close()
@@ -74,7 +74,7 @@ class StepStreams:
             listener = _Listener(self._publishers.camera(view, StreamPolicy.ALL))
             try:
                 listener.source.attach(listener)
-            except (ProtocolError, ValueError) as error:  # the server says that they come from where nothing can
+            except (ProtocolError, ValueError) as error:  # the server announces an invalid endpoint
                 log.warning("camera %s: the pictures of steps cannot be received: %s", name, error)
                 continue
             self._listeners[name] = listener
@@ -85,7 +85,7 @@ class StepStreams:
         return new
 
     async def opened(self) -> None:
-        """Wait until the cameras stream and the connections to them stand, or that has taken too long."""
+        """Wait until the cameras stream and their connections are open, or until the time limit."""
         try:
             async with asyncio.timeout(_OPENING_S):
                 switch = self._publishers.camera_switch
@@ -94,13 +94,13 @@ class StepStreams:
                 for listener in tuple(self._listeners.values()):
                     await listener.connection(self._publishers)
         except TimeoutError:
-            log.debug("a camera's stream has not opened within %g s", _OPENING_S)
+            log.debug("the stream of a camera did not open within %g s", _OPENING_S)
 
     async def pictures(self, names: Iterable[str], frame_id: int, deadline: float) -> dict[str, CameraFrame]:
-        """Return the first picture of each camera that is not older than a snapshot, as far as they come in time.
+        """Return, for each camera, the first picture not older than a snapshot, if it arrives in time.
 
         Args:
-            names: Cameras that `listen` was told of.
+            names: Cameras passed to `listen`.
             frame_id: Number of the snapshot.
             deadline: Loop time until which to wait.
         """
@@ -113,11 +113,11 @@ class StepStreams:
                     if frame is not None:
                         found[name] = frame
         except TimeoutError:
-            log.debug("no picture of snapshot %d came in time", frame_id)
+            log.debug("no picture of snapshot %d arrived in time", frame_id)
         return found
 
     def close(self) -> None:
-        """Stop receiving, from the event loop. Idempotent."""
+        """Stop receiving. Call from the event loop. Idempotent."""
         if self._closing is not None:
             self._closing.cancel()
             self._closing = None
@@ -128,16 +128,16 @@ class StepStreams:
 
 
 class _Listener(MessageHandler):
-    """Keeps the latest pictures of one camera, each with its number."""
+    """Buffers the latest pictures of one camera, each with its number."""
 
     def __init__(self, source: CameraSource) -> None:
         self.source = source
         self._kept: deque[tuple[PictureStamp, BytesLike]] = deque(maxlen=_KEPT)
         self._news = asyncio.Event()
-        self._over = False  # nothing that could be told apart will come
+        self._over = False  # no picture with a number will arrive
 
     async def connection(self, publishers: Publishers) -> None:
-        """Wait until the publisher is on the line."""
+        """Wait until the publisher is connected."""
         while not self._over:
             line = publishers.subscriptions.line(self)
             if line is None or line.connected:
@@ -145,7 +145,7 @@ class _Listener(MessageHandler):
             await self._next()
 
     async def picture(self, least: int) -> CameraFrame | None:
-        """Return the first picture that is not older than a snapshot; None where none can come."""
+        """Return the first picture that is not older than a snapshot, or None if none can arrive."""
         while True:
             while self._kept:
                 stamp, payload = self._kept.popleft()
@@ -156,16 +156,16 @@ class _Listener(MessageHandler):
             await self._next()
 
     def forget(self) -> None:
-        """Drop what has been received."""
+        """Discard the buffered pictures."""
         self._kept.clear()
 
     def end(self) -> None:
-        """Let nobody wait any longer."""
+        """Wake all waiters and end the reception."""
         self._over = True
         self._news.set()
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one message."""
+        """Process one message."""
         width, height = self.source.view.info.resolution
         try:
             stamp = picture_stamp(payload, width, height, where=self.source.view.name)
@@ -173,25 +173,25 @@ class _Listener(MessageHandler):
             self.on_malformed(str(error))
             return
         if stamp is None:
-            self.end()  # without numbers, none of them is known to be new enough
+            self.end()  # without numbers, no picture is known to be new enough
         else:
             self._kept.append((stamp, payload))
             self._news.set()
 
     def on_malformed(self, problem: str) -> None:
-        """Take note of a malformed message."""
+        """Log a malformed message."""
         log.debug("skipped a malformed picture: %s", problem)
 
     def on_connection(self, connected: bool) -> None:
-        """Take note that the connection was made or lost."""
+        """Wake the waiters because the connection was opened or lost."""
         self._news.set()
 
     def on_gap(self, why: str) -> None:
-        """Take note that the stream comes from elsewhere."""
+        """Wake the waiters because the source of the stream changed."""
         self._news.set()
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Take note that the client was closed."""
+        """End the reception because the client was closed."""
         self.end()
 
     async def _next(self) -> None:

@@ -1,7 +1,7 @@
-"""State of entities and articulations as last received, and what waits to be sent.
+"""State of entities and articulations as last received, and the commands that wait for the next step.
 
-The client writes records, the wrappers that users hold read them: a wrapper goes on working when `discover()` binds
-its record to a new model.
+The client writes these records and the wrappers that users hold read them. A wrapper keeps working when `discover()`
+binds its record to a new model.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class MirroredEntity:
         has_free_base: True when the (root) body has a free joint.
         qpos_offset: Start of the free joint in `mjData.qpos`, or None.
         qvel_offset: Start of the free joint in `mjData.qvel`, or None.
-        pose: Newest state of a plain entity.
-        wrenches: What the next step is to carry.
+        pose: Latest state of a plain entity.
+        wrenches: Wrenches that the next step sends.
     """
 
     def __init__(self, mirror: Mirror, name: str) -> None:
@@ -61,7 +61,7 @@ class MirroredEntity:
         self.wrenches: Wrenches = {}
 
     def bind_entity(self, info: EntityInfo) -> None:
-        """Take over what a handshake says."""
+        """Adopt the description from a handshake."""
         self.body_id = info.id
         self.has_free_base = info.has_free_base
         self.free_joint = info.free_joint
@@ -70,7 +70,7 @@ class MirroredEntity:
         self.pose = None
 
     def check_pose(self, state: EntityState, op: str) -> None:
-        """Refuse a state whose arrays have other lengths than a pose and a velocity.
+        """Reject a state whose arrays do not have the lengths of a pose and a velocity.
 
         Raises:
             ProtocolError: An array has the wrong length.
@@ -82,10 +82,10 @@ class MirroredEntity:
                 )
 
     def absorb_pose(self, state: EntityState, *, into_mirror: bool) -> None:
-        """Take over a checked state, here and where asked for in the mirror. Call under the mirror's lock."""
+        """Store a checked state here and, if requested, in the mirror. Call under the mirror's lock."""
         self.pose = state
         data = self.mirror.data
-        if data is None:  # else it is read from there
+        if data is None:  # otherwise it is read from the mirror
             qpos, qvel = (None if array is None else array.copy() for array in (state.qpos, state.qvel))
             self.pose = EntityState(xpos=state.xpos, xquat=state.xquat, qpos=qpos, qvel=qvel)
             return
@@ -110,16 +110,16 @@ class MirroredEntity:
         return None if self.pose is None or self.pose.qvel is None else self.pose.qvel.copy()
 
     def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
-        """Return what makes a direct step carry the wrenches alone."""
+        """Return the command of a direct step that carries only the wrenches."""
         return ArticulationCommand(xfrc_applied=wrenches)
 
     def apply_wrench(self, body: str, wrench: list[float]) -> None:
-        """Buffer a wrench for the next step, in place of an earlier one on the same body. From any thread."""
+        """Buffer a wrench for the next step, replacing any earlier one on the same body. Call from any thread."""
         with self.mirror.lock:
             self.wrenches[body] = wrench
 
     def take_wrenches(self) -> Wrenches:
-        """Return the wrenches for the step that is being built, and leave the buffer empty."""
+        """Return the wrenches for the step being built and clear the buffer."""
         with self.mirror.lock:
             taken, self.wrenches = self.wrenches, {}
         return taken
@@ -128,15 +128,15 @@ class MirroredEntity:
 class MirroredArticulation(MirroredEntity):
     """State of one articulation.
 
-    Its arrays are its own: those of a reply are its reader's, who may write into them. What is read from here goes out
-    as a copy for the same reason.
+    It owns its arrays. Those of a reply belong to its reader, who may write to them. For the same reason, readers of
+    this record get copies.
 
     Attributes:
-        layout: Where its values live in the compiled model.
-        info: The handshake's description.
-        controller: The handshake's controller block, kept current.
-        control_mode: Whether the controller is in force.
-        ctrl: Set-points that the next step sends, shape (n_ctrl,); written in place by users, who call `drive` before.
+        layout: Addresses of its values in the compiled model.
+        info: Description from the handshake.
+        controller: Controller block from the handshake, kept current.
+        control_mode: Whether the controller is active.
+        ctrl: Set-points that the next step sends, shape (n_ctrl,). Users write them in place after `drive`.
         qpos: Joint positions.
         qvel: Joint velocities.
         applied: `mjData.ctrl` as the server applied it.
@@ -164,7 +164,7 @@ class MirroredArticulation(MirroredEntity):
         self.bind(info, layout)
 
     def bind(self, info: ArticulationInfo, layout: ArticulationLayout) -> None:
-        """Take over what a handshake says; set-points and control mode are kept when they still fit."""
+        """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
@@ -177,7 +177,7 @@ class MirroredArticulation(MirroredEntity):
         self._bind_controller(info.controller)
         self._bind_root()
         data = self.mirror.data
-        # Asking MuJoCo's structure for its arrays takes as long as writing to them.
+        # Looking up MuJoCo's arrays takes as long as writing to them.
         self._mirrored = None if data is None else (data.qpos, data.qvel, data.ctrl, data.act)
         self.qpos: Floats = np.zeros(0) if data is None else data.qpos[layout.qpos_adr]
         self.qvel: Floats = np.zeros(0) if data is None else data.qvel[layout.qvel_adr]
@@ -221,14 +221,14 @@ class MirroredArticulation(MirroredEntity):
         return self.qvel[:6].copy() if self.has_free_base else None
 
     def check(self, state: ArticulationState, op: str) -> None:
-        """Refuse a state whose arrays do not fit the model, before anything of the reply is taken over.
+        """Reject a state whose arrays do not fit the model, before any part of the reply is applied.
 
         Raises:
             ProtocolError: An array has the wrong length.
         """
         if self.mirror.model is None:
             return
-        # For each robot of each reply: what is wrong, and with what, is found out only where something is.
+        # This runs for each robot in each reply: locate the problem only if there is one.
         n_qpos, n_qvel, n_ctrl = self._lengths
         ctrl, act, force, sensors = state.ctrl, state.act, state.actuator_force, state.sensors
         if (
@@ -251,10 +251,10 @@ class MirroredArticulation(MirroredEntity):
             self._fits(op, f"sensor {name!r}", reading, self.layout.sensor_dims.get(name, len(reading)))
 
     def check_written(self, qpos: Floats) -> None:
-        """Refuse positions that `set_qpos` cannot have written.
+        """Reject positions that `set_qpos` cannot have written.
 
         Raises:
-            ProtocolError: They are neither all of the articulation's positions nor those of its free base.
+            ProtocolError: The positions cover neither the whole articulation nor its free base.
         """
         if self.mirror.model is not None and not (self.has_free_base and len(qpos) == 7):
             self._fits("set_qpos", "qpos", qpos, len(self.layout.qpos_adr))
@@ -262,13 +262,13 @@ class MirroredArticulation(MirroredEntity):
     def _fits(self, op: str, what: str, array: Floats | list[float] | None, expected: int) -> None:
         if array is not None and len(array) != expected:
             raise ProtocolError(
-                f"{op}: {what} of articulation {self.name!r} has {len(array)} values, its model has {expected}.",
+                f"{op}: {what} of articulation {self.name!r} has {len(array)} values, but its model has {expected}.",
                 op=op,
                 hint="The model changed on the server: call discover().",
             )
 
     def absorb(self, state: ArticulationState, *, into_mirror: bool) -> None:
-        """Take over a checked state, into the mirror's data, too, if need be. Call under the mirror's lock."""
+        """Store a checked state here and, if requested, in the mirror's data. Call under the mirror's lock."""
         qpos, qvel, ctrl, act = state.qpos, state.qvel, state.ctrl, state.act
         self.qpos, self.qvel = qpos.copy(), qvel.copy()
         self.force = None if state.actuator_force is None else state.actuator_force.copy()
@@ -296,9 +296,9 @@ class MirroredArticulation(MirroredEntity):
                 all_act[layout.act_adr] = act[layout.act_from]
 
     def write_set_points(self) -> None:
-        """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.
+        """Write the set-points to the mirror's `ctrl` if they changed since the last call, for a puppet step.
 
-        Those that did not change are left alone: in puppet mode `client.data.ctrl` is the user's to write.
+        If they did not change, leave `ctrl` alone: in puppet mode the user writes `client.data.ctrl`.
 
         Raises:
             ValueError: A set-point is NaN or infinite.
@@ -310,21 +310,21 @@ class MirroredArticulation(MirroredEntity):
             self._written_ctrl = self.ctrl.copy()
 
     def drive(self) -> None:
-        """Note that this client wants to control the articulation, from the next step on."""
+        """Let this client control the articulation from the next step on."""
         self._driven = True
 
     def leave(self) -> None:
-        """Note that it does not want to any more, until it writes again."""
+        """Stop controlling the articulation until the next write."""
         self._driven = False
         self._left_ctrl = self.ctrl.copy()
 
     @property
     def driven(self) -> bool:
-        """Whether this client wants to control the articulation: it said so, or wrote a set-point all the same."""
+        """Whether this client controls the articulation: it called `drive` or wrote a set-point."""
         return self._driven or not np.array_equal(self.ctrl, self._left_ctrl)
 
     def live_command(self) -> ArticulationCommand:
-        """Return what a live step tells the articulation: the server ignores anything but `ctrl`.
+        """Return the command of a live step; the server ignores everything but `ctrl`.
 
         Raises:
             ValueError: A set-point is NaN or infinite.
@@ -332,7 +332,7 @@ class MirroredArticulation(MirroredEntity):
         return ArticulationCommand(ctrl=self._set_points())
 
     def direct_command(self, wrenches: Wrenches | None) -> ArticulationCommand:
-        """Return what a direct step that carries these wrenches tells the articulation.
+        """Return the command of a direct step that carries these wrenches.
 
         Raises:
             ValueError: A set-point is NaN or infinite.
@@ -346,9 +346,9 @@ class MirroredArticulation(MirroredEntity):
 
     def _set_points(self) -> list[float]:
         values: list[float] = self.ctrl.tolist()
-        # The sum is not finite either when one of them is not, and costs a tenth of looking at each.
-        if not math.isfinite(sum(values)) and (strange := self.not_finite()):
-            problem = f"set-points of articulation {self.name!r} are not finite: {', '.join(strange)}"
+        # The sum is not finite if any value is not, and it costs a tenth of checking each value.
+        if not math.isfinite(sum(values)) and (invalid := self.not_finite()):
+            problem = f"set-points of articulation {self.name!r} are not finite: {', '.join(invalid)}"
             raise ValueError(f"step: {problem}. Nothing was sent.")
         return values
 
@@ -363,7 +363,7 @@ class MirroredArticulation(MirroredEntity):
         return [f"{self.input_name(i)} {self.ctrl[i]:g} ({low[i]:g} to {high[i]:g})" for i in outside]
 
     def input_name(self, i: int) -> str:
-        """Return the quoted name of the actuator of a set-point, with the number of its input if it has several."""
+        """Return the quoted name of a set-point's actuator, with the input number if it has several inputs."""
         model = self.mirror.model
         if model is None:
             return repr([*self.info.actuator_types][i])
@@ -377,7 +377,7 @@ class MirroredArticulation(MirroredEntity):
 
     @property
     def takes_positions(self) -> bool:
-        """Whether set-points are positions of the joints, because a PD controller is in force."""
+        """Whether set-points are joint positions because a PD controller is active."""
         controller = self.controller
         return (
             controller is not None
@@ -386,9 +386,9 @@ class MirroredArticulation(MirroredEntity):
         )
 
     def ranges(self) -> tuple[Floats, Floats]:
-        """Return the least and the largest value of each set-point, infinite where there is none or it is not known.
+        """Return the lower and upper bound of each set-point; infinite if unlimited or unknown.
 
-        Set-points are controls, and those of a PD controller in force are positions of the joint that is driven.
+        Set-points are controls. While a PD controller is active, they are positions of the driven joints.
         """
         low, high = np.full(len(self.ctrl), -np.inf), np.full(len(self.ctrl), np.inf)
         model = self.mirror.model
@@ -413,13 +413,13 @@ class MirroredArticulation(MirroredEntity):
         return low, high
 
     def _compiled(self, wrenches: Wrenches) -> Wrenches:
-        """Return wrenches by names that the server finds: where robots have public names, only compiled ones."""
+        """Return wrenches by names that the server resolves: only compiled ones if robots have public names."""
         if self.info.actor_name is None:
             return wrenches
         return {f"{self.info.compiled_prefix}_{body}": wrench for body, wrench in wrenches.items()}
 
     def body_pose(self, name: str, body_id: int) -> tuple[Floats, Floats] | None:
-        """World position and orientation (w, x, y, z): as received at level `full`, else from the mirror, or None."""
+        """Return world position and orientation (w, x, y, z), received at level `full` or from the mirror; or None."""
         with self.mirror.lock:
             if self.bodies is not None and name in self.bodies:
                 received = self.bodies[name]
@@ -429,11 +429,11 @@ class MirroredArticulation(MirroredEntity):
 
 
 Carried = dict[MirroredEntity, Wrenches]
-"""The wrenches that a step carries, by what they were applied to."""
+"""The wrenches that a step carries, by the record that they were applied to."""
 
 
 def give_back(carried: Carried) -> None:
-    """Buffer wrenches again whose step was not executed, where nothing newer was applied."""
+    """Buffer the wrenches of a step that was not executed again, unless newer ones were applied."""
     for record, wrenches in carried.items():
         with record.mirror.lock:
             record.wrenches = {**wrenches, **record.wrenches}

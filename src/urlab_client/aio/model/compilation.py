@@ -1,7 +1,7 @@
-"""Compiling the model of a server that is not trusted, in a child process with limits.
+"""Compiling the model of an untrusted server in a child process with limits.
 
-For the mirror. MuJoCo's compiler takes all the memory and time that a model asks for, cannot be broken off, reads the
-files that the model names, and is written in C++: so it runs where it may fail.
+For the mirror. MuJoCo's compiler uses as much memory and time as a model requires, cannot be cancelled, reads the files
+that the model names, and may crash because it is written in C++. The child process contains these failures.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _REFUSED: Final = b"-"
 
 
 class _CompileJob(msgspec.Struct):
-    """What the child reads from its standard input."""
+    """The job that the child reads from its standard input."""
 
     xml: str
     assets: Mapping[str, bytes]
@@ -45,31 +45,31 @@ class _CompileJob(msgspec.Struct):
 
 
 def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
-    """Return an MJCF as a binary model; blocking, in bounded time.
+    """Compile an MJCF to a binary model. Blocks for a bounded time.
 
     Args:
         xml: The model.
-        assets: Its files, by name. It may name no others that exist.
+        assets: Its files, by name. The model must not name other existing files.
 
     Raises:
-        ValueError: What is wrong with it, or which limit it exceeds.
+        ValueError: The model is invalid or exceeds a limit; the message says which.
     """
-    order = msgspec.msgpack.encode(_CompileJob(xml, assets, _MEMORY_BYTES, _CPU_S))
+    job = msgspec.msgpack.encode(_CompileJob(xml, assets, _MEMORY_BYTES, _CPU_S))
     try:
         with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as folder:
             command = [sys.executable, "-m", __name__, folder]
             done = subprocess.run(  # noqa: S603
-                command, input=order, capture_output=True, timeout=_WALL_S, check=False, **APART
+                command, input=job, capture_output=True, timeout=_WALL_S, check=False, **APART
             )
     except subprocess.TimeoutExpired:
         raise ValueError(f"compiling it took more than {_WALL_S} s") from None
     except OSError as error:
-        raise ValueError(f"no process can be started to compile it: {error}") from error
+        raise ValueError(f"the compiling process could not be started: {error}") from error
     if done.returncode == 0 and done.stdout.startswith(_DONE):
         return done.stdout[1:]
     if done.returncode == 0 and done.stdout.startswith(_REFUSED):
         raise ValueError(done.stdout[1:].decode(errors="replace"))
-    log.debug("the compiling process ended with %d: %s", done.returncode, done.stderr.decode(errors="replace"))
+    log.debug("the compiling process exited with code %d: %s", done.returncode, done.stderr.decode(errors="replace"))
     if sys.platform != "win32" and done.returncode == -signal.SIGXCPU:
         raise ValueError(f"compiling it took more than {_CPU_S} s of processor time")
     raise ValueError(f"MuJoCo failed on it, or compiling it needs more than {_MEMORY_BYTES >> 20} MiB")
@@ -79,38 +79,38 @@ def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
 
 
 def _main(folder: str) -> None:
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is not an answer
-    order = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_CompileJob)
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # keeps what libraries print out of the result
+    job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_CompileJob)
     try:
-        answer = _DONE + _compile(order, folder)
+        result = _DONE + _compile(job, folder)
     except MemoryError:
-        answer = _REFUSED + b"compiling it needs more than %d MiB" % (order.memory_bytes >> 20)
-    except Exception as error:  # noqa: BLE001 - whatever it was, the client must hear of it
-        answer = _REFUSED + " ".join(str(error).split()).encode()
-    answers.write(answer)
-    answers.flush()
+        result = _REFUSED + b"compiling it needs more than %d MiB" % (job.memory_bytes >> 20)
+    except Exception as error:  # noqa: BLE001 - the client reports every error
+        result = _REFUSED + " ".join(str(error).split()).encode()
+    output.write(result)
+    output.flush()
 
 
-def _compile(order: _CompileJob, folder: str) -> bytes:
+def _compile(job: _CompileJob, folder: str) -> bytes:
     import mujoco  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
-    os.chdir(folder)  # where there is nothing to find, and MuJoCo's log goes with it
-    limit_process(order.memory_bytes, order.cpu_s)
-    _refuse_local_files(order.xml, order.assets)
-    # All it needs came through its standard input: whatever MuJoCo makes of the model, there is nothing it can open.
+    os.chdir(folder)  # empty, and deleted together with MuJoCo's log
+    limit_process(job.memory_bytes, job.cpu_s)
+    _refuse_local_files(job.xml, job.assets)
+    # All input came through standard input, so MuJoCo does not need to open any file.
     confine_files(readable=(), writable=(Path(folder),))
     forbid_opening()
-    compiled = mujoco.MjModel.from_xml_string(order.xml, dict(order.assets))
-    mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # which the client does first, and could go on for ever
+    compiled = mujoco.MjModel.from_xml_string(job.xml, dict(job.assets))
+    mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # the client calls it first, and it may never return
     buffer = np.zeros(mujoco.mj_sizeModel(compiled), dtype=np.uint8)
     mujoco.mj_saveModel(compiled, None, buffer)
     return buffer.tobytes()
 
 
 def _refuse_local_files(xml: str, assets: Mapping[str, bytes]) -> None:
-    """Refuse a model that names what is on this machine: MuJoCo looks there, too."""
+    """Reject a model that names files of this machine, because MuJoCo would read them."""
     named = _named_by_all(xml, assets)
     names = named.documents | named.data
     names |= {_last_part(name) for name in names}
@@ -122,7 +122,7 @@ def _refuse_local_files(xml: str, assets: Mapping[str, bytes]) -> None:
 
 
 def _named_by_all(xml: str, assets: Mapping[str, bytes]) -> NamedFiles:
-    """Return what the model names, and what those of its files name that MuJoCo may take for documents."""
+    """Return the files named by the model and by those of its files that MuJoCo may read as documents."""
     named = named_files(xml.encode())
     unread = dict(assets)
     while found := [name for name in unread if _last_part(name) in set(map(_last_part, named.documents))]:

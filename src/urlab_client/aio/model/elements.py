@@ -1,4 +1,4 @@
-"""Handles on the parts of an articulation: plain local objects, the same in both flavours of the client."""
+"""Handles to the elements of an articulation: plain local objects that both flavours of the client share."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Actuator", "ArticulationElements", "Body", "Joint", "Sensor", "make_elements"]
 
-_UNSPECIFIC = {"motor", "general"}  # what servers say of a `<general>`
+_UNSPECIFIC = {"motor", "general"}  # what servers report for a `<general>`
 
 
 class Actuator:
@@ -39,13 +39,13 @@ class Actuator:
     Attributes:
         name: Short name, without the articulation's prefix.
         id: Global MuJoCo actuator id.
-        type: Kind: as authored, of a `<general>` the one that has its gain and bias, so that an affine one is a servo;
-            a plain string when the server names one this client does not know; None if unknown.
+        type: Kind as authored. For a `<general>`, the kind with the same gain and bias, so an affine one is a servo. A
+            plain string if this client does not know the kind that the server names; None if unknown.
         joint: Short name of the driven joint, or None for other transmissions.
         ctrlrange: (low, high) of the control, or None if unlimited.
         forcerange: (low, high) of the force, or None if unlimited.
         kp: `gainprm[0]`, or None without a local model.
-        kv: Damping of a servo, `-biasprm[2]`, of others `gainprm[1]`; None without a local model.
+        kv: Damping of a servo, `-biasprm[2]`; `gainprm[1]` of other actuators; None without a local model.
         ctrl_local: Slice of the articulation's `ctrl_array` that holds its inputs; length 1 for ordinary actuators.
     """
 
@@ -92,9 +92,9 @@ class Actuator:
 
     @property
     def force(self) -> float | None:
-        """Force in N or N m from the last reply: the first output, of an actuator that has several.
+        """Force in N or N m from the last reply; the first output of an actuator with several.
 
-        None below observation level `full`, and when it cannot be told without a local model which output is whose.
+        None below observation level `full`, or if the outputs cannot be assigned to actuators without a local model.
         """
         force = self._record.force
         if force is None or (self.id < 0 and len(force) != len(self._record.ctrl)):
@@ -103,30 +103,30 @@ class Actuator:
 
     @property
     def value(self) -> float:
-        """The set-point (its first input), as the next step will send it."""
+        """The set-point (first input) that the next step sends."""
         return float(self._record.ctrl[self.ctrl_local.start])
 
     def set_control(self, v: float | Sequence[float] | Floats, *, out_of_range: str | OutOfRange = "allow") -> None:
         """Set the set-point that the next step sends.
 
         Args:
-            v: The set-point. For an actuator with several inputs, a number is its first input, which `value` tells, and
-                the others stay; a sequence is all of them.
-            out_of_range: What becomes of a value outside the actuator's range: `error` refuses it, `clamp` takes the
-                nearest value inside, `allow` sends it as it is. The range is the control range; while a PD controller
-                is in force it is that of the driven joint. Without a local model no range is known.
+            v: The set-point. For an actuator with several inputs, a number sets the first input, which `value`
+                returns, and leaves the others unchanged; a sequence sets all of them.
+            out_of_range: What to do with a value outside the actuator's range: `error` rejects it, `clamp` uses the
+                nearest value in range, `allow` sends it unchanged. The range is the control range or, while a PD
+                controller is active, the range of the driven joint. Without a local model no range is known.
 
         Raises:
-            TypeError: It is not a number.
-            ValueError: It is NaN, infinite, as a sequence not as long as there are inputs, or, with `error`, out of
-                range; nothing was set.
+            TypeError: The value is not a number.
+            ValueError: The value is NaN or infinite, the sequence does not have one number per input, or, with
+                `error`, the value is out of range. Nothing was set.
         """
         where, value = self.checked(v, OutOfRange(out_of_range))
         self._record.drive()
         self._record.ctrl[where] = value
 
     def checked(self, v: object, out_of_range: OutOfRange) -> tuple[slice, float | Floats]:
-        """Return what `set_control` would set, and where; raises as it does."""
+        """Return the slice and value that `set_control` would set; raise the same errors."""
         what = f"actuator {self.name!r} of {self._record.name!r}"
         where = self.ctrl_local
         value: float | Floats
@@ -149,25 +149,25 @@ class Actuator:
         return where, inside
 
     def set_point_for(self, position: float) -> float:
-        """Return the set-point of a position servo that holds its joint at a position, but for what pulls at it.
+        """Return the set-point with which a position servo holds its joint at a position if no other force acts.
 
         Args:
-            position: In the joint's unit, radians or metres.
+            position: Position in the joint's unit, radians or metres.
 
         Raises:
-            ValueError: It is not a position servo, or there is no local model to tell.
+            ValueError: The actuator is not a position servo, or there is no local model.
         """
         record, model = self._record, self._record.mirror.model
         position = finite("set_point_for", position)
         if record.takes_positions:
             return position
         if model is None or set_point_meaning(model, self.id)[0] != "position":
-            raise ValueError(f"actuator {self.name!r} of {record.name!r} is not known to be a position servo")
+            raise ValueError(f"actuator {self.name!r} of {record.name!r} is not known to be a position servo.")
         gain, bias = float(model.actuator_gainprm[self.id][0]), float(model.actuator_biasprm[self.id][1])
         return position * float(model.actuator_gear[self.id][0]) * (-bias / gain if gain else 1.0)
 
     def describe(self) -> ActuatorDescription:
-        """Return what it is and what it is told."""
+        """Return a description of the actuator and its set-point."""
         record, model = self._record, self._record.mirror.model
         takes: SetPointMeaning = ""
         unit = ""
@@ -248,34 +248,34 @@ class Joint:
 
     @property
     def unit(self) -> str:
-        """`rad` or `m`; empty for joints whose position is not one number. The velocity's is the same per second."""
+        """Unit of the position, `rad` or `m`; empty if it is not a single number. Velocities are per second."""
         return joint_unit(self.kind)
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """(low, high) in its unit, or None if unlimited; the same as `range`."""
+        """(low, high) in the joint's unit, or None if unlimited; the same as `range`."""
         return self.range
 
     @property
     def position(self) -> float | Floats:
-        """Position as of the last reply, in its unit.
+        """Position in the joint's unit, from the last reply.
 
-        Of a ball joint the quaternion (w, x, y, z), shape (4,); of a free joint (x, y, z) in metres before it, shape
-        (7,). Arrays are fresh copies.
+        A ball joint has a quaternion (w, x, y, z), shape (4,). A free joint has (x, y, z) in metres followed by the
+        quaternion, shape (7,). Arrays are fresh copies.
         """
         return _value(self._record.qpos, self.qpos_local_offset, int(QPOS_WIDTH[self.jnt_type]))
 
     @property
     def velocity(self) -> float | Floats:
-        """Velocity as of the last reply, in its unit per second.
+        """Velocity in the joint's unit per second, from the last reply.
 
-        Of a ball joint angular, body frame, shape (3,); of a free joint linear in the world frame and angular in the
-        body frame, shape (6,). Arrays are fresh copies.
+        A ball joint has an angular velocity in the body frame, shape (3,). A free joint has a linear velocity in the
+        world frame followed by an angular velocity in the body frame, shape (6,). Arrays are fresh copies.
         """
         return _value(self._record.qvel, self.qvel_local_offset, int(QVEL_WIDTH[self.jnt_type]))
 
     def describe(self) -> JointDescription:
-        """Return what it is and where it is."""
+        """Return a description of the joint with its position and velocity."""
         return JointDescription(
             name=self.name,
             kind=self.kind,
@@ -295,7 +295,7 @@ class Sensor:
     Attributes:
         name: Short name, without the articulation's prefix.
         id: Global MuJoCo sensor id; -1 without a local model.
-        dim: Length of its reading.
+        dim: Length of the reading.
     """
 
     __slots__ = ("_record", "dim", "id", "name")
@@ -308,24 +308,24 @@ class Sensor:
 
     @property
     def latest(self) -> Floats | None:
-        """Reading of the last reply, shape (dim,), in the sensor's own units and frame; a fresh array; or None."""
+        """Reading from the last reply as a fresh array, shape (dim,), in the sensor's own unit and frame; or None."""
         reading = self._record.sensors.get(self.name)
         return None if reading is None else np.asarray(reading, dtype=np.float64)
 
     @property
     def kind(self) -> str:
-        """MJCF element: `accelerometer`, `framepos`, …; empty without a local model."""
+        """MJCF element, such as `accelerometer` or `framepos`; empty without a local model."""
         model = self._record.mirror.model
         return "" if model is None else sensor_kind(model, self.id)
 
     @property
     def unit(self) -> str:
-        """Unit of its reading; empty for directions, quaternions and sensors of unknown meaning."""
+        """Unit of the reading; empty for directions, quaternions and sensors of unknown meaning."""
         model = self._record.mirror.model
         return "" if model is None else sensor_unit(model, self.id)
 
     def describe(self) -> SensorDescription:
-        """Return what it is and what it reads."""
+        """Return a description of the sensor and its reading."""
         reading = self._record.sensors.get(self.name)
         return SensorDescription(
             name=self.name,
@@ -356,13 +356,13 @@ class Body:
 
     @property
     def xpos(self) -> Floats | None:
-        """World position, shape (3,), metres; a fresh array; None without a local model below level `full`."""
+        """World position in metres as a fresh array, shape (3,); None without a local model below level `full`."""
         pose = self._record.body_pose(self.name, self.id)
         return None if pose is None else pose[0]
 
     @property
     def xquat(self) -> Floats | None:
-        """World orientation (w, x, y, z), shape (4,); a fresh array; None without a local model below level `full`."""
+        """World orientation (w, x, y, z), a fresh array, shape (4,); None without a local model below level `full`."""
         pose = self._record.body_pose(self.name, self.id)
         return None if pose is None else pose[1]
 
@@ -372,7 +372,7 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class ArticulationElements:
-    """All handles of one articulation, made from one model."""
+    """All handles of one articulation, created from one model."""
 
     joints: NameMap[Joint]
     actuators: NameMap[Actuator]
@@ -381,7 +381,7 @@ class ArticulationElements:
 
 
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
-    """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
+    """Create the handles of an articulation. Without a local model, only names and types of its actuators are known."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
     bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
     return ArticulationElements(

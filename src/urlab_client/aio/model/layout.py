@@ -1,4 +1,4 @@
-"""Where the values of one articulation or entity live: in the compiled model and in the wire's positional arrays."""
+"""Addresses of the values of an articulation or entity in the compiled model and the wire's positional arrays."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _EMPTY: Ints = np.zeros(0, dtype=np.intp)
 
 @dataclass(frozen=True, slots=True)
 class ArticulationLayout:
-    """Elements of one articulation, in ascending id, and the addresses that gather and scatter its values.
+    """Elements of one articulation in ascending order of id, and the addresses that gather and scatter its values.
 
     Attributes:
         joints: Short joint name to id; likewise `actuators`, `sensors` and `bodies`.
@@ -45,8 +45,9 @@ class ArticulationLayout:
         qvel_adr: Addresses of all its velocities in `mjData.qvel`.
         sensor_dims: Length of each sensor's reading, by short name.
         ctrl_adr: Addresses of all its controls in `mjData.ctrl`; an actuator may have several.
-        n_out: Number of all its actuators' outputs; an actuator may have several.
-        act_from: Positions in the wire's `act` that have an activation, `act_adr` their addresses in `mjData.act`.
+        n_out: Total number of outputs of its actuators; an actuator may have several.
+        act_from: Positions in the wire's `act` that have an activation.
+        act_adr: Their addresses in `mjData.act`.
         root_body: Id of its root body, -1 without a model.
         free_joint: Id of the root's free joint, -1 if it has none. It is the first of `joints`.
     """
@@ -71,7 +72,7 @@ def articulation_layouts(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> 
 
     Args:
         model: The compiled model.
-        prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
+        prefixes: Prefix of the element names, without the underscore, by key of the articulation.
     """
     keys = list(prefixes.values())
     bodies = _by_owner(model, "body", keys)

@@ -1,6 +1,6 @@
-"""The local copy of the simulation: the handshake's compiled model and data that follow what the server sends.
+"""The local copy of the simulation: the compiled model from the handshake and data that follow the server's replies.
 
-For the client's own use. MuJoCo is imported when a model is loaded, not before.
+For the client's own use. MuJoCo is imported only when a model is loaded.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ def binary_model(model: mujoco.MjModel) -> bytes:
 
 @cache
 def _mjb_header() -> bytes:
-    """Return the first bytes of any model this MuJoCo saves: magic, number size, layout and version."""
+    """Return the header of every model saved by this MuJoCo: magic, number size, layout and version."""
     import mujoco  # noqa: PLC0415
 
     return binary_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
 
 
 def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
-    """Write the options that are not None into a model's `mjOption`, all or none.
+    """Write the options that are not None to a model's `mjOption`, all or none.
 
-    The raw masks come first, so that the named switches win, as on the server.
+    Write the raw masks first, so that the named switches take precedence, as on the server.
 
     Raises:
         ValueError: An integrator, cone or solver is unknown.
@@ -96,7 +96,7 @@ def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
 
 
 def _choice(name: str, value: str) -> int:
-    """Return the number of an integrator, cone or solver. One without a name on the wire comes as its number."""
+    """Return the number of an integrator, cone or solver. The wire carries the number of one without a name."""
     import mujoco  # noqa: PLC0415
 
     enum, prefix = _CHOICES[name]
@@ -121,14 +121,14 @@ def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco
         model = mujoco.MjModel.from_xml_string(xml, dict(assets))
         forget_last_document()
         return model
-    from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - it is run as a program, too
+    from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - also run as a program
 
     try:
         return _from_binary(compile_confined(xml, assets))
     except ValueError as error:
         raise ValueError(
-            f"{error}. The server is neither on this machine nor known by its key, so what its model may ask for and "
-            "read is limited: trust_server=True lifts that, local_model=False loads no model"
+            f"{error}. The server is neither on this machine nor known by its key, so its model may use only limited "
+            "resources and files: trust_server=True lifts the limits, local_model=False loads no model"
         ) from None
 
 
@@ -137,7 +137,7 @@ def _switched(mask: int, bit: int, on: bool) -> int:
 
 
 class Loaded(NamedTuple):
-    """A model that was loaded, and whether it was compiled here from XML."""
+    """A loaded model, and whether this client compiled it from XML."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -148,10 +148,10 @@ class Mirror:
     """Local model and data, guarded by a reentrant lock.
 
     Attributes:
-        lock: Held while data change; hold it to read several values that belong together from another thread.
+        lock: Held while data change. Hold it to read several consistent values from another thread.
         model: The compiled model, or None without one.
         data: State that mirrors the server's, or None without a model.
-        approximate: True when the model was compiled here from XML because the server runs another MuJoCo build
+        approximate: True if this client compiled the model from XML because the server runs another MuJoCo build
             or is not trusted with binary models.
     """
 
@@ -165,9 +165,9 @@ class Mirror:
 
     @staticmethod
     def check_version(hello: HelloOk) -> URLabVersionMismatch | None:
-        """Return the error to raise when the server's compiled model cannot be loaded by this MuJoCo.
+        """Return the error to raise if this MuJoCo cannot load the server's compiled model, otherwise None.
 
-        Development builds share version numbers while their models differ, so the model's own header counts as well.
+        Development builds with different models share version numbers, so this also compares the model's header.
         """
         import mujoco  # noqa: PLC0415
 
@@ -179,14 +179,14 @@ class Mirror:
 
     @classmethod
     def load(cls, hello: HelloOk, *, trusted: bool) -> Loaded | None:
-        """Load the handshake's model, None if there is none. Blocking, and without effect here: run it in a thread.
+        """Load the model from the handshake; None if it has none. Blocks and changes no state: run in a thread.
 
         Args:
             hello: The handshake.
-            trusted: Whether the server may have its XML compiled in this process.
+            trusted: Whether this process may compile the server's XML.
 
         Raises:
-            ProtocolError: The bytes are not a model this MuJoCo can load.
+            ProtocolError: This MuJoCo cannot load the model.
         """
         import mujoco  # noqa: PLC0415
 
@@ -203,8 +203,8 @@ class Mirror:
                 )
                 if left_out:
                     log.warning(
-                        "The server's MuJoCo %s writes attributes that MuJoCo %s does not know; the local model goes "
-                        "without them: %s.",
+                        "The server's MuJoCo %s writes attributes that MuJoCo %s does not support; the local model "
+                        "omits them: %s.",
                         hello.mujoco_version,
                         mujoco.mj_versionString(),
                         ", ".join(left_out),
@@ -220,7 +220,7 @@ class Mirror:
         return Loaded(model, data, not binary)
 
     def use(self, loaded: Loaded | None) -> None:
-        """Mirror into a model from now on, or into none. Call under the lock."""
+        """Switch to a loaded model, or to none. Call under the lock."""
         if loaded is None:
             self.model = self.data = None
             self.approximate = False
@@ -230,7 +230,7 @@ class Mirror:
         self._dragged = None
 
     def reset(self, keyframe: str | None) -> None:
-        """Reset the data as the server does: replies carry the articulations' state, but not all of it. Under the lock.
+        """Reset the data as the server does, because replies carry only part of the state. Call under the lock.
 
         Args:
             keyframe: Compiled keyframe name, or None.
@@ -246,7 +246,7 @@ class Mirror:
             mujoco.mj_resetData(self.model, self.data)
 
     def perturb(self, perturbation: Perturbation | None) -> None:
-        """Take over a mouse drag for the next local step, and let go of the one before. Call under the lock."""
+        """Apply a mouse drag to the next local step and remove the previous one. Call under the lock."""
         if self.data is None:
             return
         if self._dragged is not None:
@@ -257,10 +257,10 @@ class Mirror:
             self.data.xfrc_applied[self._dragged] = perturbation.xfrc
 
     def check_finite(self) -> None:
-        """Check what a push is about to send, before the local step. Call under the lock.
+        """Check the data that a push will send, before the local step. Call under the lock.
 
         Raises:
-            ValueError: Time, or something in `qpos`, `qvel` or `ctrl`, is NaN or infinite.
+            ValueError: The time or a value in `qpos`, `qvel` or `ctrl` is NaN or infinite.
         """
         model, data = self.model, self.data
         if model is None or data is None:
@@ -270,22 +270,22 @@ class Mirror:
         for what, array in (("qpos", data.qpos), ("qvel", data.qvel), ("ctrl", data.ctrl)):
             i = first_not_finite(array)
             if i is not None:
-                whose = f" of {_owner(model, what, i)}" if what != "ctrl" else ""
-                raise ValueError(f"step: data.{what}[{i}]{whose} is {array[i]}. Nothing was sent.")
+                owner = f" of {_owner(model, what, i)}" if what != "ctrl" else ""
+                raise ValueError(f"step: data.{what}[{i}]{owner} is {array[i]}. Nothing was sent.")
 
     def mark_stale(self) -> None:
         """Note that positions or velocities changed, so that derived quantities must be computed before use."""
         self._stale = True
 
     def current_data(self) -> mujoco.MjData | None:
-        """Return the data with body poses and velocities computed for the present state, None without a model."""
+        """Return the data with body poses and velocities of the current state, or None without a model."""
         if self._stale:
             with self.lock:
                 self.derived()
         return self.data
 
     def derived(self) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-        """Return model and data with body poses and velocities computed for the present state. Call under the lock."""
+        """Return model and data with body poses and velocities of the current state. Call under the lock."""
         if self.model is None or self.data is None:
             return None
         if self._stale:

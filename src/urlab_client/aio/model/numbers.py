@@ -1,4 +1,4 @@
-"""Numbers as users give them, checked before anything is sent: NaN, infinities and None end a simulation quietly."""
+"""Checks of users' numbers before anything is sent: NaN, infinity and None silently end a simulation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["finite", "finite_array", "first_not_finite", "is_array"]
 
 
 def is_array(value: object) -> TypeGuard[Iterable[float]]:
-    """Whether a value is several numbers: a sequence or an array of any library."""
+    """Return whether a value holds several numbers: a sequence or an array of any library."""
     return not isinstance(value, (float, int, np.generic)) and isinstance(value, Iterable)
 
 
@@ -22,8 +22,8 @@ def finite(what: str, value: object) -> float:
     """Return a number as a float.
 
     Raises:
-        TypeError: It is not a number.
-        ValueError: It is NaN or infinite.
+        TypeError: The value is not a number.
+        ValueError: The number is NaN or infinite.
     """
     if not isinstance(value, (float, SupportsFloat)):
         raise TypeError(f"{what} takes a number, got {value!r}.")
@@ -34,11 +34,11 @@ def finite(what: str, value: object) -> float:
 
 
 def finite_array(what: str, values: Iterable[float]) -> Floats:
-    """Return numbers as an array of their own.
+    """Return numbers as a new array.
 
     Raises:
-        TypeError: Some of them are not numbers.
-        ValueError: Some of them are NaN or infinite.
+        TypeError: A value is not a number.
+        ValueError: A number is NaN or infinite.
     """
     given = np.asarray(values if hasattr(values, "__array__") else tuple(values))
     if given.dtype.kind not in "biuf" and given.size:
@@ -46,13 +46,13 @@ def finite_array(what: str, values: Iterable[float]) -> Floats:
     array = given.astype(np.float64)
     i = first_not_finite(array)
     if i is not None:
-        raise ValueError(f"{what} takes finite numbers, got {array.flat[i]} at {i}.")
+        raise ValueError(f"{what} takes finite numbers, got {array.flat[i]} at index {i}.")
     return array
 
 
 def first_not_finite(array: Floats) -> int | None:
-    """Return the index of the first number that is NaN or infinite, None if there is none."""
-    # One call, faster than `isfinite(array).all()`; where a square overflows each number is looked at.
+    """Return the index of the first number that is NaN or infinite, or None if all are finite."""
+    # One call is faster than `isfinite(array).all()`. If a square overflows, check each number.
     if math.isfinite(np.vdot(array, array)):
         return None
     found = np.flatnonzero(~np.isfinite(array))

@@ -1,4 +1,4 @@
-"""Units of joints, set-points and sensor readings. MuJoCo has none of its own: these hold for models in SI units."""
+"""Units of joints, set-points and sensor readings. MuJoCo has no units; these apply to models in SI units."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ JOINT_KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # by mj
 _JOINT_UNITS = {"slide": "m", "hinge": "rad"}
 _FORCE_UNITS = {"slide": "N", "hinge": "N m"}
 
-# By the name of mjtSensor without its beginning. Those of joints and actuators depend on the joint.
+# By mjtSensor name without its prefix. The units of joint and actuator sensors depend on the joint.
 _SENSOR_UNITS = {
     "TOUCH": "N",
     "ACCELEROMETER": "m/s²",
@@ -54,7 +54,7 @@ _OF_ACTUATORS = frozenset({"ACTUATORPOS", "ACTUATORVEL", "ACTUATORFRC"})
 
 
 def joint_unit(kind: JointKind) -> str:
-    """Return the unit of a joint's position; empty for joints whose position is not one number."""
+    """Return the unit of a joint's position; empty if the position is not a single number."""
     return _JOINT_UNITS.get(kind, "")
 
 
@@ -64,7 +64,7 @@ def sensor_kind(model: mujoco.MjModel, sensor: int) -> str:
 
 
 def sensor_unit(model: mujoco.MjModel, sensor: int) -> str:
-    """Return the unit of a sensor's reading; empty where it has none."""
+    """Return the unit of a sensor's reading; empty if it has none."""
     what, of = _sensor(model, sensor), int(model.sensor_objid[sensor])
     if what in _OF_JOINTS or what in _OF_ACTUATORS:
         joint = of if what in _OF_JOINTS else driven_joint(model, of)
@@ -73,10 +73,9 @@ def sensor_unit(model: mujoco.MjModel, sensor: int) -> str:
 
 
 def set_point_meaning(model: mujoco.MjModel, actuator: int) -> tuple[SetPointMeaning, str]:
-    """Return what a set-point of an actuator means, from its gain and bias, and the unit where it is known.
+    """Return the meaning of an actuator's set-point, derived from its gain and bias, and its unit if known.
 
-    An actuator with affine bias pulls towards its set-point: a servo of position or velocity. One without bias makes a
-    force of it.
+    An actuator with affine bias is a position or velocity servo. One without bias turns the set-point into a force.
     """
     import mujoco  # noqa: PLC0415
 

@@ -1,7 +1,7 @@
-"""Bringing a model to the server over the wire: what it consists of, and sending what the server lacks.
+"""Uploading a model to the server over the wire: collecting its files and sending those that the server lacks.
 
-For `client.scene.upload_model`. Files are named by their hashes, so the server asks for those it has not seen yet, and
-an upload that broke off goes on where it was: with a new manifest.
+For `client.scene.upload_model`. Hashes identify the files, so the server requests only those that it does not have. An
+interrupted upload resumes with a new manifest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = ["FlatModel", "OnUpload", "flatten", "upload"]
 R = TypeVar("R", bound=Reply)
 
 OnUpload = Callable[[UploadProgress], object]
-"""Told how far an upload is, on the client's event loop."""
+"""Callback invoked with the progress of an upload on the client's event loop."""
 
 _ATTEMPTS: Final = 3
 
@@ -49,7 +49,7 @@ class _Call(Protocol):
 
 @dataclass(frozen=True)
 class FlatModel:
-    """A model as it is sent: one document, and its files under bare names.
+    """A model in the form in which it is sent: one document and its files under bare names.
 
     Attributes:
         xml: The document.
@@ -61,12 +61,12 @@ class FlatModel:
 
     @property
     def size(self) -> int:
-        """Bytes altogether."""
+        """Total bytes."""
         return len(self.xml) + sum(map(len, self.files.values()))
 
     @cached_property
     def manifest(self) -> UploadModelManifest:
-        """What the server is told first."""
+        """The manifest that opens an upload."""
         return UploadModelManifest(
             xml_sha256=_digest(self.xml),
             total_bytes=self.size,
@@ -75,12 +75,12 @@ class FlatModel:
 
 
 def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
-    """Read a model and everything it includes, check it, and put it in the form in which it is sent. Blocking.
+    """Read a model and everything it includes, check it and convert it to the form in which it is sent. Blocks.
 
     Raises:
-        TypeError: It is neither a path nor a spec.
-        FileNotFoundError: There is no such file.
-        ValueError: MuJoCo rejects it, or it is larger than servers accept.
+        TypeError: The model is neither a path nor a spec.
+        FileNotFoundError: The file does not exist.
+        ValueError: MuJoCo rejects the model, or it is larger than servers accept.
     """
     import mujoco  # noqa: PLC0415
 
@@ -111,15 +111,15 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
 
 
 async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
-    """Send what the server lacks of a model, and have it imported.
+    """Send the parts of a model that the server lacks, and import the model.
 
-    A piece whose reply was lost is not sent again: the server counts bytes. A new manifest tells what is missing then.
-    The commit is sent once.
+    A chunk whose reply was lost is not sent again, because the server counts bytes. A new manifest then shows what is
+    missing. The commit is sent once.
 
     Args:
         model: The model.
-        call: Sends a request, within the caller's deadline.
-        on_progress: Told after each piece.
+        call: Callback that sends a request within the caller's deadline.
+        on_progress: Callback invoked after each chunk.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -142,16 +142,16 @@ async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | Non
     sent = 0
     for kind, name, data in missing:
         for offset in range(0, max(1, len(data)), MAX_CHUNK_BYTES):
-            piece = data[offset : offset + MAX_CHUNK_BYTES]
+            chunk = data[offset : offset + MAX_CHUNK_BYTES]
             await call(
                 UploadModelChunk(
-                    upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=piece
+                    upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
                 )
             )
-            sent += len(piece)
+            sent += len(chunk)
             if on_progress is not None:
                 on_progress(UploadProgress(file=name or "model.xml", sent_bytes=sent, total_bytes=total))
-            await asyncio.sleep(0)  # a canceller gets its turn between two pieces
+            await asyncio.sleep(0)  # allows cancellation between two chunks
     return opened.upload_id
 
 

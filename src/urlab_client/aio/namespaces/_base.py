@@ -1,4 +1,4 @@
-"""What every namespace has in common, and how arguments become wire values."""
+"""Base class of all namespaces, and conversion of arguments to wire values."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Namespace:
 
 
 def fill(kind: type[S], reply: Reply) -> S:
-    """Make a `kind` from the fields of the same names of a reply."""
+    """Return a `kind` filled from the fields of the same names of a reply."""
     return kind(**{name: getattr(reply, name) for name in kind.__struct_fields__})
 
 
 def target_by(by_name: bool) -> Literal["actor_id", "actor_name"]:
-    """Return the wire's word for how a target is looked up."""
+    """Return the wire value for the lookup of a target by name or by id."""
     return "actor_name" if by_name else "actor_id"
 
 
@@ -51,11 +51,11 @@ def as_vec3(name: str, values: None) -> None: ...
 @overload
 def as_vec3(name: str, values: Vector) -> Vec3: ...
 def as_vec3(name: str, values: Vector | None) -> Vec3 | None:
-    """Return three numbers as a tuple, None for None.
+    """Return three numbers as a tuple; None for None.
 
     Raises:
-        TypeError: They are not numbers.
-        ValueError: There are more or fewer.
+        TypeError: The values are not numbers.
+        ValueError: There are more or fewer than three values.
     """
     if values is None:
         return None
@@ -68,11 +68,11 @@ def as_quat(name: str, values: None) -> None: ...
 @overload
 def as_quat(name: str, values: Vector) -> Quat: ...
 def as_quat(name: str, values: Vector | None) -> Quat | None:
-    """Return four numbers as a tuple, None for None.
+    """Return four numbers as a tuple; None for None.
 
     Raises:
-        TypeError: They are not numbers.
-        ValueError: There are more or fewer.
+        TypeError: The values are not numbers.
+        ValueError: There are more or fewer than four values.
     """
     if values is None:
         return None

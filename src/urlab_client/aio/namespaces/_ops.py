@@ -87,7 +87,7 @@ class RuntimeOps(Namespace):
             MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
-            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
+            NotControlOwner: Another client controls the robot, or no client does; nothing was written.
         """
         await self._call(SetControlSource(source=source, articulation=articulation), timeout)
 
@@ -111,7 +111,7 @@ class RuntimeOps(Namespace):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
-            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
+            NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
         """
         await self._call(
@@ -133,7 +133,7 @@ class RuntimeOps(Namespace):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
-            UnknownBody: The compiled model has no body of that name.
+            UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
         return fill(
@@ -151,7 +151,7 @@ class RuntimeOps(Namespace):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
-            UnknownBody: The compiled model has no body of that name.
+            UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
         return fill(MocapPose, await self._call(ReadMocapPose(body=body), timeout))
@@ -198,7 +198,7 @@ class SceneOps(Namespace):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            CreateLevelFailed: The level exists already, a play session runs, or it could not be saved.
+            CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         await self._call(CreateLevel(name=name, force_overwrite=force_overwrite), timeout)
 
@@ -211,7 +211,7 @@ class SceneOps(Namespace):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            LoadLevelFailed: The level does not exist, cannot be read, or a play session runs.
+            LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         await self._call(LoadLevel(name_or_path=name_or_path), timeout)
 
@@ -222,7 +222,7 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            SaveLevelFailed: The level has no path yet, a play session runs, or it could not be written.
+            SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
         """
         await self._call(SaveLevel(), timeout)
 
@@ -288,7 +288,7 @@ class SceneOps(Namespace):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            SetActorTransformFailed: No actor matches, or the rotation is not one.
+            SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         await self._call(
             SetActorTransform(
@@ -699,7 +699,7 @@ class ViewportOps(Namespace):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            UnknownActor: No actor matches; the message is the key.
+            UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
         """
@@ -716,7 +716,7 @@ class ViewportOps(Namespace):
             MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
-            Unsupported: Only a server without Unreal answers this: it cannot do what was asked.
+            Unsupported: The request is not supported without Unreal; only the simulated server answers this.
         """
         return (await self._call(SetViewportMode(mode=mode), timeout)).mode
 
@@ -740,7 +740,7 @@ class ViewportOps(Namespace):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            UnknownActor: No actor matches; the message is the key.
+            UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
         return (
@@ -777,7 +777,7 @@ class FarmOps(Namespace):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            LeaseBusy: Somebody holds the server's driver lease.
+            LeaseBusy: Another client holds the server's driver lease.
         """
         return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
 

@@ -6,4 +6,4 @@ __all__ = ["FarmNamespace"]
 
 
 class FarmNamespace(FarmOps):
-    """Sharing servers among clients; servers of the alpha have none of it."""
+    """Sharing servers among clients. Servers of the alpha do not support it."""

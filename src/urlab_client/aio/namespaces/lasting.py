@@ -1,4 +1,4 @@
-"""What holds for a `with` block: play, and edits of the scene that end with one restart of it."""
+"""Context managers for play, and for scene edits that end with one restart of play."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 class Playing:
-    """Play for as long as a block lasts; see `client.sim.playing()`."""
+    """Play for the duration of a block; see `client.sim.playing()`."""
 
     def __init__(
         self,
@@ -26,12 +26,12 @@ class Playing:
         stop: Callable[[], Awaitable[None]],
         status: Callable[[], Awaitable[PIEStatus]],
     ) -> None:
-        """Make a block; nothing is sent before it is entered.
+        """Create the context manager. Nothing is sent before it is entered.
 
         Args:
             start: Starts play.
-            stop: Ends it.
-            status: Tells whether it runs.
+            stop: Stops play.
+            status: Returns the state of play.
         """
         self._start = start
         self._stop = stop
@@ -55,23 +55,23 @@ class Playing:
         if not self._ours:
             return
         try:
-            with anyio.CancelScope(shield=True):  # its requests have deadlines
+            with anyio.CancelScope(shield=True):  # bounded, because its requests have deadlines
                 await self._stop()
         except URLabError as failed:
             if error is None:
                 raise
-            log.warning("play could not be stopped after %r: %s", error, failed)  # which says more than this
+            log.warning("play could not be stopped after %r: %s", error, failed)  # the first error is raised
 
 
 class SceneEdit:
     """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
 
     def __init__(self, begin: Callable[[], None], end: Callable[[bool], Awaitable[None]]) -> None:
-        """Make a block; nothing is sent before its end.
+        """Create the context manager. Nothing is sent before its end.
 
         Args:
-            begin: Told that the block is entered.
-            end: Told that it is left, and whether all went well.
+            begin: Callback invoked when the block is entered.
+            end: Callback invoked when the block is left, with True unless it raised.
         """
         self._begin = begin
         self._end = end
@@ -83,5 +83,5 @@ class SceneEdit:
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if isinstance(exc, Exception):
-            exc.add_note("scene.edit(): what was edited before this stays in the level; play was not restarted.")
+            exc.add_note("scene.edit(): the edits made before this error stay in the level; play was not restarted.")
         await self._end(exc is None)

@@ -1,4 +1,4 @@
-"""`client.outliner`: looking at the world."""
+"""`client.outliner`: inspecting the world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LIGHTS = frozenset({"DirectionalLight", "PointLight", "SpotLight", "RectLight",
 
 
 class OutlinerNamespace(OutlinerOps):
-    """Looking at the world, and preparing plain meshes for physics."""
+    """Inspecting the world, and preparing plain meshes for physics."""
 
     async def list_actors(self, *, timeout: Timeout = DEFAULT) -> list[ActorInfo]:
         """List the visible actors of the edited level.
@@ -34,14 +34,14 @@ class OutlinerNamespace(OutlinerOps):
     ) -> list[ActorInfo]:
         """List the actors that pass every given filter.
 
-        The plugin does not send the kind of an actor here: it is derived from the class name, and
+        The plugin does not send the kind of an actor here. The client derives it from the class name, and
         `has_quick_convert` stays False.
 
         Args:
             class_filter: Class or parent class name, any letter case.
             tag: Whole tag, any letter case.
             name_prefix: Beginning of the engine actor name, any letter case.
-            in_pie: Search the play world when it runs.
+            in_pie: Search the play world if play is running.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:

@@ -24,11 +24,11 @@ from urlab_client.protocol.types import RecordingHandle, RecordingSummary, Repla
 
 __all__ = ["RecordingNamespace", "ReplayNamespace"]
 
-_FLOAT32_MAX = 3.4028234663852886e38  # what the server says for "no limit"
+_FLOAT32_MAX = 3.4028234663852886e38  # the server's value for "no limit"
 
 
 class RecordingNamespace(Namespace):
-    """Recording joint states on the server. The properties follow this client's own calls."""
+    """Recording joint states on the server. The properties reflect this client's own calls."""
 
     def __init__(self, session: Session) -> None:
         super().__init__(session)
@@ -38,22 +38,22 @@ class RecordingNamespace(Namespace):
 
     @property
     def is_active(self) -> bool:
-        """Whether a recording runs."""
+        """Whether a recording is running."""
         return self._active
 
     @property
     def frame_count(self) -> int:
-        """Frames of the recording that was stopped last."""
+        """Number of frames in the recording that was stopped last."""
         return self._summary.frame_count
 
     @property
     def sim_duration(self) -> float:
-        """Seconds of simulation time of the recording that was stopped last."""
+        """Duration of the recording that was stopped last, seconds of simulation time."""
         return self._summary.sim_duration_s
 
     @property
     def last_saved_path(self) -> Path | None:
-        """Where the last recording was saved, on the server's machine."""
+        """Path of the recording that was saved last, on the server's machine."""
         return self._last_saved
 
     async def start(
@@ -62,12 +62,12 @@ class RecordingNamespace(Namespace):
         """Start recording.
 
         Args:
-            name: Accepted; servers name the session themselves.
-            max_duration_s: Keep only the newest seconds of simulation time.
+            name: Accepted but not used; the server names the session.
+            max_duration_s: Seconds of simulation time to keep; older frames are dropped. None for no limit.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            RecordingAlreadyActive: A recording runs.
+            RecordingAlreadyActive: A recording is already running.
         """
         reply = await self._call(RecordingStart(name=name, max_duration_s=max_duration_s), timeout)
         self._active = True
@@ -78,7 +78,7 @@ class RecordingNamespace(Namespace):
         """Stop recording.
 
         Raises:
-            RecordingNotActive: No recording runs.
+            RecordingNotActive: No recording is running.
         """
         self._summary = fill(RecordingSummary, await self._call(RecordingStop(), timeout))
         self._active = False
@@ -88,7 +88,7 @@ class RecordingNamespace(Namespace):
         """Write the active session to a JSON file on the server's machine and return its absolute path.
 
         Args:
-            path: File name, in the server's replay directory; default `recording.json`.
+            path: File name in the server's replay directory; default `recording.json`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -99,13 +99,13 @@ class RecordingNamespace(Namespace):
         return self._last_saved
 
     async def clear(self, *, timeout: Timeout = DEFAULT) -> None:
-        """Forget the recorded frames."""
+        """Discard the recorded frames."""
         await self._call(RecordingClear(), timeout)
         self._summary = RecordingSummary(0, 0.0)
 
 
 class ReplayNamespace(ReplayOps):
-    """Playing recordings back; needs step mode direct or puppet."""
+    """Playing recordings back. Requires step mode `direct` or `puppet`."""
 
     def __init__(self, session: Session) -> None:
         super().__init__(session)
@@ -120,7 +120,7 @@ class ReplayNamespace(ReplayOps):
         """Load a recording from the server's replay directory and make it active.
 
         Raises:
-            PathNotReadable: The recording is missing or is not one.
+            PathNotReadable: The file is missing or is not a recording.
         """
         reply = await self._call(ReplayLoad(path=str(path)), timeout)
         self._session_name = reply.name
@@ -153,16 +153,16 @@ class ReplayNamespace(ReplayOps):
         """Play a loaded session by name, or load a recording and play it.
 
         Args:
-            path_or_name: Name of a loaded session, else a file of the server's replay directory.
-            loop: Accepted; servers play sessions in a loop until stopped.
+            path_or_name: Name of a loaded session, otherwise a file in the server's replay directory.
+            loop: Accepted but not used; servers play sessions in a loop until stopped.
             timeout: Seconds to wait for each op; None waits without limit.
 
         Raises:
-            PathNotReadable: It is neither a session nor a recording.
+            PathNotReadable: `path_or_name` is neither a session nor a recording.
             ReplayRequiresStepped: The step mode is live.
         """
         name = str(path_or_name)
-        # In one turn, or another task could make another session the active one before it starts.
+        # In one turn: otherwise another task could activate another session before this one starts.
         async with self._session.turn(ReplayListSessions, timeout=timeout, each=True) as turn:
             if name in (await turn.call(ReplayListSessions())).sessions:
                 await turn.call(ReplaySetActive(name=name))

@@ -54,27 +54,27 @@ R = TypeVar("R", bound=Reply)
 
 
 class SceneNamespace(SceneOps):
-    """Editor-time authoring. Edits during play show after the next start of play."""
+    """Editor-time authoring. Edits during play take effect at the next start of play."""
 
     def __init__(self, session: Session, sim: SimNamespace) -> None:
         super().__init__(session)
         self._sim = sim
-        self._edits = 0  # blocks of `edit()` that are open
+        self._edits = 0  # open blocks of `edit()`
 
     def edit(self, *, timeout_s: float = 30.0) -> SceneEdit:
         """Edit the level in a `with` block, and restart play once at its end, so that the simulation has the edits.
 
-        Where no play runs at the end, nothing is started. Of nested blocks the outermost one restarts. After the
-        restart the client's own step mode is in force again; in live mode physics starts paused.
+        If play is off at the end, it is not started. With nested blocks, only the outermost one restarts play. After
+        the restart the client's own step mode is in force again; in live mode physics starts paused.
 
-        If the block raises, play is not restarted: it goes on in the world as it was, and what was edited before stays
-        in the level, as the editor has no op to undo it. The exception carries a note that says so.
+        If the block raises, play is not restarted and continues without the edits. The edits made so far stay in the
+        level, because the editor has no op to undo them. A note on the exception reports this.
 
         Args:
             timeout_s: Seconds to wait for the compile.
 
         Raises:
-            URLabPIEError: On leaving: the level does not compile as it is now. The edits stay, and play is off.
+            URLabPIEError: On leaving, the edited level did not compile. The edits stay, and play is off.
 
         Example:
             async with client.scene.edit():
@@ -101,12 +101,12 @@ class SceneNamespace(SceneOps):
         on_progress: Callable[[JobStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> URLabBlueprint:
-        """Turn an MJCF file on the server's machine into a blueprint for `spawn_actor`.
+        """Import an MJCF file on the server's machine as a blueprint for `spawn_actor`.
 
         Args:
             xml_path: Absolute path of the MJCF file.
             force_reimport: Replace an existing blueprint of the same file stem.
-            on_progress: Told again and again how far the import is, by servers that say so.
+            on_progress: Callback invoked repeatedly with the progress of the import, if the server reports it.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -131,13 +131,13 @@ class SceneNamespace(SceneOps):
         scale: Vector = (1.0, 1.0, 1.0),
         timeout: Timeout = DEFAULT,
     ) -> URLabSpawnHandle:
-        """Place an instance of a blueprint in the edited level, or move the one that carries the id.
+        """Place an instance of a blueprint in the edited level, or move the actor that has the id.
 
         Args:
-            blueprint: What `import_xml` returned, or a package or class path.
+            blueprint: Return value of `import_xml`, or a package or class path.
             actor_id: Stable id; empty always places a new actor.
             location: Position in the world frame, metres.
-            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; overrides `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
             timeout: Seconds to wait; None waits without limit.
@@ -155,7 +155,7 @@ class SceneNamespace(SceneOps):
             scale=as_vec3("scale", scale),
         )
         reply = await self._call(request, timeout)
-        # The plugin's own echo of the location is wrong by a factor of 100 and the sign of y.
+        # The location that the plugin echoes is wrong by a factor of 100 and in the sign of y.
         return URLabSpawnHandle(
             actor_id=reply.actor_id,
             actor_name=reply.actor_name,
@@ -185,12 +185,12 @@ class SceneNamespace(SceneOps):
             actor_id: Stable id; not checked for reuse.
             location: Position in the world frame, metres.
             rotation_euler: (roll, pitch, yaw) in degrees, Unreal's frame.
-            intensity: In Unreal's unit for that kind of light.
+            intensity: Intensity in Unreal's unit for that kind of light.
             color: Red, green, blue in [0, 1].
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            SpawnFailed: Unknown kind.
+            SpawnFailed: The kind is unknown.
         """
         euler = as_vec3("rotation_euler", rotation_euler)
         request = SpawnLight(
@@ -229,7 +229,7 @@ class SceneNamespace(SceneOps):
         await self._call(kind(target=target, target_by=target_by(by_name)), timeout)
 
     async def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
-        """Describe every visible actor, with articulation metadata; the play world when it runs.
+        """Describe every visible actor, with articulation metadata; during play, of the play world.
 
         Raises:
             SnapshotFailed: There is no world to describe.
@@ -250,11 +250,11 @@ class SceneNamespace(SceneOps):
     ) -> URLabSpawnHandle:
         """Spawn another instance of an actor's class with the same rotation and scale.
 
-        The plugin reports neither pose nor flags of the copy; they are read from the actor list.
+        The plugin reports neither pose nor flags of the copy; the client reads them from the actor list.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
-            new_actor_id: Id of the copy; one that exists moves that actor.
+            new_actor_id: Id of the copy; an existing id moves that actor.
             by_name: Look `target` up by the engine's actor name.
             location: Position of the copy in the world frame, metres; default 1 m along x from the source.
             timeout: Seconds to wait; None waits without limit.
@@ -300,24 +300,24 @@ class SceneNamespace(SceneOps):
     ) -> dict[str, URLabSpawnHandle]:
         """Place a grid of actors in one request and return their handles by actor id.
 
-        Cell (i, j) stands at origin + (i spacing[0], j spacing[1], 0) and has the id `<base>_<i>_<j>`.
+        Cell (i, j) is at origin + (i spacing[0], j spacing[1], 0) and has the id `<base>_<i>_<j>`.
 
         Args:
-            blueprint: What `import_xml` returned, or a package or class path.
-            base_actor_id: Beginning of the ids.
+            blueprint: Return value of `import_xml`, or a package or class path.
+            base_actor_id: Prefix of the ids.
             count_x: Cells along x.
-            count_y: Cells along y; at most 1024 cells together.
+            count_y: Cells along y; at most 1024 cells in total.
             spacing: Distance between cells, metres; the third number is ignored.
             origin: Position of cell (0, 0) in the world frame, metres.
-            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; overrides `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
-            on_progress: Told again and again how far it is, by servers that say so.
+            on_progress: Callback invoked repeatedly with the progress, if the server reports it.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            InvalidCount: A count is not above zero.
-            TooManyCells: More than 1024 cells.
+            InvalidCount: A count is not above 0.
+            TooManyCells: There are more than 1024 cells.
             SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
         """
         given = as_quat("rotation_quat", rotation_quat)
@@ -356,30 +356,30 @@ class SceneNamespace(SceneOps):
         on_progress: Callable[[UploadProgress], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> URLabBlueprint:
-        """Bring a model of this machine to the server and turn it into a blueprint for `spawn_actor`.
+        """Upload a model from this machine to the server and import it as a blueprint for `spawn_actor`.
 
-        Files that the server has got before, from any client, are not sent again. Each upload replaces the blueprint of
-        the one before: to have two uploaded robots in one level, combine them in one MJCF.
+        Files that the server already has, from any client, are not sent again. Each upload replaces the blueprint of
+        the previous one; to have two uploaded robots in one level, combine them in one MJCF.
 
         Args:
-            model: An MJCF file, with whatever it includes, or a spec.
-            on_progress: Told after each piece that was sent.
+            model: An MJCF file, which may include others, or a spec.
+            on_progress: Callback invoked after each chunk that was sent.
             timeout: Seconds to wait for each request; None waits without limit. By default the import may take ten
                 minutes.
 
         Raises:
-            UnknownOp: The server takes no models over the wire; nothing was sent.
-            FileNotFoundError: There is no such file.
+            UnknownOp: The server does not accept uploads; nothing was sent.
+            FileNotFoundError: The file does not exist.
             ValueError: MuJoCo rejects the model, or it is larger than servers accept; nothing was sent.
-            ImportFailed: The server rejects it.
+            ImportFailed: The server rejects the model.
             OutcomeUnknown: The connection broke during the import.
         """
         if not self._session.features.uploads:
             raise UnknownOp(
                 "unknown_op",
-                "this server takes no models over the wire. Nothing was sent.",
+                "this server does not accept uploaded models. Nothing was sent.",
                 op="upload_model_manifest",
-                hint="Put the file on the server's machine and use import_xml().",
+                hint="Copy the file to the server's machine and use import_xml().",
             )
         flat = await anyio.to_thread.run_sync(flatten, model, abandon_on_cancel=True)
 
@@ -396,22 +396,22 @@ class SceneNamespace(SceneOps):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
-        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
-        one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Scene changes by other tasks wait until
+        this call has finished. At most one MJCF that exists only on this machine is uploaded, if the server accepts
+        uploads.
 
         Args:
             level_name: Short name or `/Game/` path.
-            assets: What to place.
+            assets: Actors to place.
             save: Save the level afterwards.
-            timeout: Seconds to wait for each of the ops; None waits without limit.
+            timeout: Seconds to wait for each op; None waits without limit.
 
         Returns:
             Handles by actor id.
 
         Raises:
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
-            URLabRPCError: From the op that failed; what was placed before it stays.
+            URLabRPCError: An op failed; actors placed before it stay.
         """
         require("apply_scene: assets", assets, Iterable, "a list of URLabAsset")
         wanted = list(assets)
@@ -420,7 +420,7 @@ class SceneNamespace(SceneOps):
         ids = [asset.actor_id for asset in wanted]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
-            raise ValueError(f"actor ids must differ, these are used twice: {', '.join(twice)}")
+            raise ValueError(f"actor ids must differ; these are used twice: {', '.join(twice)}")
         async with self._session.composing(CreateLevel, timeout):
             try:
                 await self.create_level(level_name, timeout=timeout)
@@ -445,7 +445,7 @@ class SceneNamespace(SceneOps):
             return handles
 
     async def _imported(self, files: list[str], timeout: Timeout) -> dict[str, URLabBlueprint]:
-        """Import models from the server's disk, or else from this machine's where the server takes them so."""
+        """Import models from the server's disk, otherwise from this machine if the server accepts uploads."""
         blueprints: dict[str, URLabBlueprint] = {}
         uploaded = ""
         for xml in files:
@@ -457,7 +457,7 @@ class SceneNamespace(SceneOps):
                 if uploaded:
                     raise ValueError(
                         f"apply_scene: the server has neither {uploaded} nor {xml} on its disk, and an uploaded model "
-                        "replaces the one before: combine them in one MJCF"
+                        "replaces the previous one; combine them in one MJCF"
                     ) from refusal
                 blueprints[xml] = await self.upload_model(xml, timeout=timeout)
                 uploaded = xml
@@ -467,7 +467,7 @@ class SceneNamespace(SceneOps):
 def _class_path(blueprint: URLabBlueprint | str) -> str:
     if isinstance(blueprint, str):
         return blueprint
-    require("blueprint", blueprint, URLabBlueprint, "what import_xml() returns, or a class path")
+    require("blueprint", blueprint, URLabBlueprint, "the return value of import_xml(), or a class path")
     return blueprint.class_path
 
 

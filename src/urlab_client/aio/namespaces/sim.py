@@ -26,7 +26,7 @@ _POLL_S = 0.25
 _SLICE_S = 2.0
 _STOP_POLL_S = 0.05
 _WIND_DOWN_S = 10.0
-_SLACK_S = 15.0  # the server may take 10 s to reach its game thread before its own timeout starts
+_SLACK_S = 15.0  # the server may need 10 s to reach its game thread before its own timeout starts
 
 
 class SimNamespace(Namespace):
@@ -46,20 +46,20 @@ class SimNamespace(Namespace):
         on_progress: Callable[[PIEStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> PIEStartResult:
-        """Start play, wait until the model is compiled, and take over the handshake of the new play world.
+        """Start play, wait until the model is compiled, and adopt the handshake of the new play world.
 
-        Without `level_path`, a healthy session continues and play does not restart. Afterwards the client's own step
+        Without `level_path`, a healthy play session continues and does not restart. Afterwards the client's own step
         mode is in force again; in live mode physics starts paused.
 
         Args:
             level_path: Level to open first, a full `/Game/` path: `/Game/Levels/lab` or `/Game/Levels/lab.lab`.
             timeout_s: Seconds to wait for the compile.
-            raise_on_failure: Raise unless play is ready; else return the result in any state.
-            on_progress: Called with the state about every quarter of a second while the model compiles.
-            timeout: Seconds to wait for each answer of the server; None waits without limit.
+            raise_on_failure: Raise unless play is ready; otherwise return the result in any state.
+            on_progress: Callback invoked with the state of play about every 0.25 s while the model compiles.
+            timeout: Seconds to wait for each reply of the server; None waits without limit.
 
         Raises:
-            URLabPIEError: Play did not become ready; its message carries the compile log.
+            URLabPIEError: Play did not become ready; the message contains the compile log.
         """
         async with self._session.turn(BeginPie, timeout=timeout, each=True) as turn:
             self._state.switching_play = True
@@ -83,10 +83,10 @@ class SimNamespace(Namespace):
     async def _play(
         self, turn: Turn, level_path: str | None, timeout_s: float, on_progress: Callable[[PIEStatus], object] | None
     ) -> BeginPieOk:
-        """Begin play and wait until its model is compiled, or has failed to, or time is up."""
+        """Begin play and wait until its model has compiled or failed to compile, or the time is up."""
         loop = running_loop()
         deadline = loop.time() + timeout_s
-        # In slices: while the server waits for the compile it answers nobody, this client included.
+        # In slices: while the server waits for the compile it answers no client, including this one.
         reply = await self._begin(turn, level_path, min(timeout_s, _SLICE_S))
         while reply.state == PIEState.TIMEOUT and not reply.compile_error and loop.time() < deadline:
             status = _status(await turn.call(PieStatus()))
@@ -107,50 +107,48 @@ class SimNamespace(Namespace):
         except BaseException as error:
             pending.play = pending.play or (turn.sent and leaves_open(error))
             raise
-        # Until the handshake has been taken over, or there will be none.
+        # Until the handshake has been adopted, or is known not to come.
         pending.play = reply.state in (PIEState.READY, PIEState.TIMEOUT)
         return reply
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
-        """End play and wait until it has ended; without play, succeed at once. The session continues.
+        """Stop play and wait until it has ended; return immediately if play is off. The session continues.
 
         Args:
-            timeout: Seconds to wait for each answer of the server; None waits without limit.
+            timeout: Seconds to wait for each reply of the server; None waits without limit.
 
         Raises:
-            GameThreadTimeout: The editor did not react; often a modal dialog is open.
-            URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
+            GameThreadTimeout: The editor did not react, often because a modal dialog is open.
+            URLabTimeoutError: The editor accepted the request, but play did not end within 10 s.
         """
         loop = running_loop()
         async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
             self._state.switching_play = True
-            # On Windows, what we have mapped the server could neither remove nor make anew.
+            # On Windows the server could neither remove nor recreate regions that this client has mapped.
             self._state.publishers.release_regions()
             try:
                 await turn.call(StopPie())
-                # The plugin answers when the end has been requested.
+                # The plugin replies as soon as the end has been requested.
                 deadline = loop.time() + _WIND_DOWN_S
                 while _status(await turn.call(PieStatus())).state is not PIEState.OFF:
                     if loop.time() > deadline:
-                        raise URLabTimeoutError(
-                            f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie"
-                        )
+                        raise URLabTimeoutError(f"stop_pie: play did not end within {_WIND_DOWN_S:g} s.", op="stop_pie")
                     await turn.aside(asyncio.sleep(_STOP_POLL_S))
             finally:
                 self._state.switching_play = False
             self._state.on_play_ended("stopped by this client")
 
     def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
-        """Play while a `with` block lasts: start it on entering, and stop it on leaving, also after an exception.
+        """Play for the duration of a `with` block: start on entering, and stop on leaving, also after an exception.
 
-        Play that runs already is taken over as `start()` does, and goes on after the block.
+        If play is already running, the block joins it as `start()` does, and play continues after the block.
 
         Args:
             level_path: Level to open first, a full `/Game/` path; None for the open one.
             timeout_s: Seconds to wait for the compile.
 
         Raises:
-            URLabPIEError: On entering: play did not become ready. It is stopped again.
+            URLabPIEError: On entering, play did not become ready. It is stopped again.
 
         Example:
             async with client.sim.playing():

@@ -6,4 +6,4 @@ __all__ = ["ViewportNamespace"]
 
 
 class ViewportNamespace(ViewportOps):
-    """The editor's perspective viewport; the play window has a camera of its own."""
+    """The editor's perspective viewport. The play window has its own camera."""

@@ -1,1 +1,1 @@
-"""What the client knows of the simulation and the connection, and what is unknown after a lost reply."""
+"""The client's knowledge of the simulation and the connection, and what is uncertain after a lost reply."""

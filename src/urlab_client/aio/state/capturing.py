@@ -1,8 +1,8 @@
 """Pictures without a step: `camera.capture()` and `client.capture()`.
 
-Newer servers draw on request in live mode, older ones only publish pictures there: then the client waits for one that
-was taken after the call. In `direct` and `puppet`, where a request for pictures would be a step, the server is brought
-into live mode for that long, paused.
+In live mode, newer servers render on request. Older servers only publish pictures, so the client waits for one that was
+taken after the call. In `direct` and `puppet`, a request for pictures would be a step, so the client switches the
+server to paused live mode for the duration of the capture.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ __all__ = ["Capturing"]
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05
 _MOVES_S: Final = 0.25
-"""In which time passes in live mode unless it is paused, at 5 % of real time, too."""
+"""Seconds in which simulation time advances in live mode unless paused, even at 5 % of real time."""
 
 _HINT = (
-    "Is the camera switched on in the editor, and can the server draw? Without OpenGL it sends no pictures; its log "
-    "says what it found."
+    "Check that the camera is switched on in the editor and that the server can render. Without OpenGL it sends no "
+    "pictures; its log shows what it found."
 )
-_ASSUMED = "Which step mode the server is in is not known, and outside live mode it may publish no pictures."
+_ASSUMED = "The server's step mode is unknown, and outside live mode it may publish no pictures."
 
 
 class Capturing:
     """Takes pictures for one client.
 
     Args:
-        state: The client's state.
-        default_timeout: Seconds that a camera has which has delivered before; None waits.
+        state: State of the client.
+        default_timeout: Seconds to wait for a camera that has delivered before; None waits without limit.
     """
 
     def __init__(self, state: SimState, default_timeout: float | None) -> None:
@@ -66,17 +66,19 @@ class Capturing:
         """Return a picture of each camera, taken after this call.
 
         Raises:
-            URLabError: A camera is not in the scene any more; nothing was sent.
-            PictureTimeout: Cameras delivered none in time.
-            NoActiveManager: No play session runs.
-            ModeLocked: The project pins a mode in which pictures come with steps only.
+            URLabError: A camera is no longer in the scene; nothing was sent.
+            PictureTimeout: A camera delivered no picture in time.
+            NoActiveManager: No play session is running.
+            ModeLocked: The project pins a mode in which only steps deliver pictures.
         """
         state = self._state
         first = Meta if state.session.read_only else Step
         async with state.session.turn(first, timeout=timeout, each=True) as turn:
             state.require_handshake("capture")
             if state.hello is not None and not state.hello.manager_present:
-                raise NoActiveManager("no_active_manager", "no play session runs. Nothing was sent.", op="capture")
+                raise NoActiveManager(
+                    "no_active_manager", "no play session is running. Nothing was sent.", op="capture"
+                )
             views = self._views(cameras)
             taking = _Taking(state, turn, views, self._deadline(views, timeout))
             try:
@@ -89,19 +91,19 @@ class Capturing:
                         await taking.in_live_mode(certain=True)
                     taking.note_time(state.sim_time)
             except ModeLocked as locked:
-                locked.hint = "Pictures come with steps here: client.step(include_cameras=…)."
+                locked.hint = "In this mode, pictures come with steps: call client.step(include_cameras=…)."
                 raise
         return taking.delivered()
 
     def _views(self, cameras: Sequence[HasCamera]) -> list[URLabCameraView]:
-        there = {id(view): view for view in self._state.objects.views()}
-        gone = [camera.name for camera in cameras if id(camera) not in there]
-        if gone:
+        present = {id(view): view for view in self._state.objects.views()}
+        missing = [camera.name for camera in cameras if id(camera) not in present]
+        if missing:
             raise URLabError(
-                f"capture: camera {gone[0]!r} is not in the scene any more. Nothing was sent.",
-                hint="client.camera() finds those that are.",
+                f"capture: camera {missing[0]!r} is no longer in the scene. Nothing was sent.",
+                hint="Call client.camera() to get a camera of the current scene.",
             )
-        return [there[id(camera)] for camera in cameras]
+        return [present[id(camera)] for camera in cameras]
 
     def _deadline(self, views: Sequence[URLabCameraView], timeout: Timeout) -> float | None:
         seconds = self._default_timeout if timeout is DEFAULT else timeout
@@ -112,20 +114,20 @@ class Capturing:
         return asyncio.get_running_loop().time() + seconds
 
     async def _learn_mode(self, turn: Turn) -> None:
-        """Find out which mode the server is in: outside live mode a request for pictures might be a step."""
+        """Determine the server's mode, because outside live mode a request for pictures might be a step."""
         state = self._state
         before = (await turn.call(PieStatus())).sim_time
         if before is None:
             return
         await turn.aside(asyncio.sleep(_MOVES_S))
         if (await turn.call(PieStatus())).sim_time != before:
-            state.mode = StepMode.LIVE  # nobody else has the session, so it runs by itself
+            state.mode = StepMode.LIVE  # no other client holds the session, so physics runs on its own
         else:
             await learn_mode(state, turn)
 
 
 class _Taking:
-    """One call: the pictures that have come and those that have not."""
+    """One call, with the pictures received so far."""
 
     def __init__(self, state: SimState, turn: Turn, views: Sequence[URLabCameraView], deadline: float | None) -> None:
         self._state = state
@@ -138,7 +140,7 @@ class _Taking:
         """Take the pictures of a server in live mode.
 
         Args:
-            certain: Whether it is known to be, so that a `step` only asks.
+            certain: Whether live mode is confirmed, so that a `step` advances nothing.
         """
         state, features = self._state, self._state.session.features
         try:
@@ -146,7 +148,7 @@ class _Taking:
                 if certain and features.renders_sync:
                     await self._ask()
                 else:
-                    # What the state is called that the pictures must not be older than, where they say what they show.
+                    # The number of a snapshot: numbered pictures must not be older.
                     reply = await self._turn.call(Step()) if certain and features.camera_switch else None
                     await self._watch(None if reply is None else reply.frame_id)
         except URLabTimeoutError:
@@ -154,19 +156,19 @@ class _Taking:
         except TimeoutError:
             late = [view.name for view in self._views if id(view) not in self._found]
             raise PictureTimeout(
-                f"capture: no picture of {', '.join(map(repr, late))} came in time.",
+                f"capture: no picture of {', '.join(map(repr, late))} arrived in time.",
                 cameras=late,
                 hint=_ASSUMED if state.mode_assumed else _HINT,
             ) from None
 
     def note_time(self, sim_time: float) -> None:
-        """Note what time it was, where the server does not say."""
+        """Set the simulation time of pictures for which the server sends none."""
         for sample in self._found.values():
             if sample.sim_time is None:
                 sample.sim_time = sim_time
 
     def delivered(self) -> list[CameraSample]:
-        """Return the pictures, which are the cameras' newest ones from now on."""
+        """Return the pictures and store each as the newest one of its camera."""
         for view in self._views:
             sample = self._found[id(view)]
             view.pictures.deliver(sample.pixels, sample.sim_time, sample.frame_id)
@@ -193,22 +195,22 @@ class _Taking:
 
     async def _watch(self, least: int | None) -> None:
         publishers = self._state.publishers
-        waiting = [_NextPicture(publishers.camera(view, StreamPolicy.ALL), least) for view in self._views]
+        receivers = [_NextPicture(publishers.camera(view, StreamPolicy.ALL), least) for view in self._views]
         try:
-            for one in waiting:
-                one.source.attach(one)
-            await self._turn.aside(self._received(waiting))
+            for receiver in receivers:
+                receiver.source.attach(receiver)
+            await self._turn.aside(self._receive(receivers))
         finally:
-            for one in waiting:
-                one.source.detach(one)
+            for receiver in receivers:
+                receiver.source.detach(receiver)
 
-    async def _received(self, waiting: Sequence[_NextPicture]) -> None:
-        for _ in range(2):  # turns of the loop, after which nothing waits in a socket any more
+    async def _receive(self, receivers: Sequence[_NextPicture]) -> None:
+        for _ in range(2):  # iterations of the loop that drain the sockets
             await asyncio.sleep(0)
-        for one in waiting:
-            one.begin()
-        for view, one in zip(self._views, waiting, strict=True):
-            self._keep(view, await one.came, view.resolution)
+        for receiver in receivers:
+            receiver.begin()
+        for view, receiver in zip(self._views, receivers, strict=True):
+            self._keep(view, await receiver.payload, view.resolution)
 
     def _keep(
         self,
@@ -234,45 +236,45 @@ class _Taking:
 class _NextPicture(MessageHandler):
     """Waits for a picture that was taken after `begin`.
 
-    A picture that says which snapshot it shows is compared with `least`. Of others the second one counts: the first may
-    have been on its way.
+    A picture with a snapshot number is compared with `least`. Without numbers, the second picture counts, because the
+    first may have been in transit.
 
     Attributes:
-        source: The camera.
-        came: What came.
+        source: Source of the camera's pictures.
+        payload: The picture received.
     """
 
     def __init__(self, source: CameraSource, least: int | None) -> None:
         self.source = source
-        self.came: asyncio.Future[BytesLike] = asyncio.get_running_loop().create_future()
+        self.payload: asyncio.Future[BytesLike] = asyncio.get_running_loop().create_future()
         self._least = least
         self._begun = False
         self._before = 0
 
     def begin(self) -> None:
-        """Take what comes from now on."""
+        """Accept pictures from now on."""
         self._begun = True
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one message."""
-        if not self._begun or self.came.done():
+        """Process one message."""
+        if not self._begun or self.payload.done():
             return
         width, height = self.source.view.info.resolution
         try:
             stamp = picture_stamp(payload, width, height, where=self.source.view.name)
         except ProtocolError as error:
-            self.came.set_exception(error)
+            self.payload.set_exception(error)
             return
-        told = None if stamp is None or self._least is None else stamp.frame_id >= self._least
-        fresh = self._before > 0 if told is None else told
+        by_number = None if stamp is None or self._least is None else stamp.frame_id >= self._least
+        fresh = self._before > 0 if by_number is None else by_number
         self._before += 1
         if fresh:
-            self.came.set_result(payload)
+            self.payload.set_result(payload)
 
     def on_malformed(self, problem: str) -> None:
-        """Leave it out."""
+        """Ignore a malformed message."""
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Take note that the client was closed."""
-        if not self.came.done():
-            self.came.set_exception(error())
+        """Fail because the client was closed."""
+        if not self.payload.done():
+            self.payload.set_exception(error())

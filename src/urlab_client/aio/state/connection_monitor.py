@@ -1,7 +1,7 @@
-"""What the client notices without being asked: lost connections, sessions that are gone, play that ended or began.
+"""Detection of lost connections, lost sessions, and the start and end of play.
 
-The wire announces none of it. But the connections break, or the snapshots cease, and then a question whose answer
-changes nothing tells the reason.
+The wire announces none of these. When a connection breaks or the snapshots stop, the monitor sends a request without
+side effects, and the reply shows the reason.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ __all__ = ["ConnectionMonitor"]
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _PROBE_S = 2.0
-_SILENCE_S = 1.0  # while play runs a snapshot comes every 100 ms, in every mode and paused, too
-# The plugin closes the state socket before or after it takes leave of the play session.
-_PATIENCE_S = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
+_SILENCE_S = 1.0  # while play runs, a snapshot arrives every 100 ms in every mode, even while paused
+# The plugin closes the state socket before or after it ends the play session.
+_PROBE_DELAYS_S = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 
 
 class ConnectionMonitor:
-    """Looks after one client, in one task that lives only while there is something to find out.
+    """Monitors one client in a task that runs only while there is something to find out.
 
-    In live mode it always watches. In the other modes, where the client has no other use for the state socket, it does
-    so while somebody listens to the events.
+    In live mode it always watches the state. In the other modes, where the client does not otherwise use the state
+    socket, it watches only while the events have listeners.
 
     Args:
-        session: The client's session.
-        state: The client's state, which it keeps true.
+        session: Session of the client.
+        state: State of the client, which the monitor keeps current.
     """
 
     def __init__(self, session: Session, state: SimState) -> None:
@@ -57,11 +57,11 @@ class ConnectionMonitor:
         state.on_adopted = self._on_adopted
 
     def on_connection(self, event: ClientEvent) -> None:
-        """Take note of what happened to the connection of the requests, and pass it on."""
+        """Handle an event of the request connection and publish it."""
         publishers = self._state.publishers
         if isinstance(event, ServerLost):
             self._session.confirmed = False
-            publishers.release_regions()  # the next server may lay them out anew where they are
+            publishers.release_regions()  # the next server may reuse their files with another layout
         publishers.events.publish(event)
         if isinstance(event, ServerReconnected):
             self._session.was_down = self._session.was_down or event.refused
@@ -78,13 +78,13 @@ class ConnectionMonitor:
             await asyncio.wait((self._task,))
 
     def _on_listener(self) -> None:
-        """Begin to watch the state socket. From any thread."""
+        """Start watching the state socket. Call from any thread."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._attend)
 
     def _on_adopted(self) -> None:
-        """Take note of a handshake, or of the end of play."""
+        """Handle a new handshake or the end of play."""
         self._announced = False
         self._loop = asyncio.get_running_loop()
         if self._timer is None:
@@ -104,7 +104,7 @@ class ConnectionMonitor:
         subscriptions.refresh()
 
     def _wanted(self) -> Subscription:
-        # While play runs the connection itself is the sign. Afterwards the first snapshot is: the socket may stay open.
+        # While play runs, the open connection shows it. Afterwards only a snapshot does: the socket may stay open.
         subscription = self._state.publishers.state().subscription()
         filters = () if self._playing or self._announced else (STATE_FULL,)
         return Subscription(subscription.endpoint, filters, subscription.accepts)
@@ -122,7 +122,7 @@ class ConnectionMonitor:
             self._look()
 
     def _tick(self) -> None:
-        """Look whether live snapshots have ceased."""
+        """Check whether live snapshots have stopped."""
         if self._closed or self._loop is None:
             return
         self._timer = self._loop.call_later(_SILENCE_S, self._tick)
@@ -133,7 +133,7 @@ class ConnectionMonitor:
         self._received, self._flowing = received, flowing
 
     def _look(self) -> None:
-        """Begin to find out how things stand, unless that goes on already or somebody knows better."""
+        """Start to determine the reason, unless that is in progress or this client is starting or ending play."""
         if self._closed or self._state.switching_play or not self._session.session_id:
             return
         if self._task is None or self._task.done():
@@ -141,19 +141,19 @@ class ConnectionMonitor:
 
     async def _find_out(self) -> None:
         before = self._playing
-        for pause in _PATIENCE_S:
+        for pause in _PROBE_DELAYS_S:
             await asyncio.sleep(pause)
             if self._state.switching_play or before != self._playing or not self._session.transport.connected:
                 return
             try:
                 reply = await self._session.probe(ListKeyframes(), timeout=_PROBE_S)
             except NoActiveManager:
-                return  # the state has taken note, or knew
+                return  # the state already reflects it
             except URLabRPCError as refusal:
-                log.debug("looking after the session: %s", refusal)
+                log.debug("the server refused the session probe: %s", refusal)
                 return
             except URLabError as error:
-                log.debug("looking after the session: %s", error)
+                log.debug("the session probe failed: %s", error)
                 continue
             if reply is not None and not before:
                 self._announced = True
@@ -170,15 +170,15 @@ class _Presence(MessageHandler):
         self._on_sign = on_sign
 
     def on_connection(self, connected: bool) -> None:
-        """Pass it on."""
+        """Report the state of the connection."""
         self._on_line(connected)
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Pass on that there is one."""
+        """Report a snapshot as a sign of play."""
         self._on_sign()
 
     def on_malformed(self, problem: str) -> None:
-        """Take it as a sign of play."""
+        """Report a malformed snapshot as a sign of play."""
         self._on_sign()
 
     def on_end(self, error: Callable[[], URLabError]) -> None:

@@ -1,4 +1,4 @@
-"""From a handshake to what the client knows: the session, the local model, the scene, the step mode."""
+"""Turning a handshake into the client's state: the session, the local model, the scene and the step mode."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 class Discovery:
-    """Opens sessions and takes over handshakes.
+    """Opens sessions and applies handshakes.
 
     Args:
-        state: The client's state, into which all of it goes.
-        local_model: Load the model of the handshake.
-        check_version: Raise when the MuJoCo builds differ.
-        promote: Bring the server into the step mode that the client was made with.
-        trusted: Load models in MuJoCo's binary format.
+        state: State of the client, updated from each handshake.
+        local_model: Whether to load the model of the handshake.
+        check_version: Whether to raise an error if the MuJoCo builds differ.
+        promote: Whether to switch the server to the step mode that the client was created with.
+        trusted: Whether to load models in MuJoCo's binary format.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class Discovery:
         self._check_version = check_version
         self._promote = promote
         self._trusted = trusted
-        self._said = ""  # what other versions of MuJoCo came to
+        self._warned = ""  # the last warning about another version of MuJoCo
 
     async def open(self, turn: Turn, observations: str) -> HelloOk:
-        """Open a session and take over what the server says."""
+        """Open a session and apply its handshake."""
         state = self._state
         hello = await state.session.hello(turn, Hello(observations=observations))
         state.level = state.sent_level = observations
@@ -53,16 +53,16 @@ class Discovery:
         return hello
 
     async def look_on(self, turn: Turn, handshake: bytes) -> None:
-        """Take over what another client's `handshake()` says, without opening a session.
+        """Apply the result of another client's `handshake()` without opening a session.
 
         Raises:
-            ValueError: It is none.
+            ValueError: `handshake` is not the result of `handshake()`.
         """
         session = self._state.session
         try:
             hello = decode_reply(op_of(Hello), HelloOk, handshake)
         except URLabError as error:
-            raise ValueError(f"this is not what handshake() returns: {error}") from None
+            raise ValueError(f"The argument is not a result of handshake(): {error}") from None
         listed = [op.name for op in (await turn.call(Meta())).ops]
         session.features = session.features.with_ops(listed).with_hello(hello)
         await self.adopt(turn, hello)
@@ -71,7 +71,7 @@ class Discovery:
         """Return a handshake whose model this process can and may load.
 
         Raises:
-            URLabVersionMismatch: It is another MuJoCo's, and the user wants to hear of that.
+            URLabVersionMismatch: The model is from another MuJoCo build, and `check_version` is set.
             URLabError: The server is not trusted with binary models and offers no other.
         """
         mismatch = self._state.mirror.check_version(hello)
@@ -91,8 +91,8 @@ class Discovery:
             if has_xml
             else "There is no local model, because the server does not offer it as XML."
         )
-        if self._said != consequence:
-            self._said = consequence
+        if self._warned != consequence:
+            self._warned = consequence
             warnings.warn(f"{mismatch.args[0]} {consequence}", stacklevel=2)
 
     async def _hello_with_assets(self, turn: Turn) -> HelloOk:
@@ -102,29 +102,28 @@ class Discovery:
         return hello
 
     async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
-        """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
+        """Return the handshake with a model only in XML, because MuJoCo's binary loader is not safe for hostile models.
 
         Raises:
-            URLabError: The server has none.
+            URLabError: The server does not offer the model as XML.
         """
         if hello.mjcf_compiled is None:
             log.info("the server is not trusted with binary models: the local model is compiled here from XML")
             hello = await self._hello_with_assets(turn)
         if hello.manager_present and hello.mjcf_compiled is None:
             raise URLabError(
-                "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
-                "machine and from servers known by their key.",
+                "The server offers its model only in MuJoCo's binary format, which is loaded only from servers on this "
+                "machine and servers known by their key.",
                 op="hello",
-                hint="Pass server_key=…, or trust_server=True if you trust the network in between, or "
-                "local_model=False.",
+                hint="Pass server_key=…, trust_server=True if you trust the network in between, or local_model=False.",
             )
         hello.mjb = None
         return hello
 
     async def adopt(self, turn: Turn, hello: HelloOk) -> None:
-        """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        """Apply a handshake: load its model, bind the wrappers and switch the server to the wanted step mode."""
         state = self._state
-        hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
+        hello.mjb_base64 = NOT_SENT  # it would keep the whole reply in memory
         await state.session.transport.follow(hello)
         loaded = None
         if self._local_model:
@@ -134,8 +133,8 @@ class Discovery:
             loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
         examined = examine(hello, None if loaded is None else loaded.model)
         state.publishers.check_open()
-        # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
-        # The model's bytes, several times its size, are not needed any more.
+        # From here on nothing awaits until the handshake is fully applied, so a cancellation cannot separate model and
+        # wrappers. The model's bytes, several times its size, are no longer needed.
         hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
         played = state.hello is not None and state.hello.manager_present
         with state.mirror.lock:
@@ -145,7 +144,7 @@ class Discovery:
             state.objects.bind(hello, examined)
             state.forget_clocks()
         state.pending.play = False
-        views = state.objects.views()  # binds the cameras to what the handshake says of them
+        views = state.objects.views()  # binds the cameras to the handshake's descriptions
         state.publishers.refresh()
         if state.publishers.camera_switch is not None:
             state.publishers.camera_switch.restart([view.info for view in views])
@@ -160,7 +159,7 @@ class Discovery:
             await promote(state, turn, state.wanted_mode)
         else:
             state.assume_mode(StepMode.LIVE if state.wanted_mode is StepMode.AUTO else state.wanted_mode)
-        # A handshake describes the model and not where the simulation stands, which may have run for hours.
+        # A handshake describes the model but not the simulation's state, which may have run for hours.
         if hello.manager_present and not state.session.read_only and (reply := await look(turn)) is not None:
             state.absorb_found(reply, "forward")
         log.info(
@@ -170,7 +169,7 @@ class Discovery:
 
 
 async def look(turn: Turn) -> ForwardOk | None:
-    """Return where the simulation stands, None where no play runs or the server does not tell."""
+    """Return the simulation's state, or None if play is not running or the server does not provide it."""
     try:
         return await turn.call(Forward())
     except (NoActiveManager, NotReady, UnknownOp):

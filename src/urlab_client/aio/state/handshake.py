@@ -1,7 +1,7 @@
-"""What a handshake says, examined before any of it is taken over.
+"""Validation of a handshake before any part of it is applied.
 
-For the client's state. Ids, offsets, sizes and names of a handshake lead into MuJoCo's and NumPy's memory for as long
-as the session lasts: here each of them is compared with the model, once.
+For the client's state. Ids, offsets, sizes and names from a handshake index MuJoCo's and NumPy's memory for the whole
+session, so this module checks each of them against the model once.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _LAST_PORT = 65535
 
 
 class Examined(Struct, frozen=True):
-    """What follows from a handshake and its model.
+    """The result of checking a handshake against its model.
 
     Attributes:
-        layouts: Where the values of each articulation live, by key; without a model, nowhere.
+        layouts: Layout of each articulation's values, by key; empty layouts without a model.
         entities: Plain entities by name.
     """
 
@@ -40,16 +40,16 @@ class Examined(Struct, frozen=True):
 
 
 def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
-    """Check a handshake against its model and work out what follows from both.
+    """Check a handshake against its model and derive the layouts and entities.
 
     Raises:
-        ProtocolError: Something in it cannot be right.
+        ProtocolError: A value of the handshake is invalid.
     """
     keys = [info.prefix for info in hello.articulations]
     if "" in keys or len(set(keys)) < len(keys):
-        raise _refused(f"its articulations are called {', '.join(map(repr, keys))}: keys are not empty and differ")
+        raise _refused(f"its articulations are called {', '.join(map(repr, keys))}; keys must be unique and not empty")
     if hello.instance is not None and not 0 <= hello.instance.state_port <= _LAST_PORT:
-        raise _refused(f"its state stream is on port {hello.instance.state_port}")
+        raise _refused(f"its state stream is on port {hello.instance.state_port}, which is not a valid port")
     for info in hello.articulations:
         _check_cameras(f"articulation {info.prefix!r}", info.camera_topics)
         if info.controller is not None:
@@ -81,24 +81,24 @@ def _check_cameras(owner: str, cameras: Mapping[str, CameraInfo]) -> None:
 
 
 def _check_entity(name: str, info: EntityInfo, model: mujoco.MjModel | None) -> None:
-    said = (info.free_joint_id, info.qpos_offset, info.qvel_offset)
+    reported = (info.free_joint_id, info.qpos_offset, info.qvel_offset)
     if model is None:
-        if info.id < 1 or any(number is not None and number < 0 for number in said):
-            raise _refused(f"entity {name!r} has body {info.id} and joint, offsets {said}")
+        if info.id < 1 or any(number is not None and number < 0 for number in reported):
+            raise _refused(f"entity {name!r} has the invalid body {info.id} or joint and offsets {reported}")
         return
     if not 0 < info.id < model.nbody:
-        raise _refused(f"entity {name!r} is body {info.id}, and the bodies of its model are 1 to {model.nbody - 1}")
+        raise _refused(f"entity {name!r} is body {info.id}, but the bodies of its model are 1 to {model.nbody - 1}")
     joint = int(model.body_jntadr[info.id])
     free = joint >= 0 and model.jnt_type[joint] == FREE
     if free != info.has_free_base:
-        raise _refused(f"entity {name!r} has {'a' if info.has_free_base else 'no'} free base, its model says otherwise")
+        raise _refused(f"entity {name!r} has {'a' if info.has_free_base else 'no'} free base, unlike its model")
     places = (joint, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])) if free else (None, None, None)
-    if any(number not in (None, place) for number, place in zip(said, places, strict=True)):
-        raise _refused(f"entity {name!r} has joint and offsets {said}, in its model they are {places}")
+    if any(number not in (None, place) for number, place in zip(reported, places, strict=True)):
+        raise _refused(f"entity {name!r} has joint and offsets {reported}, but in its model they are {places}")
 
 
 def _entities_of(model: mujoco.MjModel, keys: frozenset[str]) -> dict[str, EntityInfo]:
-    """Find the dynamic bodies of no articulation: the plugin lists none, but they are in the model."""
+    """Find the dynamic bodies outside articulations in the model, because the plugin does not list them."""
     bodies, joints = model_names(model, "body"), model_names(model, "joint")
     found: dict[str, EntityInfo] = {}
     for body_id, name in enumerate(bodies):

@@ -1,4 +1,4 @@
-"""Requests whose replies were lost, so that nobody knows whether they were executed."""
+"""Requests whose replies were lost, so that the client cannot know whether they were executed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _UNDECIDED = (StepTimeout, ShuttingDown, InternalError)
 
 
 class Counters(Protocol):
-    """Where the client stands: a part of its state."""
+    """The part of the client's state that locates it in the simulation."""
 
     session: Session
     step_count: int
@@ -33,20 +33,20 @@ class Counters(Protocol):
 
 
 class PendingOutcomes:
-    """Requests that may or may not have been executed. Forgotten with the next reply that tells the step counter.
+    """Requests that may or may not have been executed. Cleared by the next reply that contains the step counter.
 
     Attributes:
-        steps: Steps, or in puppet mode pushes.
-        since: Step counter before the first of them.
-        time: Simulation time before the first of them, seconds.
-        connects: Connections made when the latest of them was sent.
-        queued: Whether the server said that it has queued steps.
-        carried: What steps carried, each with the number of steps that must have been executed for it to have acted.
-        reset: Whether a reset is among them.
+        steps: Number of steps or, in puppet mode, pushes.
+        since: Step counter before the first request.
+        time: Simulation time before the first request, seconds.
+        connects: Number of connections opened when the latest request was sent.
+        queued: Whether the server reported that it has queued steps.
+        carried: Wrenches of the steps, each with the number of steps after which they have acted.
+        reset: Whether one of the requests is a reset.
         keyframe: Compiled keyframe of that reset.
-        mode: Step mode that was asked for, or None.
-        paused: Whether physics may be paused for pictures, see `stopped_live`.
-        play: Whether a start of play was broken off, so that another world may be playing than the client knows.
+        mode: Requested step mode, or None.
+        paused: Whether physics may be paused for pictures; see `stopped_live`.
+        play: Whether a start of play was interrupted, so that the server may play another world than the client knows.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class PendingOutcomes:
         return self.steps > 0 or self.reset
 
     def clear(self) -> None:
-        """Forget steps and resets: a reply told the state."""
+        """Clear steps and resets because a reply contained the state."""
         self.steps: int = 0
         self.since: int = 0
         self.time: float = 0.0
@@ -70,7 +70,7 @@ class PendingOutcomes:
         self.carried: list[tuple[int, Carried]] = []
 
     def add_steps(self, state: Counters, error: BaseException, steps: int, carried: Carried) -> None:
-        """Note that steps were sent and `error` came instead of their reply."""
+        """Record steps that were sent and failed with `error` instead of a reply."""
         self._note(state)
         self.steps += steps
         if carried:
@@ -78,20 +78,20 @@ class PendingOutcomes:
         self.queued = self.queued or isinstance(error, StepTimeout)
 
     def add_reset(self, state: Counters, keyframe: str | None) -> None:
-        """Note that a reset was sent and an error came instead of its reply."""
+        """Record a reset that was sent and failed with an error instead of a reply."""
         self._note(state)
         self.reset = True
         self.keyframe = keyframe
 
     def give_back(self, applied: int) -> None:
-        """Buffer again what was carried by steps that were not executed."""
+        """Buffer the wrenches of steps that were not executed again."""
         for needed, carried in reversed(self.carried):
             if needed > applied:
                 give_back(carried)
 
     @contextmanager
     def about_mode(self, mode: StepMode | str) -> Generator[None]:
-        """Note, unless the body succeeds or is refused, that the server is to be brought into `mode`."""
+        """Record `mode` as pending unless the body succeeds or the server refuses it."""
         try:
             yield
         except BaseException as error:
@@ -109,7 +109,7 @@ class PendingOutcomes:
 
 
 def leaves_open(error: BaseException) -> bool:
-    """Return whether a request that left and failed in this way may have been executed."""
+    """Return whether a request that was sent and failed with this error may have been executed."""
     if isinstance(error, URLabRPCError):
         return isinstance(error, _UNDECIDED)
     return not isinstance(error, (ServerUnreachable, TypeError, ValueError))

@@ -1,4 +1,4 @@
-"""Finding out what became of requests whose replies were lost."""
+"""Determining the outcome of requests whose replies were lost."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["resync"]
 
 
 async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DEFAULT) -> Resync:
-    """Ask the server for counter and time, open a session where that is needed, and take the state over.
+    """Request step counter and time from the server, open a session if needed, and apply the state.
 
-    `forward` is the only op that tells both in every mode. It integrates nothing and warm-starts nothing: the
-    trajectory after it is the same, bit for bit.
+    `forward` is the only op that returns both in every mode. It neither integrates nor changes the warm start, so the
+    trajectory after it is bitwise identical.
     """
     async with state.session.turn(Forward, timeout=timeout) as turn:
         pending, state.pending = state.pending, PendingOutcomes()
@@ -45,8 +45,8 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         reply, held, renewed = None, False, True
     if before is not None:
         applied, was_reset = _compare(pending, before)
-        # What broke off with a connection may still travel, and then meets a server that has moved on. In puppet mode
-        # the next push overrides it anyway; elsewhere it is shut out with the session it belongs to.
+        # A request interrupted by a lost connection may still be in transit and reach the server later. In puppet mode
+        # the next push overrides it; in other modes the server rejects it once its session has been replaced.
         late = pending.connects != state.session.transport.stats.connects and state.mode is not StepMode.PUPPET
         renewed = late and not (applied == sent and (was_reset or not pending.reset))
     if renewed or pending.play:
@@ -54,10 +54,10 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         await discovery.open(turn, state.level)
         reply = await look(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
-            applied = _slipped_in(state, applied, reply.time - before.time)
+            applied = _with_late_steps(state, applied, reply.time - before.time)
     if reply is not None and pending.mode is not None:
         await ask_mode(state, turn, pending.mode)
-        reply = await look(turn)  # in live mode it has moved on meanwhile
+        reply = await look(turn)  # in live mode the simulation has advanced meanwhile
     if reply is not None:
         if was_reset:
             state.absorb_reset(reply, pending.keyframe)
@@ -79,7 +79,7 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
 
 
 def _compare(pending: PendingOutcomes, reply: ForwardOk) -> tuple[int | None, bool | None]:
-    """Return how many of the steps in doubt were executed, and whether the reset was, as far as that shows."""
+    """Return how many pending steps were executed and whether the reset was; None if unknown."""
     if not pending:
         return 0, None
     if not pending.reset:
@@ -89,12 +89,12 @@ def _compare(pending: PendingOutcomes, reply: ForwardOk) -> tuple[int | None, bo
         return (None if pending.steps else 0), True
     if pending.steps:
         return None, None
-    # A counter that was 0 is so after a reset, too.
+    # A counter that was 0 before a reset is 0 after it, too.
     return 0, False if pending.since else None
 
 
-def _slipped_in(state: SimState, applied: int, seconds: float) -> int | None:
-    """Count the steps that were executed between the first look and the new session, whose counter is a new one."""
+def _with_late_steps(state: SimState, applied: int, seconds: float) -> int | None:
+    """Add the steps executed between the first reply and the new session, whose counter starts anew."""
     model = state.mirror.model
     if model is None or seconds < 0:
         return None

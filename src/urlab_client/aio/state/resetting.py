@@ -1,4 +1,4 @@
-"""One reset: what it sends, and what becomes of that. Everything happens within the caller's turn."""
+"""One reset: its request and the handling of its reply, all within the caller's turn."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ __all__ = ["take_reset"]
 async def take_reset(
     state: SimState, turn: Turn, keyframe: str | None, seed: int | None, qpos: Mapping[str, Mapping[str, float]]
 ) -> ResetOk:
-    """Reset the simulation and take over the state.
+    """Reset the simulation and apply the new state.
 
     Args:
-        state: The client's state.
-        turn: The turn in which all of it happens.
-        keyframe: Keyframe to reset to, by its short or its compiled name.
-        seed: Remembered by the server.
-        qpos: Articulation key to joint name to the first component of its position.
+        state: State of the client.
+        turn: Turn that contains the whole operation.
+        keyframe: Short or compiled name of the keyframe to reset to.
+        seed: Seed that the server stores.
+        qpos: First component of joint positions, by articulation key and joint name.
     """
     state.require_handshake("reset")
     articulations = state.objects.articulations
@@ -58,7 +58,7 @@ def _joint_values(state: SimState, key: str, values: Mapping[str, float]) -> dic
 
 
 def _compiled_keyframe(state: SimState, name: str) -> str:
-    """Return the compiled name; only that is known to the server."""
+    """Return the compiled name, which is the only one that the server knows."""
     text("reset: keyframe_name", name)
     model = state.mirror.model
     if model is None:
@@ -74,6 +74,6 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     problem = (
         f"{name!r} could mean {', '.join(matches)}"
         if matches
-        else f"no keyframe is called {name!r}, only: {', '.join(compiled) or 'none'}"
+        else f"no keyframe is called {name!r}; the keyframes are: {', '.join(compiled) or 'none'}"
     )
     raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")

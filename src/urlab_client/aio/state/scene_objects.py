@@ -1,4 +1,4 @@
-"""What the scene of the last handshake holds: articulations, entities and cameras, and which names mean them."""
+"""Contents of the scene from the last handshake: articulations, entities and cameras, looked up by name."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 
 
 class SceneObjects:
-    """Articulations, entities and cameras. Users hold on to theirs: a later handshake binds the same ones again.
+    """Articulations, entities and cameras. Users keep these objects, so a later handshake rebinds the same ones.
 
     Attributes:
         articulations: Articulations by key.
-        articulations_by_id: Those that have an actor id, by that id.
+        articulations_by_id: Articulations that have an actor id, by that id.
         entities: Every dynamic body by name, articulations included.
         global_cameras: Scene-level cameras.
-        records: What is mirrored of the articulations, by key.
-        entity_records: What is mirrored of the plain entities, by name.
+        records: Mirrored state of the articulations, by key.
+        entity_records: Mirrored state of the plain entities, by name.
     """
 
     def __init__(self, session: Session, publishers: Publishers, mirror: Mirror, motion: Motion) -> None:
@@ -53,19 +53,19 @@ class SceneObjects:
         self._motion = motion
 
     def bind(self, hello: HelloOk, examined: Examined) -> None:
-        """Take over what a handshake lists."""
+        """Adopt the contents of a handshake."""
         self._bind_articulations(hello, examined)
         self._bind_entities(examined)
         cameras = hello.global_cameras or {}
         self.global_cameras = NameMap({n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera")
 
     def views(self) -> list[URLabCameraView]:
-        """Return all cameras, bound to what the handshake says of them."""
+        """Return all cameras, bound to their descriptions in the handshake."""
         own = [view for art in self.articulations.values() for view in art.cameras.values()]
         return [*own, *self.global_cameras.values()]
 
     def announced_camera(self, name: str, frame: CameraFrame) -> URLabCameraView | None:
-        """Return a view of a camera of the scene that was announced by its picture alone."""
+        """Return a view of a scene camera that only its picture announced, or None if there are no such cameras."""
         if not self.hidden_cameras:
             return None
         mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
@@ -75,21 +75,21 @@ class SceneObjects:
         return view
 
     def camera_names(self) -> list[str]:
-        """Return a name of each camera that no other has: `<articulation>/<camera>`, or the scene's."""
+        """Return a unique name of each camera: `<articulation>/<camera>`, or the name of a scene camera."""
         own = [f"{art.prefix}/{name}" for art in self.articulations.values() for name in art.cameras]
         return [*own, *self.global_cameras]
 
     def shown_cameras(self, names: Iterable[str]) -> dict[str, str]:
-        """Return what users call cameras by `camera_names`: by the name alone where that means one of them."""
+        """Map names from `camera_names` to the names shown to users: the bare name where it is unique."""
         short = {name: name.rpartition("/")[2] for name in names}
         counts = Counter(short.values())
         return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
 
     def camera_name(self, name: str) -> str:
-        """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
+        """Resolve `<articulation>/<camera>` or just `<camera>` to one of `camera_names`.
 
         Raises:
-            UnknownName: None of them, or several.
+            UnknownName: The name matches no camera or several.
         """
         names = self.camera_names()
         owner, slash, short = text("camera", name).rpartition("/")
@@ -107,7 +107,7 @@ class SceneObjects:
     def with_cameras(
         self, asked: bool | dict[str, str | None], more: Mapping[str, str]
     ) -> bool | dict[str, str | None]:
-        """Return the pictures that a step is to bring: what its caller asked for, and more that there are."""
+        """Return the pictures to request with a step: those that the caller requested, plus existing ones of `more`."""
         if asked is True:
             return True
         chosen = dict(asked or {})
@@ -117,35 +117,35 @@ class SceneObjects:
 
     @property
     def hidden_cameras(self) -> bool:
-        """Whether the scene may have cameras that the handshake does not list."""
+        """Whether the scene may have cameras that are missing from the handshake."""
         return any("/" in name for record in self.records.values() for name in record.info.camera_topics)
 
     def camera(self, name: str) -> URLabCameraView | None:
-        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
+        """Return the camera named `<articulation>/<camera>` or just `<camera>`, or None."""
         try:
             return self.require_camera(name)
         except KeyError:
             return None
 
     def require_camera(self, name: str) -> URLabCameraView:
-        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`.
+        """Return the camera named `<articulation>/<camera>` or just `<camera>`.
 
         Raises:
-            KeyError: None, or several.
+            KeyError: The name matches no camera or several.
         """
         if name in self.global_cameras:
             return self.global_cameras[name]
         owner, _, short = self.camera_name(name).rpartition("/")
         return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
-    def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:
-        """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
-        views = [view for view in map(self.camera, asked) if view is not None]
-        came = {id(self.camera(name)) for name in reply.cameras or {}}
+    def note_missing_frames(self, requested: Iterable[str], reply: StepOk) -> None:
+        """Mark the cameras whose requested frame is missing, because the server omits it without an error."""
+        views = [view for view in map(self.camera, requested) if view is not None]
+        delivered = {id(self.camera(name)) for name in reply.cameras or {}}
         for view in views:
-            if view.delivered and id(view) not in came:
+            if view.delivered and id(view) not in delivered:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
-            view.delivered = id(view) in came
+            view.delivered = id(view) in delivered
 
     def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
         wrappers: dict[str, URLabArticulation] = {}

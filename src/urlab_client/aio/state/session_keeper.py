@@ -1,9 +1,9 @@
-"""A session that lasts: `keep_session=True`.
+"""Keeping a session open: `keep_session=True`.
 
-After a restart of the server, and with each new play session, the client discovers again by itself. It never takes a
-session back: the server has one, whoever said `hello` last has it, and no request tells who that is. What shows is
-whether the server was gone. So only a session that was lost with the connection is opened again, if nothing listened at
-the address meanwhile and the world has not simply gone on.
+After a restart of the server and with each new play session, the client discovers again automatically. It never takes a
+session back: the server has a single session, the last client that sent `hello` holds it, and no request shows which
+client that is. The client can only detect that the server was down. So it reopens only a session that was lost with the
+connection, if nothing listened at the address meanwhile and the simulation has not continued.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ __all__ = ["SessionKeeper"]
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
-_LOOK_S: Final = 5.0  # how often it is made sure that the session is still this client's
+_LOOK_S: Final = 5.0  # interval between checks that this client still holds the session
 _PROBE_S: Final = 2.0
-_WORLD_S: Final = 0.5  # a world that goes on publishes ten times a second, where it publishes at all
-_PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts, the last one again and again
+_WORLD_S: Final = 0.5  # a running simulation that publishes does so ten times a second
+_PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts; the last one repeats
 
 
 class SessionKeeper:
-    """Keeps the session of one client, in one task.
+    """Keeps the session of one client open, in one task.
 
     Args:
-        session: The client's session.
-        state: The client's state.
-        discovery: Opens sessions.
+        session: Session of the client.
+        state: State of the client.
+        discovery: Discovery that opens sessions.
     """
 
     def __init__(self, session: Session, state: SimState, discovery: Discovery) -> None:
@@ -51,18 +51,18 @@ class SessionKeeper:
         self._state = state
         self._discovery = discovery
         self._task: asyncio.Task[None] | None = None
-        self._time = 0.0  # of the simulation, when the connection was lost
-        self._given_up = ""  # a session that another client has ended
+        self._time = 0.0  # simulation time when the connection was lost
+        self._given_up = ""  # id of a session that another client has taken over
 
     def start(self) -> None:
-        """Keep the session that is open now, and those after it; on the event loop. Idempotent."""
+        """Keep the current session and its successors open. Call from the event loop. Idempotent."""
         if self._task is None or self._task.done():
             kinds = (ServerLost, SessionLost, PlayStarted)
             events = self._state.publishers.events.stream(kinds, 100)
             self._task = asyncio.create_task(self._run(events), name="urlab-keeper")
 
     async def aclose(self) -> None:
-        """Keep it no longer. Idempotent."""
+        """Stop keeping the session. Idempotent."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait((self._task,))
@@ -76,7 +76,7 @@ class SessionKeeper:
             except ClientClosed:
                 return
             except URLabError as error:
-                log.warning("the session could not be looked after: %s", error)
+                log.warning("the session could not be checked: %s", error)
 
     async def _act_on(self, event: ClientEvent) -> None:
         match event:
@@ -86,30 +86,30 @@ class SessionKeeper:
                 if event.session_id == self._session.session_id:
                     await self._on_lost(event.session_id)
             case PlayStarted(articulations=[]):
-                await self._open("somebody else has started play")
+                await self._open("another client or the editor has started play")
             case _:
                 pass
 
     async def _look(self) -> None:
-        """Notice a session that has been taken over, before the server restarts and it looks as if that were why."""
+        """Detect a takeover of the session early, before a restart of the server could be mistaken for the cause."""
         session = self._session
         if session.session_id not in ("", self._given_up) and session.transport.connected:
             try:
                 await session.probe(ListKeyframes(), timeout=_PROBE_S)
-            except URLabError as error:  # the events tell what it means
-                log.debug("looking after the session: %s", error)
+            except URLabError as error:  # the events report its meaning
+                log.debug("the session probe failed: %s", error)
 
     async def _on_lost(self, session_id: str) -> None:
         if session_id == self._given_up:
             return
-        if not self._session.was_down or await self._world_goes_on():
+        if not self._session.was_down or await self._simulation_continues():
             self._given_up = session_id
-            log.warning("another client has taken the session over; it is not taken back")
+            log.warning("another client has taken over the session; this client does not take it back")
             return
         await self._open("the server has been restarted")
 
-    async def _world_goes_on(self) -> bool:
-        """Return whether the simulation is where this client left it, or further: then no server was restarted."""
+    async def _simulation_continues(self) -> bool:
+        """Return whether the simulation is at or past the last known time, so that no server was restarted."""
         if self._time <= 0.0:
             return False
         snapshots = Stream(self._state.publishers.state(), policy=StreamPolicy.LATEST)
@@ -120,7 +120,7 @@ class SessionKeeper:
             return False
 
     async def _open(self, why: str) -> None:
-        """Open a session, as soon as the server lets one be opened, unless the user does so or has to say more."""
+        """Open a session as soon as the server permits, unless the user opens one or outcomes are pending."""
         session, state = self._session, self._state
         lost = session.session_id
         attempt = 0

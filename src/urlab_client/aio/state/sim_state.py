@@ -1,6 +1,6 @@
-"""What the client knows of the simulation: the handshake, the local model, and the state of the last reply.
+"""The client's view of the simulation: the handshake, the local model and the state of the last reply.
 
-The client and its namespaces share one `SimState`; users see it through the attributes of `URLabClient`.
+The client and its namespaces share one `SimState`. Users access it through the attributes of `URLabClient`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ __all__ = ["SimState"]
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
-# By the server's clock. More than this means that the clock was set, not that a message was overtaken.
+# By the server's clock. A larger difference means that the clock was set, not that messages were reordered.
 _OVERTAKEN_S = 1.0
 
 
@@ -60,33 +60,33 @@ _Parts = tuple[
     list[tuple[MirroredEntity, EntityState]],
     list[tuple[URLabCameraView, Pixels, CameraFrame]],
 ]
-"""The parts of a state that fits, each with what it is about."""
+"""The parts of a checked state, each with its target."""
 
 
 class SimState:
-    """Everything that `discover()` and the replies after it say.
+    """State from `discover()` and the replies after it.
 
     Attributes:
         session: The RPC session.
-        publishers: What the server publishes.
+        publishers: Publishers of the server.
         mirror: Local model and data.
         objects: Articulations, entities and cameras.
-        wanted_mode: Step mode the user asked for.
-        mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
-        promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
-        mode_word: What the server called the step mode when it last told it.
+        wanted_mode: Step mode that the user requested.
+        mode_assumed: Whether `mode` is an assumption that no reply has confirmed.
+        promoted_from: Mode to restore on close after this client changed it; possibly one that only the server knows.
+        mode_word: Name of the step mode in the server's last reply that contains it.
         level: Observation level of the session.
-        paused: Whether this client has paused physics, as far as that lasts.
-        sent_level: Observation level the server has, which an earlier step may have changed.
+        paused: Whether this client has paused physics and nothing has resumed it since.
+        sent_level: Observation level in the server, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
         step_count: Steps since the last handshake or reset.
-        reset_seed: Seed of the last reset, None without one.
+        reset_seed: Seed of the last reset, or None without one.
         sim_time: Simulation time of the last reply, seconds.
-        on_adopted: Told of each handshake taken over, and of the end of play.
+        on_adopted: Callback invoked after each handshake and at the end of play.
         pending: Requests whose replies were lost.
-        switching_play: Whether this client is starting or ending play, so that neither is news.
-        observers: Who looks on, such as recorders.
-        step_streams: Where the pictures of steps are looked for if replies bring older ones.
+        switching_play: Whether this client is starting or ending play, so that it reports neither as news.
+        observers: Observers of the client, such as recorders.
+        step_streams: Streams that deliver the pictures of steps if replies carry older ones.
     """
 
     def __init__(
@@ -129,11 +129,11 @@ class SimState:
         self.pending: PendingOutcomes = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
         self.switching_play = False
-        self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread
+        self.observers: tuple[ClientObserver, ...] = ()  # replaced, never modified: read from any thread
 
     @property
     def mode(self) -> StepMode:
-        """Step mode in force, as far as this client knows. In live mode, and no other, state is received by itself."""
+        """Current step mode, as far as this client knows. Only live mode receives state in the background."""
         return self._mode
 
     @mode.setter
@@ -151,7 +151,7 @@ class SimState:
                 receiver.stop()
 
     def tell_of_handshake(self) -> None:
-        """Let the observers know that a handshake was taken over."""
+        """Notify the observers of a new handshake."""
         for observer in self.observers:
             try:
                 observer.on_handshake()
@@ -159,33 +159,33 @@ class SimState:
                 log.exception("%r failed on a handshake", observer)
 
     def observed_cameras(self, n_steps: int) -> dict[str, str]:
-        """Return the pictures that the observers want of the next step: camera to `sync` or `latest`."""
+        """Return the pictures that the observers want from the next step: camera to `sync` or `latest`."""
         wanted: dict[str, str] = {}
         for observer in self.observers:
             try:
                 wanted |= {name: str(CameraTiming(how)) for name, how in observer.step_cameras(n_steps).items()}
             except Exception:
-                log.exception("%r failed to say which pictures it wants", observer)
+                log.exception("%r failed to return the pictures that it wants", observer)
         return wanted
 
     def assume_mode(self, mode: StepMode) -> None:
-        """Go by a step mode until a reply shows which one is in force: no op tells it without changing it."""
+        """Assume a step mode until a reply shows the real one, because no op can query it without changing it."""
         self.mode = mode
         self.mode_assumed = True
 
     @property
     def live(self) -> bool:
-        """Whether state is received by itself."""
+        """Whether state is received in the background."""
         return self._live.running
 
     @property
     def live_received(self) -> int:
-        """Snapshots that arrived by themselves."""
+        """Number of snapshots received in the background."""
         return self._live.stats.received
 
     @property
     def local_time(self) -> float:
-        """Simulation time of the local data, or without them of the last reply, seconds."""
+        """Simulation time of the local data or, without local data, of the last reply, seconds."""
         return self.sim_time if self.mirror.data is None else self.mirror.data.time
 
     def _articulation_key(self, name: str) -> str | None:
@@ -193,23 +193,23 @@ class SimState:
         return None if articulation is None else articulation.prefix
 
     def require_handshake(self, op: str) -> None:
-        """Refuse an op that goes by what a handshake said, when that is not known.
+        """Reject an op that depends on the handshake if the handshake is unknown.
 
         Raises:
-            NoSession: The handshake of the session, or of a new play, was given up.
+            NoSession: The handshake of the session or of a new play session was abandoned.
         """
         if self.hello is None and self.session.greeted:
             raise NoSession("discover() did not finish. Nothing was sent.", op=op)
         if self.pending.play:
             raise NoSession(
-                "sim.start() was broken off, so it is not known what plays now. Nothing was sent.",
+                "sim.start() was interrupted, so the client does not know what is playing. Nothing was sent.",
                 op=op,
                 hint="Call sim.start(), discover() or resync().",
             )
 
     def _note_session(self, hello: HelloOk) -> None:
-        """Note that a session was opened, maybe by a handshake that its caller had given up."""
-        self.pending.clear()  # what belonged to the session before is refused now
+        """Handle a new session, possibly from a handshake that its caller had abandoned."""
+        self.pending.clear()  # the server rejects requests of the previous session
         self.step_count = 0
         self.sent_level = ""
         self.publishers.events.publish(
@@ -219,7 +219,7 @@ class SimState:
         )
 
     def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
-        """Take over the state after a reset, whole or not at all; raises as `absorb` does."""
+        """Apply the state after a reset completely or not at all; raise the same errors as `absorb`."""
         received = time.time_ns()
         parts = self._checked(reply, "reset")
         with self.mirror.lock:
@@ -230,11 +230,11 @@ class SimState:
 
     @property
     def _trusted(self) -> bool:
-        """Whether published states can be this session's; a client that looks on has none to lose."""
+        """Whether published states belong to this session; a read-only client has no session to lose."""
         return self.session.confirmed or self.session.read_only
 
     def matches(self, snapshot: StateSnapshot) -> bool:
-        """Whether a published state is of the world that the handshake described, as far as that can be seen."""
+        """Return whether a published state fits the world that the handshake described."""
         if not self._trusted or snapshot.per_articulation.keys() != self.objects.records.keys():
             return False
         try:
@@ -246,44 +246,44 @@ class SimState:
     def _absorb_live(self, snapshot: StateSnapshot) -> None:
         age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
         if 0 < age < _OVERTAKEN_S:
-            return  # sent before the last reply, arrived after it
+            return  # sent before the last reply but received after it
         if not self._trusted:
-            return  # the connection was lost: this may be another server's
+            return  # the connection was lost, so this may be from another server
         known = self.objects.records
         if snapshot.per_articulation.keys() != known.keys():
             raise ProtocolError(
-                f"state/full: it holds {_listed(snapshot.per_articulation)}, the handshake {_listed(known)}.",
+                f"state/full: it has {_listed(snapshot.per_articulation)}, but the handshake has {_listed(known)}.",
                 hint="The world changed on the server: call discover().",
             )
         self.absorb(snapshot, "state/full")
 
     def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
-        """Take over the state in a reply, whole or not at all.
+        """Apply the state in a reply completely or not at all.
 
         Args:
             reply: The reply.
-            op: Op that it answers, for messages.
-            into_mirror: Also write it into the local data; not in puppet mode, whose state comes from there.
+            op: Op of the reply, for messages.
+            into_mirror: Whether to write it to the local data, too; not in puppet mode, where they are its source.
 
         Raises:
-            ProtocolError: Something in it does not fit the model or the cameras; nothing was taken over.
+            ProtocolError: The state does not fit the model or the cameras; nothing was applied.
         """
         received = time.time_ns()
         self._take_over(reply, self._checked(reply, op), received, into_mirror=into_mirror)
 
     def absorb_found(self, reply: StateReply, op: str) -> None:
-        """Take over where a simulation stands that a handshake told of; raises as `absorb` does.
+        """Apply the state found after a handshake; raise the same errors as `absorb`.
 
-        Observers are not told: nothing has happened that they follow.
+        Do not notify observers: the simulation has not changed.
         """
         received = time.time_ns()
         self._write(reply, self._checked(reply, op), received, into_mirror=True)
 
     def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Parts:
-        """Compare a state with the model and the cameras, and return it with what each part of it is about.
+        """Check a state against the model and the cameras, and return each part with its target.
 
         Raises:
-            ProtocolError: Something in it does not fit.
+            ProtocolError: A part of the state does not fit.
         """
         if not math.isfinite(reply.time):
             raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
@@ -341,8 +341,8 @@ class SimState:
             0 < drag.body_id < model.nbody and len(drag.xfrc) == 6 and np.isfinite(drag.xfrc).all()
         ):
             raise ProtocolError(
-                f"{op}: a perturbation of body {drag.body_id} by {drag.xfrc.tolist()}: "
-                f"bodies are 1 to {model.nbody - 1}, a wrench is six numbers.",
+                f"{op}: invalid perturbation of body {drag.body_id} by {drag.xfrc.tolist()}: "
+                f"bodies are 1 to {model.nbody - 1}, and a wrench has six finite numbers.",
                 op=op,
             )
 
@@ -358,16 +358,16 @@ class SimState:
             self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
 
     def forget_clocks(self) -> None:
-        """Start at zero, as a new play does: what was known is of the world before. Call under the lock."""
+        """Reset counter and clocks to zero, as a new play session does. Call under the lock."""
         self.step_count = 0
         self.sim_time = 0.0
         self.sim_time_sec = self.sim_time_nsec = 0
 
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
-        """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names.
+        """Mirror the leading joint positions that `set_qpos` wrote to an articulation, given by any of its names.
 
         Raises:
-            ProtocolError: They are neither all of its positions nor those of its free base.
+            ProtocolError: The positions cover neither the whole articulation nor its free base.
         """
         articulation = self.objects.articulations.get(key)
         if articulation is None:
@@ -381,10 +381,10 @@ class SimState:
             self.mirror.mark_stale()
 
     def mirror_options(self, options: SimOptions) -> None:
-        """Take over the options that `set_sim_options` echoed, all or none.
+        """Mirror the options that `set_sim_options` returned, all or none.
 
         Raises:
-            ProtocolError: One of them cannot be right.
+            ProtocolError: An option is invalid.
         """
         try:
             check_sim_options(options)
@@ -392,16 +392,18 @@ class SimState:
                 with self.mirror.lock:
                     write_options(self.mirror.model.opt, options)
         except ValueError as error:
-            raise ProtocolError(f"set_sim_options: the server says that {error}.", op="set_sim_options") from None
+            raise ProtocolError(
+                f"set_sim_options: the server returned an invalid option: {error}.", op="set_sim_options"
+            ) from None
 
     def _note_refusal(self, refusal: URLabRPCError) -> None:
         if isinstance(refusal, NoActiveManager):
-            self.on_play_ended("stopped by somebody else")
+            self.on_play_ended("stopped by another client or in the editor")
         elif isinstance(refusal, SessionTakenOver):
             self.publishers.events.publish(SessionLost(session_id=self.session.session_id, reason=refusal.message))
 
     def on_play_ended(self, reason: str = "") -> None:
-        """Note that the play session is gone: the server is back in live mode, without articulations."""
+        """Handle the end of play: the server is back in live mode and has no articulations."""
         played = self.hello is not None and self.hello.manager_present
         if self.hello is not None:
             self.hello.manager_present = False
@@ -422,7 +424,9 @@ class SimState:
         for name, frame in cameras.items():
             view = self.objects.camera(name) or self.objects.announced_camera(name, frame)
             if view is None:
-                raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
+                raise ProtocolError(
+                    f"step: the reply has a frame of camera {name!r}, which the handshake does not list.", op="step"
+                )
             found.append((view, frame))
         return found
 

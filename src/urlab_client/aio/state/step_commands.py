@@ -1,4 +1,4 @@
-"""What a step tells the articulations and entities: set-points, and the wrenches that it carries."""
+"""Commands of a step to the articulations and entities: set-points and wrenches."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ __all__ = ["direct_commands", "live_commands", "take_wrenches"]
 
 
 def direct_commands(state: SimState, carried: Carried) -> dict[str, ArticulationCommand]:
-    """Return what a step tells the articulations and entities, with the wrenches that it carries."""
+    """Return the commands of a step, including its wrenches."""
     ours = _ours(state)
-    if not carried:  # as nearly every step
+    if not carried:  # true for nearly every step
         return {record.name: record.direct_command(None) for record in ours}
     commands = {record.name: record.direct_command(carried.get(record)) for record in ours}
     for name, record in state.objects.entity_records.items():
         if record not in carried:
             continue
         if not state.session.features.claims:
-            # Under its own name: the server tries the body's name alone after `<key>_<body>`.
+            # Use the entity's own name: the server tries `<key>_<body>` first and then the bare name of the body.
             commands[name] = record.wrench_command(carried[record])
         else:
-            # An entity has no owner, so one of the robots takes it along.
+            # An entity has no owner, so the command of a robot carries its wrenches.
             key = next(iter(commands or state.objects.records))
             carrier = commands.setdefault(key, ArticulationCommand())
             carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **carried[record]}
@@ -32,20 +32,20 @@ def direct_commands(state: SimState, carried: Carried) -> dict[str, Articulation
 
 
 def live_commands(state: SimState, carried: Carried) -> dict[str, ArticulationCommand]:
-    """Return what a step in live mode tells the articulations."""
+    """Return the commands of a step in live mode."""
     if state.session.features.live_pictures_in_steps:
         return direct_commands(state, carried)
     return {record.name: record.live_command() for record in _ours(state)}
 
 
 def _ours(state: SimState) -> Iterable[MirroredArticulation]:
-    # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
+    # A server whose robots have owners rejects a step that writes to another client's robots, so send only our own.
     records = state.objects.records.values()
     return [record for record in records if record.driven] if state.session.features.claims else records
 
 
 def take_wrenches(state: SimState) -> Carried:
-    """Take what the step that is being built carries out of its buffers."""
+    """Return the wrenches for the step being built and clear their buffers."""
     carried: Carried = {}
     for record in _ours(state):
         if record.wrenches:

@@ -1,7 +1,7 @@
-"""The pictures that a step brings: asked for by the names that mean one camera, handed back under the user's.
+"""The pictures of a step: requested by unique camera names and returned under the user's names.
 
-For the client's `step`. A picture that was to show the state after the step, and shows an older one, is withheld. On
-servers that cannot draw for a step, the picture is taken from the camera's stream instead.
+For the client's `step`. A picture that should show the state after the step but shows an older one is dropped. If the
+server cannot render for a step, the picture comes from the camera's stream instead.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _RENDER_S: Final = 5.0
 
 
 def first_picture_s(views: Iterable[URLabCameraView]) -> float:
-    """Return how long a server may look for OpenGL before it draws: 0 where each camera has shown something."""
+    """Return the seconds that a server may need to initialise OpenGL: 0 if each camera has delivered a picture."""
     return 0.0 if all(view.pictures.came for view in views) else FIRST_PICTURE_S
 
 
@@ -37,14 +37,14 @@ class StepPictures:
     """The pictures of one step.
 
     Args:
-        state: The client's state, which knows the cameras.
-        asked: What is wanted: all newest ones, none, or camera to `sync` or `latest`.
+        state: State of the client, which contains the cameras.
+        asked: Requested pictures: True for all newest ones, False for none, or a map of camera to `sync` or `latest`.
 
     Attributes:
-        interruption: What broke off the wait for pictures.
+        interruption: Cancellation that interrupted the wait for pictures.
 
     Raises:
-        KeyError: There is no such camera, or several; nothing was sent.
+        KeyError: A name matches no camera or several; nothing was sent.
     """
 
     def __init__(self, state: SimState, asked: bool | Mapping[str, str | None]) -> None:
@@ -55,7 +55,7 @@ class StepPictures:
         self._sync: set[str] = set()
         self._all = self._listening = False
         self.interruption: asyncio.CancelledError | None = None
-        if asked is False:  # as nearly every step has it
+        if asked is False:  # true for nearly every step
             return
         names = state.objects.camera_names()
         if isinstance(asked, bool):
@@ -65,8 +65,8 @@ class StepPictures:
         else:
             self._shown = {state.objects.camera_name(name): name for name in asked}
             self._wanted = {state.objects.camera_name(name): timing for name, timing in asked.items()}
-        # Asked for all of them, a server that calls two cameras alike brings one. One that has cameras which it does
-        # not announce shows them to nobody else.
+        # If two cameras share a name, a request for all cameras returns only one of them. Unannounced cameras, however,
+        # are returned only by such a request.
         unique = all("/" not in name for name in self._shown.values())
         self._all = asked is True and (unique or state.objects.hidden_cameras)
         self._sync = {name for name, timing in self._wanted.items() if timing == CameraTiming.SYNC}
@@ -76,18 +76,18 @@ class StepPictures:
 
     @property
     def seconds(self) -> float:
-        """How long the server may take for them, besides the step itself."""
+        """Seconds that the server may take for the pictures in addition to the step."""
         views = [view for name in self._wanted if (view := self._state.objects.camera(name)) is not None]
-        return self._drawing_s + first_picture_s(views)
+        return self._rendering_s + first_picture_s(views)
 
     @property
-    def _drawing_s(self) -> float:
+    def _rendering_s(self) -> float:
         if not self._sync:
             return 0.0
         return _RENDER_S if self._features.renders_sync else _BLOCKING_S * len(self._sync)
 
     def ask(self, request: Step) -> None:
-        """Write into a request what it is to ask for, if anything."""
+        """Add the pictures to a request, if any."""
         if not self:
             return
         request.include_cameras = True if self._all else dict(self._wanted)
@@ -96,9 +96,9 @@ class StepPictures:
             request.camera_timeout_ms = 1000.0 * _RENDER_S
 
     async def listen(self, turn: Turn) -> None:
-        """Receive the streams in which pictures are looked for, before the step is taken; at most for seconds.
+        """Subscribe to the streams of the pictures before the step. Takes a few seconds at most.
 
-        Where cameras stream all the time, the first reply shows whether there is a need.
+        If cameras always stream, the first reply shows whether the streams are needed.
         """
         if not self._sync or self._features.renders_sync:
             return
@@ -108,9 +108,9 @@ class StepPictures:
             await turn.aside(streams.opened())
 
     async def complete(self, turn: Turn, reply: StepOk) -> None:
-        """Bring the pictures of a reply under the user's names: without those that are too old, with those of streams.
+        """Rename a reply's pictures to the user's names, drop outdated ones and add those of streams.
 
-        The step is done by then, so its state is taken over before a cancellation shows: by `account`.
+        The step is already done, so a cancellation is deferred until its state has been applied; `account` raises it.
         """
         try:
             await self._catch_up(turn, reply)
@@ -119,14 +119,14 @@ class StepPictures:
         self.take(reply)
 
     def account(self, reply: StepOk, *, came: bool) -> None:
-        """Mark the cameras whose pictures did not come, after the reply was taken over.
+        """Mark the cameras whose pictures are missing, after the reply was applied.
 
         Args:
             reply: The reply.
-            came: Whether the step was one that brings pictures.
+            came: Whether a step of this mode delivers pictures.
 
         Raises:
-            CancelledError: The wait for pictures was broken off.
+            CancelledError: The wait for pictures was cancelled.
         """
         if came:
             self._state.objects.note_missing_frames(self.names, reply)
@@ -134,7 +134,7 @@ class StepPictures:
             raise self.interruption
 
     async def _catch_up(self, turn: Turn, reply: StepOk) -> None:
-        """Wait in the streams for the pictures that a reply has not, or in an older version, within their deadline."""
+        """Wait in the streams for pictures that are missing or outdated in a reply, within their deadline."""
         if not self._sync or self._features.renders_sync or reply.frame_id is None:
             return
         frames = reply.cameras or {}
@@ -149,7 +149,7 @@ class StepPictures:
         streams.needed = True
         if not self._listening:
             self._listen(late)
-        found = await streams.pictures(late, reply.frame_id, turn.deadline(self._drawing_s))
+        found = await streams.pictures(late, reply.frame_id, turn.deadline(self._rendering_s))
         if found:
             reply.cameras = {**frames, **found}
 
@@ -158,7 +158,7 @@ class StepPictures:
         return self._state.step_streams.listen(views, self._state.hello)
 
     def take(self, reply: StepOk) -> None:
-        """Bring the pictures of a reply under the user's names, without those that are too old."""
+        """Rename the pictures of a reply to the user's names and drop outdated ones."""
         if reply.cameras is None:
             return
         reply.cameras = {
@@ -170,10 +170,10 @@ class StepPictures:
     def _too_old(self, name: str, frame: CameraFrame, step: int | None) -> bool:
         if name not in self._sync or frame.frame_id is None or step is None or frame.frame_id >= step:
             return False
-        log.info("camera %s: its picture is of snapshot %d, the step of %d", name, frame.frame_id, step)
+        log.info("camera %s: its picture shows snapshot %d, but the step is snapshot %d", name, frame.frame_id, step)
         return True
 
     @property
     def names(self) -> list[str]:
-        """The user's names of the cameras whose pictures are to come."""
+        """The user's names of the requested cameras."""
         return list(self._shown.values())

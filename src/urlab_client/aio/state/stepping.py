@@ -1,4 +1,4 @@
-"""One step: what it sends in each step mode, and what becomes of that. Everything happens within the caller's turn."""
+"""One step: its request in each step mode and the handling of its reply, all within the caller's turn."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Cameras = bool | Mapping[str, "str | CameraTiming"]
 
 
 async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
-    """Advance physics as the step mode says, and take over the state.
+    """Advance physics according to the step mode and apply the new state.
 
     Args:
-        state: The client's state.
-        turn: The turn in which all of it happens.
-        n_steps: Physics steps.
-        cameras: Pictures to bring.
-        asked: Observation level of the reply, None for the session's.
+        state: State of the client.
+        turn: Turn that contains the whole operation.
+        n_steps: Number of physics steps.
+        cameras: Pictures to return.
+        asked: Observation level of the reply; None for the session's.
     """
     state.require_handshake("step")
     await settle_mode(state, turn)
@@ -47,10 +47,10 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     assumed, before, session = state.mode_assumed, state.step_count, state.session.session_id
     level = asked or state.level
     request.observations = None if level == state.sent_level else level
-    state.sent_level = ""  # unknown to us until the server has answered
+    state.sent_level = ""  # unknown until the reply arrives
     try:
         reply = await turn.call(request, takes=_seconds(pictures))
-        if state.session.session_id == session:  # else it has the level of a handshake that was given up
+        if state.session.session_id == session:  # otherwise an abandoned handshake set the level
             state.sent_level = level if state.session.features.level_sticks else state.level
         if pictures is not None:
             await pictures.complete(turn, reply)
@@ -61,10 +61,10 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     if state.pending:
         state.pending.clear()
     if assumed:
-        # A handshake that was given up and answered meanwhile let the server count anew.
+        # If an abandoned handshake was answered meanwhile, the server's counter started anew.
         _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
         if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
-            return await take_steps(state, turn, n_steps, cameras, asked)  # all it has done is to set the clock
+            return await take_steps(state, turn, n_steps, cameras, asked)  # the request has only set the clock
     if state.mode is StepMode.PUPPET:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
@@ -79,11 +79,11 @@ def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int,
     else:
         give_back(carried)
     if isinstance(error, StepTimeout):
-        state.mode = StepMode.DIRECT  # no other mode lets a step wait
+        state.mode = StepMode.DIRECT  # only direct mode lets a step wait
 
 
 async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None) -> StepOk:
-    carried = take_wrenches(state)  # of no effect on servers that do not take them in this mode
+    carried = take_wrenches(state)  # without effect on servers that ignore them in this mode
     try:
         request = Step(per_articulation=live_commands(state, carried) or None)
         if pictures is not None:
@@ -108,7 +108,7 @@ def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
     except ValueError:
         give_back(carried)
         raise
-    # A server in puppet mode, which it may be as long as the mode is only assumed, sets its clock to what a step says.
+    # While the mode is only assumed, the server may be in puppet mode, in which it sets its clock from the request.
     time = state.local_time if state.mode_assumed else None
     return Step(n_steps=n_steps, per_articulation=commands or None, time=time), carried
 
@@ -120,7 +120,7 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
         raise URLabError(
             "step: puppet mode integrates the local model, which this client does not have.",
             op="step",
-            hint="Make the client with local_model=True and call discover() during play.",
+            hint="Create the client with local_model=True and call discover() during play.",
         )
     if take_wrenches(state):
         warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=4)
@@ -136,31 +136,31 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
 
 
 def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) -> None:
-    """Take over the step mode that a reply shows, if it does: in each the server counts steps in another way.
+    """Infer the step mode from a reply if possible: in each mode the server counts steps differently.
 
-    In live mode it does not count. In puppet mode it counts one for each request, and its clock says what it was told.
+    In live mode it does not count. In puppet mode it counts each request once and its clock has the requested time.
 
     Raises:
-        URLabError: It is not the mode that the client was made with, and was told not to switch.
+        URLabError: The mode differs from the one that the client was created with, and the client must not switch.
     """
     expected = state.mode
     if advanced == 0:
         state.mode = StepMode.LIVE
-        state.sent_level = ""  # where it is not looked at
+        state.sent_level = ""  # the server ignores the level in this mode
     elif advanced == 1 and reply.time == request.time and state.mirror.model is not None:
         state.mode = StepMode.PUPPET
     elif advanced == request.n_steps:
         state.mode = StepMode.DIRECT
     if state.mode is not expected and state.wanted_mode is not StepMode.AUTO:
         raise URLabError(
-            f"step: the server is in step mode {state.mode}, in which it has handled this step, and not in {expected}.",
+            f"step: the server handled this step in step mode {state.mode}, not in {expected}.",
             op="step",
             hint=f"Call runtime.set_mode({str(expected)!r}), or leave auto_promote_step_mode on.",
         )
 
 
 async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int) -> StepPictures | None:
-    """Return the pictures that a step is to bring, None for none, when observers have room for what it brings."""
+    """Return the pictures to request with a step, or None. Waits until the observers can accept more data."""
     if state.mode is not StepMode.LIVE:
         for observer in state.observers:
             await observer.ready()
@@ -183,10 +183,10 @@ async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int)
 
 def _too_few(n_steps: int, mode: StepMode) -> str:
     if mode is StepMode.PUPPET:
-        return f"step: n_steps is at least 0, got {n_steps}"
-    return f"step: n_steps is at least 1 in step mode {mode}, got {n_steps}; only a puppet step may take none"
+        return f"step: n_steps must be at least 0, got {n_steps}."
+    return f"step: n_steps must be at least 1 in step mode {mode}, got {n_steps}. Only a puppet step may take 0."
 
 
 def _seconds(pictures: StepPictures | None) -> float | None:
-    """Return how long a step may take the server that has to wait for pictures; None for as long as any other."""
+    """Return the seconds that a step with pictures may take; None for the default of a step."""
     return None if pictures is None or not pictures.seconds else (op_of(Step).timeout or 0.0) + pictures.seconds

@@ -1,7 +1,7 @@
-"""What users call robots, bodies and geoms, in the words of the server; and back.
+"""Translation of users' names of robots, bodies and geoms to the server's names, and back.
 
-For `client.runtime`. Keys, actor ids and names of the engine's objects all mean a robot, and each of them may stand in
-front of a body's or geom's own name. The server knows one of them, or the compiled name.
+For `client.runtime`. A key, an actor id and the name of an engine object can all identify a robot, and each may prefix
+the name of a body or geom. The server knows only one of them, or the compiled name.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ R = TypeVar("R", bound=Reply)
 
 
 def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | None) -> Q:
-    """Return a request with names that the server knows; a name that means nothing stays as it is.
+    """Return a request with names that the server knows. Unknown names stay unchanged.
 
     Raises:
-        UnknownName: A name that could mean several things; nothing was sent.
+        UnknownName: A name is ambiguous; nothing was sent.
     """
     match request:
         case SetTwist(articulation=str(name)) | SetControlSource(articulation=str(name)):
             robot = objects.articulations.get(name)
             return request if robot is None else replace(request, articulation=robot.prefix)
-        # MuJoCo takes the process down for a name that is not text; what is wrong with it is said later.
+        # MuJoCo crashes the process if a name is not text. Later checks report such names.
         case SetMocapPose(body=str(body)) | ReadMocapPose(body=str(body)):
             return replace(request, body=_compiled("body", body, objects, model))
         case GetContacts(filter=names) if names is not None:
@@ -59,7 +59,7 @@ def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | No
 
 
 def as_written(reply: R, request: Request[Any]) -> R:
-    """Return a reply with the names that the user's request has for what it asked for."""
+    """Return a reply with the names that the user's request contains."""
     match reply, request:
         case MocapReply(), (SetMocapPose(body=body) | ReadMocapPose(body=body)):
             return replace(reply, body=body)

@@ -1,6 +1,6 @@
 """Gymnasium environments: `URLabEnv` over one client, `URLabVectorEnv` over many, `URLabBatchEnv` without a wire.
 
-Needs the extra `gym`. Importing this package registers the environments of `tasks`, for `gymnasium.make`.
+Needs the extra `gym`. Importing this package registers the environments in `tasks` for `gymnasium.make`.
 """
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv

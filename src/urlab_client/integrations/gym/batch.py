@@ -1,4 +1,4 @@
-"""`URLabBatchEnv`: the robots of a scene stepped in batch by MuJoCo itself, without a wire."""
+"""`URLabBatchEnv`: many copies of a scene, stepped in batch by MuJoCo itself, without a wire."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_appl
 class URLabBatchEnv(Vectorized):
     """Many copies of one scene in this process, stepped by `mujoco.batch` on a thread pool.
 
-    MuJoCo before 3.17 has no such module; there Python's threads step the copies, with the same results.
+    MuJoCo before 3.17 lacks this module; Python threads then step the copies, with the same results.
 
-    The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
-    rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
-    wrench is applied. So are pictures where the same driver draws: this process draws them with the code and the
-    settings of a simulated server. Controllers act before each physics step, as they do on the server, with the
-    parameters they had when the scene was fetched.
+    The environment fetches the compiled scene from a server once and then no longer needs the server. Observations,
+    rewards and autoreset equal those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
+    wrench is applied. Pictures are equal, too, if the same driver draws them: this process uses the code and the
+    settings of a simulated server. Controllers act before each physics step, as on the server, with the parameters
+    that they had when the scene was fetched.
     """
 
     def __init__(
@@ -97,43 +97,43 @@ class URLabBatchEnv(Vectorized):
         """Fetch the scene and make the batch.
 
         Args:
-            address: Where the scene comes from: `sim://MODEL`, with the options of the model, or a server during play.
+            address: Source of the scene: `sim://MODEL`, with the options of the model, or a server during play.
             num_envs: Number of copies.
-            space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
+            space_mode: See `URLabEnv`.
             observations: See `URLabEnv`.
             reward_fn: See `URLabVectorEnv`.
             termination_fn: See `URLabVectorEnv`.
             max_episode_steps: See `URLabEnv`.
-            cameras: See `URLabEnv`. Every step draws them, in this process.
+            cameras: See `URLabEnv`. This process draws them in every step.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
             keyframe: See `URLabEnv`.
-            render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
-            render_camera: Camera that `render` shows; the first one of the scene by default.
-            task: See `URLabEnv`. One object serves all environments.
-            randomise: See `URLabEnv`. Cameras are as late as a server's; how late within the jitter is drawn otherwise.
+            render_mode: None or `rgb_array`. With `rgb_array`, only `render` draws; steps cost the same.
+            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
+            task: See `URLabEnv`. One instance serves all environments.
+            randomise: See `URLabEnv`. Cameras have the same latency as a server's, but the jitter is drawn differently.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
-            n_threads: Threads that step, the caller's included; 0 for one per processor. Of no effect with `warp`.
-            engine: What steps: `mujoco`, on processors, in float64, bit for bit as servers do; `warp`, MuJoCo Warp, in
-                float32, on an NVIDIA GPU where there is one. Resets are MuJoCo's own with both.
-            engine_options: For `warp`: `contacts` and `constraints`, the most of one copy at one time, for which its
-                arrays have room.
+            n_threads: Threads that step, including the calling thread; 0 for one per processor. No effect with `warp`.
+            engine: Physics engine: `mujoco` steps on the CPU in float64, bit for bit like servers; `warp` (MuJoCo Warp)
+                steps in float32, on an NVIDIA GPU if present. MuJoCo itself resets with both.
+            engine_options: Options of `warp`: `contacts` and `constraints`, the largest number in one copy at any time,
+                for which its arrays are sized.
             client_options: Further options of the client that fetches the scene.
 
         Raises:
-            URLabError: The scene cannot be fetched, or MuJoCo Warp has not what it uses.
-            RenderingUnavailable: Cameras are observed, and nothing here can draw.
+            URLabError: The scene cannot be fetched, or uses a feature that MuJoCo Warp lacks.
+            RenderingUnavailable: Cameras are observed, and this machine cannot draw.
             MissingExtra: `engine` needs an extra that is not installed.
-            KeyError: An unknown camera.
-            ValueError: An option out of range, a model that varies, with `warp`, or rendering of a scene without a
-                camera.
+            KeyError: A camera is unknown.
+            ValueError: An option is out of range, `warp` is combined with a varying model, or the scene has no camera
+                to render.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         if engine not in ("mujoco", "warp"):
-            raise ValueError(f"engine is 'mujoco' or 'warp', not {engine!r}")
+            raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
-            raise ValueError(f"engine_options of {engine} cannot have {', '.join(sorted(unknown))}")
+            raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
         check_render_mode(render_mode)
         check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
         settings = EpisodeSettings.of(
@@ -183,7 +183,7 @@ class URLabBatchEnv(Vectorized):
             if engine == "warp"
             else (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         )
-        # Bound before the first call: a derived field is computed only where somebody looks at it.
+        # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
         self._late = LateCameras(declared, self._cameras)
@@ -208,32 +208,32 @@ class URLabBatchEnv(Vectorized):
         self._step_count = np.zeros(num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each copy as it is, shape (H, W, 3), RGB; None without a render mode.
+        """Return a picture of the current state of each copy, shape (H, W, 3), RGB; None without a render mode.
 
         Raises:
-            RenderingUnavailable: Nothing here can draw.
+            RenderingUnavailable: This machine cannot draw.
             TimeoutError: Drawing took too long.
         """
         if self._rendered is None:
             return None
-        everyone = np.arange(self.num_envs)
+        copies = np.arange(self.num_envs)
         mode = self._picture_scene.mode(self._rendered)
-        drawn = self._draw([self._rendered], everyone, self._visible_states(everyone))
+        drawn = self._draw([self._rendered], copies, self._visible_states(copies))
         return tuple(to_rgb(frame, mode) for frame in drawn[self._rendered])
 
     def draws(self, index: int) -> dict[str, Any] | None:
-        """Return what was drawn for the episode of an environment, as `EpisodeDraws.told` has it; None for nothing."""
+        """Return the values drawn for an environment's episode, as in `EpisodeDraws.told`; None if nothing varies."""
         found = None if self._varied is None else self._varied.draws[index]
         return None if found is None else found.told()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what drew."""
+        """Free the drawing context."""
         pictures, self._pictures = self._pictures, None
         if pictures is not None:
             pictures.close()
 
     def _seen(self, indices: Indices) -> dict[str, NDArray[Any]]:
-        """Return what some copies observe of the cameras."""
+        """Return the camera observations of some copies."""
         states, late = self._visible_states(indices), self._late
         drawn = self._draw([name for name in self._cameras if name not in late.names], indices, states)
         for name in late.names:
@@ -246,11 +246,11 @@ class URLabBatchEnv(Vectorized):
         }
 
     def _visible_states(self, indices: Indices) -> list[Floats]:
-        """Return the states of some copies, as `Visible` has them."""
+        """Return the states of some copies in the form of `Visible.state`."""
         return [np.concatenate([values[i].ravel() for values in self._visible]) for i in indices.tolist()]
 
     def _draw(self, cameras: Sequence[str], indices: Indices, states: Sequence[Floats]) -> dict[str, list[Pixels]]:
-        """Return what cameras see in some copies, given their states."""
+        """Return the pictures of cameras in some copies, given their states."""
         if not cameras:
             return {}
         if self._pictures is None:
@@ -321,7 +321,7 @@ class URLabBatchEnv(Vectorized):
         return self._observe(indices), {}
 
     def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
-        """Let the controllers turn their targets into controls, for the state as it is."""
+        """Compute the controls from the controllers' targets and the current state."""
         ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
         for key, values in targets.items():
             if self._varied is not None:
@@ -368,7 +368,7 @@ class URLabBatchEnv(Vectorized):
     def _body(self, name: str) -> int:
         found = self._bodies.get(name, self._bodies.get(name.replace("/", "_", 1)))
         if found is None:
-            raise ValueError(f"push: no body {name!r}; there are: {', '.join(self._bodies)}")
+            raise ValueError(f"push: unknown body {name!r}; the bodies are: {', '.join(self._bodies)}")
         return found
 
     def _keyframe_id(self, name: str) -> int:
@@ -383,22 +383,22 @@ class URLabBatchEnv(Vectorized):
 
 @dataclass(frozen=True)
 class _Shown:
-    """That pictures are rendered, and of which camera; the first one for None."""
+    """Request to render a camera; None selects the first colour camera."""
 
     camera: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Fetched:
-    """What a batch knows of a server's scene.
+    """What a batch needs from the server's scene.
 
     Attributes:
         model: The compiled scene.
-        prefixes: What the names of articulations' elements begin with, by key.
-        controllers: Kind and parameters of those controllers that there are, by key.
-        exact_controls: Whether those take set-points as they are.
-        pictures: What is needed to draw it.
-        rendered: Camera that `render` shows, if any.
+        prefixes: Prefixes of the compiled names of articulations, by key.
+        controllers: Kind and parameters of the attached controllers, by key.
+        exact_controls: Whether the controllers receive set-points without rounding.
+        pictures: What is needed to draw the scene.
+        rendered: Camera that `render` shows, or None.
     """
 
     model: mujoco.MjModel
@@ -413,15 +413,15 @@ def _fetch(address: str, client_options: Mapping[str, Any], cameras: Sequence[st
     """Fetch a scene.
 
     Raises:
-        URLabError: It cannot be had, or there is no articulation in it.
-        KeyError: An unknown camera.
-        ValueError: A camera is to be rendered, and there is none.
+        URLabError: The scene cannot be fetched or has no articulation.
+        KeyError: A camera is unknown.
+        ValueError: The scene has no camera to render.
     """
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
         if model is None or not client.articulations:
-            raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
+            raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         rendered = None if shown is None else shown.camera or first_camera(aio_of(client))
         return _Fetched(

@@ -1,4 +1,4 @@
-"""Another model for each copy of a batch and each of its episodes, as a server's scene has one."""
+"""Variation of the model per copy of a batch and per episode, equal to the variation of a server's scene."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class BatchVariation:
     """What varies in the copies of a batch.
 
     Args:
-        declaration: What was declared.
+        declaration: The declaration.
         model: The compiled scene, without variation.
-        batch: What steps the copies: a `mujoco.batch.Batch`, or what stands in for it.
+        batch: The batch that steps the copies: a `mujoco.batch.Batch` or its substitute.
         nsim: Number of copies.
         controllers: Controllers by articulation.
 
     Raises:
-        ValueError: A name fits no element.
+        ValueError: A name matches no element.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class BatchVariation:
         self.draws: list[EpisodeDraws | None] = [None] * nsim
 
     def begin(self, indices: Indices, seeds: NDArray[np.int64]) -> None:
-        """Write the models of the next episodes of some copies, which have to be reset after that.
+        """Write the models for the next episodes of some copies, which must then be reset.
 
         Args:
             indices: The copies.
@@ -74,17 +74,17 @@ class BatchVariation:
             self._batch.set_const(indices)
 
     def start(self, i: int, qpos: Floats) -> None:
-        """Vary where the episode of a copy starts, in place, shape (nq,)."""
+        """Vary the start positions of a copy's episode in place, shape (nq,)."""
         draws = self.draws[i]
         if draws is not None:
             self._variation.start(draws, qpos)
 
     def use_factors(self, key: str, indices: Indices) -> None:
-        """Have the controller of an articulation use the gains of some copies."""
+        """Set the gain factors of some copies in the controller of an articulation."""
         found = self._pd.get(key)
         if found is not None:
             found.factors = {name: factors[indices] for name, factors in self._factors[key].items()}
 
     def look(self, i: int) -> dict[str, NDArray[Any]]:
-        """Return the fields of a copy's model that vary and that pictures depend on, by name."""
+        """Return the varying fields of a copy's model that affect pictures, by name."""
         return {name: values[i].copy() for name, values in self._visible.items()}

@@ -1,7 +1,7 @@
-"""What disturbs one environment: pushes, noise on what it observes, late observations and actions, lost samples.
+"""Disturbances of one environment: pushes, sensor noise, delayed observations and actions, lost samples.
 
-For single, vector and batch environments, which each have one of these per environment; so the same declaration and
-seed give the same numbers in all of them.
+Single, vector and batch environments use one instance per environment, so the same declaration and seed give the same
+numbers in all of them.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from urlab_client.randomise.variation import draw_range, stream
 __all__ = ["Disturbances"]
 
 _NOISE, _PUSH, _LATE, _DROP = 1, 2, 3, 4
-"""First numbers of the streams of random numbers, beside `MODEL_STREAM`."""
+"""Keys of the random streams, besides `MODEL_STREAM`."""
 
 _SEED_END: Final = 2**31
-"""Seeds of episodes are below: servers may keep them in 32 bits."""
+"""Exclusive upper bound of episode seeds: servers may store them in 32 bits."""
 
 
 class Disturbances:
-    """What disturbs one environment, episode by episode.
+    """Disturbances of one environment, drawn anew for each episode.
 
     Args:
-        declaration: What was declared.
+        declaration: The declaration.
         mapping: The articulations as spaces.
-        n_task: Numbers that a task adds to an observation.
+        n_task: Length of what a task adds to an observation.
 
     Raises:
-        ValueError: Noise is declared on what is not observed.
+        ValueError: Noise is declared on a field that is not observed.
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
@@ -54,10 +54,10 @@ class Disturbances:
         self._late_actions = 0
 
     def begin(self, rng: np.random.Generator) -> int:
-        """Draw an episode, and return its seed.
+        """Draw the disturbances of an episode and return its seed.
 
         Args:
-            rng: The environment's generator, which the seed comes from.
+            rng: The environment's generator, which draws the seed.
         """
         self.seed: int = int(rng.integers(_SEED_END))
         seed = self.seed
@@ -80,14 +80,14 @@ class Disturbances:
         return seed
 
     def delayed(self, action: Any) -> Any:
-        """Return the action that has effect now: one of some time ago, or zero set-points."""
+        """Return the action that takes effect now: an earlier action, or zero set-points."""
         if not self._late_actions:
             return action
         self._actions.append(_copied(action))
         return self._actions.popleft() if len(self._actions) > self._late_actions else _zero(action)
 
     def forces(self) -> dict[str, Floats]:
-        """Return the forces on bodies during the next action, N, world frame, shape (3,); go on to the one after."""
+        """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""
         found: dict[str, Floats] = {}
         for schedule in self._pushes:
             force = schedule.advance()
@@ -96,10 +96,10 @@ class Disturbances:
         return found
 
     def seen(self, truth: Observation) -> Observation:
-        """Return what is seen of an observation. Pictures have a latency of their own, and stay.
+        """Return an observation with noise, delay and lost samples. Pictures have their own latency and are unchanged.
 
         Args:
-            truth: The next observation of the episode, of this environment alone; not changed.
+            truth: The next observation of the episode, of this environment only. It is not modified.
         """
         sample = _copied(truth)
         for noise, targets, (generator, biases) in zip(
@@ -122,14 +122,16 @@ class Disturbances:
         return shown
 
     def _noisy(self, noise: Noise) -> list[tuple[str, Field]]:
-        """Return which fields of which articulations noise is on."""
+        """Return the articulations and fields to which noise is added."""
         mapping = self._mapping
         if noise.field == "task":
             if not self._n_task:
                 raise ValueError("noise on task: the environment's task adds nothing to the observation")
             return [("", "task")]
         if noise.field not in mapping.fields:
-            raise ValueError(f"noise on {noise.field}, which is not observed: there are {', '.join(mapping.fields)}")
+            raise ValueError(
+                f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(mapping.fields)}"
+            )
         keys = [key for key in mapping.observed if fnmatch.fnmatchcase(key, noise.articulation)]
         if not keys:
             raise ValueError(f"noise on {noise.field}: no observed articulation is called {noise.articulation!r}")
@@ -143,14 +145,14 @@ class Disturbances:
         ]
 
     def _values(self, sample: Observation, key: str, field: Field) -> Floats:
-        """Return the view of what a target names."""
+        """Return the view of a target in a sample."""
         if field != "task":
             return self._mapping.field(sample, key, field)
         return sample["task"] if self._mapping.mode == "dict" else sample[-self._n_task :]
 
 
 class _PushSchedule:
-    """When one kind of push comes, and with what force."""
+    """Times and forces of one kind of push."""
 
     def __init__(self, push: Push, rng: np.random.Generator) -> None:
         self.push = push
@@ -160,7 +162,7 @@ class _PushSchedule:
         self._force: Floats = np.zeros(3)
 
     def advance(self) -> Floats | None:
-        """Return the force during the next action, None for no push."""
+        """Return the force during the next action, or None without a push."""
         if self._left == 0:
             if self._wait > 0:
                 self._wait -= 1
@@ -178,7 +180,7 @@ class _PushSchedule:
 
 
 def _copied(tree: Any) -> Any:
-    """Copy arrays in dictionaries; pictures, which nothing changes, are left out."""
+    """Copy arrays in dictionaries, without pictures, which are never modified."""
     if isinstance(tree, Mapping):
         entries = cast("Mapping[str, Any]", tree)
         return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}

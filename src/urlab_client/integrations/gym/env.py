@@ -40,25 +40,25 @@ _FALLBACK_FPS: Final = 50.0
 class URLabEnv(gymnasium.Env[Observation, Any]):
     """A Gymnasium environment over a discovered client in `direct` or `puppet` mode.
 
-    An action holds the set-points of all actuators, for `n_substeps` physics steps; an observation holds what
-    `observations` names (see `SpaceMapping`). `info` carries `step_count` (physics steps since the reset) and
-    `sim_time` (seconds), plain numbers that can be copied and pickled; live objects are attributes of the environment,
-    `env.unwrapped.articulations` for example.
+    An action holds the set-points of all actuators for `n_substeps` physics steps. An observation holds the fields
+    that `observations` names (see `SpaceMapping`). `info` contains `step_count` (physics steps since the reset) and
+    `sim_time` (seconds), plain numbers that can be copied and pickled. Live objects are attributes of the environment,
+    for example `env.unwrapped.articulations`.
 
-    A reset puts the simulation into its initial state, or into the keyframe that `options={"keyframe": NAME}` names,
-    clears the set-points, and with `reset_noise` moves joints by uniform noise, within their ranges. The noise is all
-    that depends on the seed. Physics is deterministic: the same seed and actions give the same observations, bit for
-    bit, on the same build of MuJoCo.
+    A reset returns the simulation to its initial state, or to the keyframe named by `options={"keyframe": NAME}`, and
+    clears the set-points. `reset_noise` then adds uniform noise to the joint positions, within the joint ranges. The
+    seed determines only this noise and what the task and `randomise` draw. Physics is deterministic: the same seed and
+    actions give the same observations, bit for bit, on the same build of MuJoCo.
 
-    `render_mode="rgb_array"` makes `render` return the frame of `render_camera`. It is drawn with each step, which
-    costs time; images never change the physics.
+    With `render_mode="rgb_array"`, `render` returns the frame of `render_camera`. Each step draws this frame, which
+    takes time. Images never affect the physics.
 
     Attributes:
         client: The client.
         task: The task, or None.
         randomise: What varies from episode to episode, or None.
-        reward_fn: The reward function, or None for rewards of 0.
-        termination_fn: The termination function, or None for episodes that never end by themselves.
+        reward_fn: The reward function. If None, rewards are 0.
+        termination_fn: The termination function. If None, episodes never terminate.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FALLBACK_FPS}  # noqa: RUF012 - Gymnasium's
@@ -86,33 +86,37 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
         Args:
             client: A client after `discover()`, during play.
-            space_mode: `flat` for one array, the default, `dict` for dictionaries by articulation and field.
+            space_mode: `flat` for one array (the default), or `dict` for dictionaries by articulation and field.
             observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
-                sequence of those fields. Where it is None, here and below, the task decides, or `standard`.
-            reward_fn: Called with the observation before, the action, the observation after, and `info`; 0 without.
-            termination_fn: Called with the observation after and `info`; episodes never end by themselves without.
-            max_episode_steps: Actions after which an episode is truncated; endless ones for None without a task.
+                sequence of those fields. If this or a later argument is None, the value of the task applies. Without
+                a task the default here is `standard`.
+            reward_fn: Function called with the observation before the action, the action, the observation after it,
+                and `info`. Without one, rewards are 0.
+            termination_fn: Function called with the observation after the action and `info`. Without one, episodes
+                never terminate.
+            max_episode_steps: Actions after which an episode is truncated. None without a task means no limit.
             cameras: Cameras whose frames are part of the observation, under `cameras`, as `ARTICULATION/CAMERA` or as
-                the name of a scene-level one; with `space_mode="dict"` only.
-            n_substeps: Physics steps per action; 1 for None without a task.
+                the name of a scene-level camera. Requires `space_mode="dict"`.
+            n_substeps: Physics steps per action; 1 by default without a task.
             render_mode: None or `rgb_array`.
-            render_camera: Camera that `render` shows; the first one of the scene by default.
-            reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints alone. A
-                joint stays within its range. No noise for None without a task.
-            keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
-            task: What the robot is to do: where episodes start, after `keyframe` and `reset_noise`, rewards and ends.
+            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
+            reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints only. A
+                joint stays within its range. None without a task means no noise.
+            keyframe: Keyframe in which episodes start unless `reset` names another; the initial state by default.
+            task: What the robot is to do. It sets rewards and episode ends, and may change the start that `keyframe`
+                and `reset_noise` give.
             randomise: What varies from episode to episode, and what disturbs sensors and actuators: a
-                `Randomisation`, or its TOML file. Most quantities of the model need a server that varies them; see
-                `connect`. On another one gravity, the start, and gains of PD controllers vary by ops, until `close()`.
-                What the server says that it varies, for None.
-            owns_client: Close the client with the environment.
+                `Randomisation`, or the path of its TOML file. Most model quantities need a server that varies them;
+                see `connect`. On other servers, ops vary gravity, the start and the gains of PD controllers until
+                `close()`. If None, the server's own declaration applies.
+            owns_client: Whether `close` also closes the client.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode, or the server varies something
-                else than `randomise` does.
-            UnsupportedRandomisation: The server varies nothing by itself, and has no op for what `randomise` varies.
-            KeyError: An unknown camera, or body to push.
-            ValueError: An option out of range, or rendering of a scene without a camera.
+            URLabError: The client has no model or no articulation, the client is in live mode, or the server varies
+                its scene differently from `randomise`.
+            UnsupportedRandomisation: The server varies nothing itself and has no op for what `randomise` varies.
+            KeyError: A camera or a body to push is unknown.
+            ValueError: An option is out of range, or the scene has no camera to render.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
@@ -157,16 +161,16 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
     @classmethod
     def connect(cls, address: str, *, client_options: Mapping[str, Any] = MappingProxyType({}), **options: Any) -> Self:
-        """Make an environment over a client of its own, in `direct` mode, which closes with it.
+        """Make an environment that creates its own client in `direct` mode and closes it.
 
         Args:
-            address: Where the robots are. A server that is started for a `sim://` address honours the model's
-                `<option>`, unless the address says `?no-mjcf-options`, and varies what `randomise` says.
+            address: Address of the server. A server started for a `sim://` address honours the model's `<option>`,
+                unless the address contains `?no-mjcf-options`, and varies what `randomise` declares.
             client_options: Further options of the client.
             options: Arguments of `URLabEnv`.
 
         Raises:
-            URLabError: The server cannot be reached, or has no articulation.
+            URLabError: The server cannot be reached or has no articulation.
         """
         if address.startswith(SCHEME) and options.get("randomise") is not None:
             declared = options["randomise"] = Randomisation.of(options["randomise"])
@@ -200,11 +204,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """Start an episode.
 
         Args:
-            seed: Seeds the noise; None goes on with the present generator.
+            seed: Seed of everything that the episodes draw. None continues with the current generator.
             options: `keyframe`: name of the keyframe to start from.
 
         Raises:
-            ValueError: An unknown option.
+            ValueError: An option is unknown.
             UnknownKeyframe: No keyframe, or more than one, has this name.
         """
         super().reset(seed=seed)
@@ -215,15 +219,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self._elapsed = 0
         info = self._info()
         if self.task is not None:
-            self._tell_success(self.task, self._episode.states(), info)
+            self._add_success(self.task, self._episode.states(), info)
         return self._seen(), info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for `n_substeps` physics steps.
+        """Apply an action for `n_substeps` physics steps.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no reset yet.
-            ValueError: The action does not fit; nothing was sent.
+            gymnasium.error.ResetNeeded: `reset` has not been called yet.
+            ValueError: The action has the wrong shape or is not finite. Nothing was sent.
         """
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
@@ -231,7 +235,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         forces: dict[str, Floats] = {}
         given, disturbances = action, self._disturbances
         if disturbances is not None:
-            self.mapping.set_points(action)  # refuses before anything is drawn
+            self.mapping.set_points(action)  # validates before anything is drawn
             given, forces = disturbances.delayed(action), disturbances.forces()
         after = self._observation = portal_of(self.client).call(self._episode.step, given, forces)
         self._elapsed += 1
@@ -244,9 +248,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         return self._seen(), reward, terminated, truncated, info
 
     def draws(self) -> dict[str, Any] | None:
-        """Return what was drawn for the episode, as plain data: `seed`, and under `varied` what was drawn for what.
+        """Return the values drawn for the episode, as plain data: `seed`, and under `varied` the draws by quantity.
 
-        None where nothing varies, and before the first reset.
+        None if nothing varies, and before the first reset.
         """
         return self._episode.draws()
 
@@ -254,7 +258,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """Return the frame of the last reset or step, shape (H, W, 3), RGB; None without a render mode.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no reset yet.
+            gymnasium.error.ResetNeeded: `reset` has not been called yet.
         """
         if not self._rendered:
             gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
@@ -265,7 +269,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         return picture
 
     def close(self) -> None:
-        """Close the client, if it was made for this environment; put back what this one varied on its server."""
+        """Undo what this environment varied on the server, and close the client if the environment owns it."""
         with contextlib.suppress(URLabError):  # the client may be closed already
             portal_of(self.client).call(self._episode.close)
         if self._owns_client:
@@ -281,12 +285,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             actions = {key: np.asarray(action[key])[None] for key in action}
         reward, terminated = float(task.reward(states, actions)[0]), bool(task.terminated(states)[0])
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        self._tell_success(task, states, info)
+        self._add_success(task, states, info)
         if terminated or truncated:
             task.ended(info.get("success", False), self._elapsed)
         return self._seen(), reward, terminated, truncated, info
 
-    def _tell_success(self, task: Task, states: States, info: dict[str, Any]) -> None:
+    def _add_success(self, task: Task, states: States, info: dict[str, Any]) -> None:
         success = task.success(states)
         if success is not None:
             info["success"] = bool(success[0])
@@ -303,12 +307,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:
-    """Return the keyframe that the options of a reset name.
+    """Return the keyframe named in the options of a reset.
 
     Raises:
-        ValueError: An unknown option.
+        ValueError: An option is unknown.
     """
     unknown = set(options or {}) - {"keyframe"}
     if unknown:
-        raise ValueError(f"unknown reset options {', '.join(sorted(unknown))}; there is 'keyframe'")
+        raise ValueError(f"unknown reset options {', '.join(sorted(unknown))}; the only option is 'keyframe'")
     return None if options is None else options.get("keyframe")

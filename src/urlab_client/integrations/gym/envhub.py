@@ -1,4 +1,4 @@
-"""Environments as LeRobot takes them: for the `env.py` of a repository on its EnvHub. Needs no LeRobot."""
+"""Environments in LeRobot's format, for the `env.py` of a repository on its EnvHub. Does not need LeRobot."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["ForLeRobot", "vector_env"]
 
 
 class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any]):
-    """A `URLabEnv` with the spaces and names of LeRobot's environments, as `urlab convert` writes its datasets.
+    """A `URLabEnv` with the spaces and names of LeRobot's environments, matching the datasets of `urlab convert`.
 
-    Observations have `agent_pos`, the observed fields of all articulations one after the other, float32: with
-    `observations=["qpos"]` what datasets have as `observation.state`; with a task
-    that observes something `environment_state`; with cameras `pixels`, whose names are those of the dataset, such as
-    `arm.overview`. Actions are one array for all articulations. `info["is_success"]` says what the task does.
+    Observations contain `agent_pos`: the observed fields of all articulations, concatenated, float32. With
+    `observations=["qpos"]` it equals the `observation.state` of datasets. If the task observes something, observations
+    contain `environment_state`. With cameras they contain `pixels`, keyed by the names in the dataset, such as
+    `arm.overview`. Actions are one array for all articulations. `info["is_success"]` is the task's success.
 
     Attributes:
-        task: The id of the environment.
+        task: Id of the environment.
         task_description: What the robot is to do, in words.
     """
 
@@ -35,11 +35,11 @@ class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any
         """Wrap an environment.
 
         Args:
-            env: A `URLabEnv` with `space_mode="dict"`, perhaps in other wrappers.
+            env: A `URLabEnv` with `space_mode="dict"`, possibly inside other wrappers.
             description: What the robot is to do, in words.
 
         Raises:
-            ValueError: Its spaces are flat.
+            ValueError: The spaces of the environment are flat.
         """
         super().__init__(env)
         inner = cast("URLabEnv", env.unwrapped)
@@ -55,13 +55,13 @@ class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any
         self.observation_space = dict_space({key: _space_of(value) for key, value in empty.items()})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
-        """Start an episode; options that are LeRobot's own are left out."""
+        """Start an episode. LeRobot's own options are ignored."""
         own = {key: value for key, value in (options or {}).items() if not key.startswith("lerobot_")}
         observation, info = self.env.reset(seed=seed, options=own or None)
         return self._renamed(observation), {**info, "is_success": False}
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
-        """Act."""
+        """Apply an action."""
         parts = np.split(np.asarray(action), np.cumsum([*self._widths.values()])[:-1])
         by_key: Any = dict(zip(self._widths, parts, strict=True))
         observation, reward, terminated, truncated, info = self.env.step(by_key)
@@ -96,13 +96,13 @@ def vector_env(
 
     Args:
         env_id: Id of an environment of this package, such as `urlab/PushPictures-v0`, or of your own `URLabEnv`.
-        n_envs: How many.
-        asynchronous: Each in a process of its own, instead of all in this one; its server is one in both cases.
-        description: What the robot is to do, in words; the id for none.
+        n_envs: Number of environments.
+        asynchronous: Whether each environment runs in its own process. Each server is a separate process either way.
+        description: What the robot is to do, in words; `env_id` if empty.
         options: Further arguments of the environment.
 
     Returns:
-        A vector environment that resets in the step that ends an episode, as LeRobot's own do.
+        A vector environment that resets in the step that ends an episode, like LeRobot's own.
     """
     makers = [partial(_make, env_id, description or env_id, options)] * n_envs
     kind = AsyncVectorEnv if asynchronous else SyncVectorEnv

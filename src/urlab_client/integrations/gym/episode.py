@@ -1,4 +1,4 @@
-"""Episodes over one async client: what a single environment and each session of a vector environment do the same."""
+"""Episodes over one async client, shared by the single environment and the sessions of a vector environment."""
 
 from __future__ import annotations
 
@@ -41,24 +41,25 @@ __all__ = ["EnvEpisode", "client_camera", "client_defaults", "compiled_prefixes"
 
 
 def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return options of a client with those that environments choose otherwise than clients do.
+    """Return client options with the defaults of environments filled in.
 
-    They step, and another MuJoCo than the server's is no reason to refuse work: the client warns of that.
+    Environments step physics themselves. A MuJoCo version other than the server's does not stop them; the client only
+    warns about it.
     """
     return {"step_mode": "direct", "mujoco_version_check": False, **options}
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
-    """Return the fields meant by an observation level, or by their names.
+    """Return the fields of an observation level, or the given field names.
 
     Raises:
-        ValueError: An unknown level.
+        ValueError: The level is unknown.
     """
     if not isinstance(observations, str):
-        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping refuses unknown names
+        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
     if observations not in LEVELS:
         raise ValueError(
-            f"observations is {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
+            f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
         )
     return LEVELS[observations]
 
@@ -69,10 +70,10 @@ class EnvEpisode:
     Attributes:
         client: The client, discovered and in `direct` or `puppet` mode.
         mapping: Its articulations as spaces.
-        observation_space: That of the mapping, with `cameras` added where there are any.
-        frames: The last frames by camera, as they were asked for.
+        observation_space: Space of the mapping, with `cameras` added if cameras are observed.
+        frames: The last frame of each requested camera.
         randomise: What varies from episode to episode, or None.
-        over_wire: How that varies on a server that varies nothing by itself, or None.
+        over_wire: Variation by ops, for a server that varies nothing itself, or None.
     """
 
     def __init__(
@@ -85,27 +86,28 @@ class EnvEpisode:
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
     ) -> None:
-        """Describe the episodes of a client.
+        """Set up the episodes of a client.
 
         Args:
             client: The client.
-            settings: What the episodes are like.
-            rendered: Further cameras whose frames are to be in `frames`.
-            task: What chooses the start, and adds to observations; set up here if it is not yet.
-            randomise: What varies from episode to episode; what the server says that it varies, for None.
-            earlier: That of an earlier client of the server, in whose place this one is.
+            settings: Settings of the episodes.
+            rendered: Further cameras whose frames `frames` must hold.
+            task: Task that chooses the start and extends observations; set up here unless it already is.
+            randomise: What varies from episode to episode. If None, the server's own declaration applies.
+            earlier: Episodes of the earlier client that this client replaces.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode, or the server varies otherwise.
-            UnsupportedRandomisation: The server varies nothing by itself, and no op does that.
-            KeyError: An unknown camera.
-            ValueError: An option out of range.
+            URLabError: The client has no model or no articulation, the client is in live mode, or the server varies
+                its scene differently.
+            UnsupportedRandomisation: The server varies nothing itself, and no op does.
+            KeyError: A camera is unknown.
+            ValueError: An option is out of range.
         """
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(
-                "The client knows no articulation to act on.",
-                hint="Start play and call discover() first, with local_model=True.",
+                "The client has discovered no articulation to act on.",
+                hint="Start play, then call discover() with local_model=True.",
             )
         if client.step_mode not in (StepMode.DIRECT, StepMode.PUPPET):
             raise URLabError(
@@ -153,10 +155,10 @@ class EnvEpisode:
             self.observation_space = with_task(self.observation_space, task)
 
     def states(self) -> States:
-        """Return the present state as a task sees it, with n = 1.
+        """Return the current state in the form passed to tasks, with n = 1.
 
         Raises:
-            URLabError: There is no task, or no local data.
+            URLabError: The environment has no task, or the client has no local data.
         """
         data = self.client.data
         if self._task is None or data is None:
@@ -165,18 +167,18 @@ class EnvEpisode:
         return States(self._task.scene, qpos, qvel, np.array([data.time]), [self._goal])
 
     def draws(self) -> dict[str, Any] | None:
-        """Return what was drawn for the episode, as `EpisodeDraws.told` has it; None for nothing."""
+        """Return the values drawn for the episode, as in `EpisodeDraws.told`; None if nothing was drawn."""
         return None if self._draws is None else self._draws.told()
 
     async def reset(
         self, rng: np.random.Generator, keyframe: str | None = None, seed: int | None = None
     ) -> Observation:
-        """Reset the simulation and return the first observation; set-points become zero.
+        """Reset the simulation, set the set-points to zero and return the first observation.
 
         Args:
             rng: The environment's generator.
-            keyframe: Where to start, instead of where the settings say.
-            seed: Decides what varies; None where nothing does.
+            keyframe: Keyframe to start from instead of the one in the settings.
+            seed: Seed of what varies; None if nothing varies.
         """
         client = self.client
         keyframe = self._keyframe if keyframe is None else keyframe
@@ -201,7 +203,7 @@ class EnvEpisode:
         return self._observe()
 
     async def close(self) -> None:
-        """Leave a server that does not vary by itself as it was; nothing where it is gone."""
+        """Undo the variation by ops. If the server is gone, do nothing."""
         if self.over_wire is not None and self._draws is not None:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
@@ -211,15 +213,15 @@ class EnvEpisode:
 
         Args:
             action: The action.
-            forces: Pushes meanwhile, by body, N, world frame, shape (3,).
+            forces: Forces applied during the action, by body, N, world frame, shape (3,).
 
         Raises:
-            ValueError: The action does not fit; nothing was sent.
+            ValueError: The action has the wrong shape or is not finite. Nothing was sent.
         """
         return await self.act(self.mapping.set_points(action), forces)
 
     async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
-        """Do what `step` does, given the set-points of each articulation, shape (n_ctrl,)."""
+        """Step like `step`, given the set-points of each articulation, shape (n_ctrl,)."""
         for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
@@ -231,7 +233,7 @@ class EnvEpisode:
         return self._observe(reply)
 
     def _noisy_positions(self, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-        """Return the present joint positions with noise on them."""
+        """Return the current joint positions with noise added."""
         positions: dict[str, dict[str, float]] = {}
         for key in self.mapping.keys:
             articulation = self.client.articulations[key]
@@ -254,7 +256,7 @@ class EnvEpisode:
         return await self._place_changed(start.qpos)
 
     async def _start_over_wire(self) -> dict[str, Floats]:
-        """Vary the start where the server does not; return the positions of each articulation that moved."""
+        """Vary the start if the server does not; return the positions of each articulation that moved."""
         data = self.client.data
         if self.over_wire is None or self._draws is None or data is None:
             return {}
@@ -263,7 +265,7 @@ class EnvEpisode:
         return await self._place_changed(qpos)
 
     async def _place_joints(self, positions: Mapping[str, Mapping[str, float]]) -> dict[str, Floats]:
-        """Put hinge and slide joints somewhere; return the positions of each articulation that moved."""
+        """Set the positions of hinge and slide joints; return the positions of each articulation that moved."""
         data = self.client.data
         if data is None:
             return {}
@@ -275,7 +277,7 @@ class EnvEpisode:
         return await self._place_changed(qpos)
 
     async def _place_changed(self, qpos: Floats) -> dict[str, Floats]:
-        """Place the articulations whose part of the positions of the scene differs; return their positions."""
+        """Place the articulations whose positions in `qpos` differ from the scene's; return their positions."""
         data = self.client.data
         placed: dict[str, Floats] = {}
         for key in self.mapping.keys:
@@ -293,10 +295,10 @@ class EnvEpisode:
             await runtime.forward()
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
-        """Return whose a body is, and what it is called there.
+        """Return the articulation of a body, and the body's name in it.
 
         Raises:
-            KeyError: There is none of this name.
+            KeyError: The scene has no such body.
         """
         key, _, name = body.partition("/")
         articulation = self.client.articulations[key]
@@ -318,10 +320,10 @@ class EnvEpisode:
         overrides: Mapping[str, Mapping[str, float]] | None,
         placed: Mapping[str, Floats],
     ) -> None:
-        """Take the frames of the state as it is. Only a puppet step draws without integrating.
+        """Take the frames of the current state. Only a puppet step draws without integrating.
 
-        It leaves traces in the solver's warm start, so the reset is done once more: rollouts are the same with and
-        without cameras.
+        A puppet step changes the solver's warm start. The reset is therefore repeated, so that rollouts with and
+        without cameras are the same.
         """
         client, mode = self.client, self.client.step_mode
         if mode is not StepMode.PUPPET:
@@ -337,16 +339,16 @@ class EnvEpisode:
         for name, view in self._cameras.items():
             frame = view.latest_frame
             if name in self._latencies and not view.delivered and name in self.frames:
-                continue  # nothing is old enough yet: what was seen last stays
+                continue  # no frame is old enough yet: keep the last one
             if frame is None or not view.delivered:
                 raise URLabError(
                     f"The server sent no frame of camera {name!r}.",
-                    hint="`urlab doctor` says whether the server can draw.",
+                    hint="Run `urlab doctor` to check whether the server can draw.",
                 )
             self.frames[name] = frame
 
     def _observe(self, reply: StepOk | None = None) -> Observation:
-        """Return the present observation; what a step has just brought is taken from its reply."""
+        """Return the current observation. Values in the reply of a step take precedence."""
         states = {} if reply is None else reply.per_articulation
 
         def read(key: str, field: Field) -> Floats:
@@ -366,7 +368,7 @@ class EnvEpisode:
         return observation
 
     def rendered(self, name: str) -> NDArray[np.uint8] | None:
-        """Return what `render` shows of a camera, shape (H, W, 3), RGB; None without a picture of it."""
+        """Return the last picture of a camera for `render`, shape (H, W, 3), RGB; None if there is none yet."""
         frame = self.frames.get(name)
         return None if frame is None else to_rgb(frame, self._cameras[name].mode)
 
@@ -388,24 +390,24 @@ class EnvEpisode:
 
 
 def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisation | None) -> Randomisation | None:
-    """Return what varies: as asked for, or as the server says.
+    """Return what varies: the given declaration, or the server's own.
 
     Raises:
-        URLabError: The server varies something else by itself.
+        URLabError: The server has a different declaration of its own.
     """
     declared = declared_in(model)
     if randomise is None:
         return declared
     if declared is not None and declared != randomise:
         raise URLabError(
-            f"The server at {client.address} varies its scene in another way.",
-            hint="Leave `randomise` out, or start the server with `urlab serve --randomise FILE`.",
+            f"The server at {client.address} varies its scene differently.",
+            hint="Omit `randomise`, or start the server with `urlab serve --randomise FILE`.",
         )
     return randomise
 
 
 def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
-    """Return what compiled names begin with, by articulation."""
+    """Return the prefix of the compiled names of each articulation."""
     return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
 
 
@@ -413,7 +415,7 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name.
 
     Raises:
-        KeyError: There is no such camera.
+        KeyError: The camera does not exist.
     """
     key, slash, camera = name.partition("/")
     if slash:
@@ -422,10 +424,10 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
 
 
 def first_camera(client: URLabClient) -> str:
-    """Return the first camera that shows colours.
+    """Return the first colour camera.
 
     Raises:
-        ValueError: There is none.
+        ValueError: The scene has no colour camera.
     """
     for key, articulation in client.articulations.items():
         for name, view in articulation.cameras.items():

@@ -1,4 +1,4 @@
-"""Cameras of a batch that show what they saw some time ago, as a server's do."""
+"""Cameras of a batch with latency, which show an earlier state, like a server's cameras."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from urlab_client.server.render.latency import Instant, Latency
 __all__ = ["LateCameras"]
 
 _UNSEEN: Final = 0
-"""Number of a snapshot, which nobody asks for here."""
+"""Snapshot number; unused here."""
 
 
 class LateCameras:
-    """What the delayed cameras of all copies have seen. Each action is a moment at which they see.
+    """States recorded by the delayed cameras of all copies, one per action.
 
     Attributes:
-        names: The cameras that are delayed.
+        names: The delayed cameras.
     """
 
     def __init__(self, declared: Randomisation | None, cameras: Sequence[str]) -> None:
-        """Look up what is delayed.
+        """Look up the delayed cameras.
 
         Args:
-            declared: What varies; its latencies go by patterns, of which the last that fits counts.
-            cameras: Cameras that are observed.
+            declared: The declaration. Its latencies name cameras by pattern; the last matching pattern applies.
+            cameras: The observed cameras.
         """
         self._settings = {
             name: CameraDelayInForce(
@@ -44,25 +44,25 @@ class LateCameras:
         self._shown: dict[tuple[str, int], Floats] = {}
 
     def begin(self, i: int, seed: int, state: Floats) -> None:
-        """Begin an episode of a copy, whose cameras see its start at once.
+        """Begin an episode of a copy. Its cameras show the start without delay.
 
         Args:
-            i: The copy.
+            i: Index of the copy.
             seed: Seed of the jitter.
-            state: Its state, as numbers of any meaning.
+            state: State of the copy, an opaque array.
         """
         for name, settings in self._settings.items():
             self._latencies[name, i] = Latency(settings, seed)
             self._shown[name, i] = state
 
     def shown(self, name: str, i: int, time: float, state: Floats) -> Floats:
-        """Let a camera see the state of a copy, and return the state that it shows.
+        """Record the state of a copy for a camera, and return the state that the camera shows now.
 
         Args:
-            name: The camera.
-            i: The copy.
-            time: Its simulation time, seconds.
-            state: Its state.
+            name: Name of the camera.
+            i: Index of the copy.
+            time: Simulation time of the copy, seconds.
+            state: State of the copy.
         """
         latency, now = self._latencies[name, i], Instant(time, 0.0)
         if not latency.withholds:

@@ -1,4 +1,4 @@
-"""Pictures of a batch, whose simulations have no server that could draw them: this process does, as servers do."""
+"""Pictures of a batch. Its simulations have no server, so this process draws them in the same way."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from urlab_client.server.render.tints import Tints
 __all__ = ["VISIBLE", "BatchPictures", "PictureScene", "Visible"]
 
 _DEADLINE_S: Final = 30.0
-"""Longest wait for one picture after the one before; the first one includes the making of a context."""
+"""Longest wait for one picture after the previous one. The first picture includes creating the context."""
 
 _JOIN_S: Final = 1.0
 
 VISIBLE: Final = ("qpos", "mocap_pos", "mocap_quat")
-"""The part of the state of copies that pictures depend on, in MuJoCo's order."""
+"""Fields of the state that pictures depend on, in MuJoCo's order."""
 
 _STATE: Final = (
     mujoco.mjtState.mjSTATE_QPOS.value
@@ -53,8 +53,8 @@ class Visible:
     """What pictures of one copy depend on.
 
     Attributes:
-        state: The fields `VISIBLE` of `MjData`, flat, one behind the other.
-        look: Fields of the model that differ from the model as compiled, the same ones each time.
+        state: The fields `VISIBLE` of `MjData`, flattened and concatenated.
+        look: Fields that differ from the compiled model; the same fields each time.
     """
 
     state: Floats
@@ -67,8 +67,8 @@ class PictureScene:
 
     Attributes:
         model: The compiled scene.
-        cameras: Cameras that are to be drawn, as environments name them.
-        owners: By body id the articulation that it is of, by its actor name.
+        cameras: Cameras to draw, by the names that environments use.
+        owners: Actor name of the articulation that owns each body, by body id.
     """
 
     model: mujoco.MjModel
@@ -77,16 +77,16 @@ class PictureScene:
 
     @classmethod
     def of(cls, client: URLabClient, model: mujoco.MjModel, cameras: Sequence[str]) -> PictureScene:
-        """Return what a client knows of the scene.
+        """Return the scene of a client.
 
         Args:
-            client: After `discover()`.
-            model: Its model.
-            cameras: The cameras, as `ARTICULATION/CAMERA` or as the name of a scene-level one.
+            client: A client after `discover()`.
+            model: The client's model.
+            cameras: The cameras, as `ARTICULATION/CAMERA` or as the name of a scene-level camera.
 
         Raises:
-            KeyError: There is no such camera.
-            URLabError: The compiled scene does not have one that the server lists.
+            KeyError: A camera does not exist.
+            URLabError: The compiled scene lacks a camera that the server lists.
         """
         owners = {
             body.id: articulation.compiled_prefix
@@ -96,7 +96,7 @@ class PictureScene:
         return cls(model, {name: _camera(client, model, name) for name in cameras}, owners)
 
     def mode(self, camera: str) -> CameraMode:
-        """Return what a camera's pixels mean."""
+        """Return the mode of a camera."""
         return CameraMode(self.cameras[camera].mode)
 
     def space(self, camera: str) -> Space:
@@ -105,29 +105,29 @@ class PictureScene:
 
 
 class BatchPictures:
-    """Draws what cameras see in any states of a scene: the code, and so the pictures, are those of its server.
+    """Draws camera pictures of given states of a scene, with the same code, and so the same pixels, as its server.
 
-    A context of OpenGL belongs to a thread, so that this has one of its own; call it from whichever you like. More
-    threads would draw no faster where the processor draws: that uses all of it as it is.
+    An OpenGL context belongs to one thread, so this object draws in a dedicated thread; its methods may be called from
+    any thread. More threads would not speed up software rendering, which already uses all processors.
 
     Args:
         scene: The scene.
 
     Raises:
-        RenderingUnavailable: Nothing here can draw.
+        RenderingUnavailable: This machine cannot draw.
     """
 
     def __init__(self, scene: PictureScene) -> None:
         self._thread = _Thread(scene, need_backend())
-        forget = weakref.finalize(self, self._thread.stop)
-        forget.atexit = False  # the thread sees to that, before the driver ends
+        finalizer = weakref.finalize(self, self._thread.stop)
+        finalizer.atexit = False  # the thread registers its own exit hook, which must run before the driver's
 
     def draw(self, cameras: Sequence[str], copies: Sequence[Visible]) -> dict[str, list[Pixels]]:
-        """Return the pictures of some copies by camera, as `URLabCameraView.latest_frame` has them.
+        """Return the pictures of some copies by camera, in the format of `URLabCameraView.latest_frame`.
 
         Args:
             cameras: Names in `PictureScene.cameras`.
-            copies: What the copies look like.
+            copies: State and appearance of each copy.
 
         Raises:
             TimeoutError: A picture took too long.
@@ -136,7 +136,7 @@ class BatchPictures:
         try:
             pictures = [picture.result(_DEADLINE_S) for picture in drawn]
         except TimeoutError:
-            raise TimeoutError(f"no picture of the batch within {_DEADLINE_S:g} s") from None
+            raise TimeoutError(f"drawing a picture of the batch took longer than {_DEADLINE_S:g} s") from None
         finally:
             for picture in drawn:
                 picture.cancel()
@@ -164,12 +164,12 @@ class _Thread:
         return drawn
 
     def stop(self) -> None:
-        """Let the thread free what it draws with, and end."""
+        """Tell the thread to free its context and exit."""
         atexit.unregister(self.close)
         self._jobs.put(None)
 
     def close(self) -> None:
-        """Do what `stop` does, and wait a bounded time for it."""
+        """Stop the thread and wait for a limited time until it exits."""
         self.stop()
         self._thread.join(_JOIN_S)
 
@@ -183,14 +183,14 @@ class _Thread:
                 try:
                     if painter is None:
                         painter = _Painter(self._scene, self._backend, context)
-                        atexit.register(self.close)  # after the driver's own hook, so before it at the end
+                        atexit.register(self.close)  # registered after the driver's hook, so it runs before it
                     drawn.set_result(painter.paint(cameras, visible))
-                except BaseException as error:  # noqa: BLE001 - who asked for the pictures hears of it
+                except BaseException as error:  # noqa: BLE001 - the future raises it in the caller
                     drawn.set_exception(error)
 
 
 class _Painter:
-    """What draws in one thread."""
+    """Draws pictures in one thread."""
 
     def __init__(self, scene: PictureScene, backend: Backend, context: ExitStack) -> None:
         appearance = Appearance.of(scene.model)
@@ -217,8 +217,8 @@ def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamer
     """Return a camera as the server draws it.
 
     Raises:
-        KeyError: There is no such camera.
-        URLabError: The compiled scene does not have it.
+        KeyError: The camera does not exist.
+        URLabError: The compiled scene lacks the camera.
     """
     view = client_camera(client, name)
     key, slash, _ = name.partition("/")
@@ -228,4 +228,4 @@ def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamer
         short = compiled.removeprefix(prefix)
         if compiled.startswith(prefix) and view.name in (short, cleaned_name(short)):
             return SceneCamera(name=view.name, id=i, mode=str(view.mode), resolution=view.resolution, fovy=view.fovy)
-    raise URLabError(f"The compiled scene at {client.address} has no camera {name!r}, though the server lists it.")
+    raise URLabError(f"The compiled scene at {client.address} has no camera {name!r}, although the server lists it.")

@@ -1,4 +1,4 @@
-"""A vector environment as Stable-Baselines3 takes them. Needs the extra `sb3`."""
+"""A vector environment for Stable-Baselines3. Needs the extra `sb3`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Sb3VecEnv"]
 if TYPE_CHECKING:
 
     class _VecEnv:
-        """What is used of `VecEnv`."""
+        """The parts of `VecEnv` in use."""
 
         _seeds: list[int | None]
         reset_infos: list[dict[str, Any]]
@@ -39,21 +39,21 @@ Indices = None | int | Sequence[int]
 class Sb3VecEnv(_VecEnv):
     """A `URLabBatchEnv` or `URLabVectorEnv` for `PPO("MlpPolicy", Sb3VecEnv(env))`.
 
-    What an environment's `info` holds are the entries of `infos` at its index; at an episode's end also
-    `terminal_observation` and `TimeLimit.truncated`. An environment that failed ends its episode as truncated, with its
-    exception as `error`.
+    The `info` of an environment contains the entries of `infos` at its index and, at the end of an episode, also
+    `terminal_observation` and `TimeLimit.truncated`. If an environment fails, its episode ends as truncated, and `info`
+    contains the exception as `error`.
 
     Args:
-        env: The environment, made with `autoreset_mode=AutoresetMode.SAME_STEP`. It closes with this one.
+        env: The environment, made with `autoreset_mode=AutoresetMode.SAME_STEP`. Closing this object closes it.
 
     Raises:
-        ValueError: It has another autoreset mode.
+        ValueError: The environment has a different autoreset mode.
     """
 
     def __init__(self, env: Vectorized) -> None:
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
-                f"Stable-Baselines3 resets in the step that ends an episode: make the environment with "
+                "Stable-Baselines3 resets in the step that ends an episode: make the environment with "
                 f"autoreset_mode=AutoresetMode.SAME_STEP, not {env.autoreset_mode.name}"
             )
         self.env = env
@@ -73,7 +73,7 @@ class Sb3VecEnv(_VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Act; return observations, rewards, ends and an info for each environment."""
+        """Apply the stored actions; return observations, rewards, dones and one info per environment."""
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         ended = terminated | truncated
         each: list[dict[str, Any]] = []
@@ -92,7 +92,7 @@ class Sb3VecEnv(_VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return each environment's picture, None without a render mode."""
+        """Return the picture of each environment, None without a render mode."""
         pictures = cast("Any", self.env).render()
         return [None] * self.env.num_envs if pictures is None else list(pictures)
 
@@ -104,22 +104,22 @@ class Sb3VecEnv(_VecEnv):
         """Set an attribute for all environments, which share it.
 
         Raises:
-            ValueError: Only some are meant.
+            ValueError: `indices` does not name all environments.
         """
         if len(self._chosen(indices)) != self.env.num_envs:
-            raise ValueError(f"{attr_name} is one for all environments: leave indices out")
+            raise ValueError(f"all environments share {attr_name}: omit indices")
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any) -> list[Any]:
-        """Refuse: the environments have no methods of their own.
+        """Raise an error: the environments have no methods of their own.
 
         Raises:
             NotImplementedError: Always.
         """
-        raise NotImplementedError(f"{method_name}: call it on .env, which is all environments at once")
+        raise NotImplementedError(f"cannot call {method_name} per environment: call it on .env, for all environments")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
-        """Return False for each: nothing wraps them one by one."""
+        """Return False for each: the environments have no individual wrappers."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: Indices) -> Sequence[int]:
@@ -129,9 +129,9 @@ class Sb3VecEnv(_VecEnv):
 
 
 def _info(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return what a vector environment says of one of its environments."""
-    said = {name: values for name, values in infos.items() if not name.startswith("_") and name not in _FINAL}
-    return {name: values[i] for name, values in said.items() if infos[f"_{name}"][i]}
+    """Return the infos of one environment of a vector environment."""
+    entries = {name: values for name, values in infos.items() if not name.startswith("_") and name not in _FINAL}
+    return {name: values[i] for name, values in entries.items() if infos[f"_{name}"][i]}
 
 
 _FINAL = {"final_obs", "final_info"}

@@ -1,4 +1,4 @@
-"""Tasks on the bundled robots: reaching a place, pushing a block, walking as told; and two whose goal never varies."""
+"""Tasks on the bundled robots: reach a target, push a block, follow a velocity, and two tasks with a fixed goal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ UPRIGHT: Final = 0.5
 
 
 class FixedReach(Task):
-    """The arm holds its hand at `TARGET_M`, always the same place; the reward is minus the distance in metres."""
+    """The arm holds its hand at the fixed target `TARGET_M`. The reward is the negative distance in metres."""
 
     TARGET_M: Final = np.array([0.35, 0.2, 0.4])
 
@@ -39,9 +39,9 @@ class FixedReach(Task):
 
 
 class Run(Task):
-    """The quadruped goes along +x by torques, as fast as it can; an episode ends when it falls.
+    """The torque-controlled quadruped runs along +x as fast as it can. The episode terminates when it falls.
 
-    The reward is the speed of its trunk in m/s, plus half a point for standing, minus the effort.
+    The reward is the speed of the trunk in m/s, plus 0.5 while standing, minus a penalty on the torques.
     """
 
     scene_address: ClassVar[str] = "sim://quadruped"
@@ -60,10 +60,10 @@ class Run(Task):
 
 
 class Reach(Task):
-    """The arm holds its hand where it is told: somewhere in a box before it, another place in each episode.
+    """The arm holds its hand at a target, drawn for each episode from a box in front of the arm.
 
-    Observed besides the arm's positions and velocities: the target and the hand's distance to it, metres, world frame.
-    The reward is minus the distance, plus 1 within `CLOSE_M`, which is success.
+    Observations add to the arm's positions and velocities the target and the vector from the hand to it, metres, world
+    frame. The reward is the negative distance, plus 1 within `CLOSE_M`, which is success.
     """
 
     LOW_M: Final = np.array([0.25, -0.25, 0.25])
@@ -101,11 +101,11 @@ class Reach(Task):
 
 
 class Push(Task):
-    """The arm pushes a block on the floor to a place that it is told.
+    """The arm pushes a block on the floor to a target, drawn for each episode.
 
-    Observed besides positions and velocities of arm and block: the target, x and y in metres, world frame. The reward
-    is minus the block's distance from it and a fifth of the hand's distance from the block, plus 1 within `CLOSE_M`,
-    which is success.
+    Observations add to the positions and velocities of arm and block the target, x and y in metres, world frame. The
+    reward is minus the block's distance from the target, minus a fifth of the hand's distance from the block, plus 1
+    within `CLOSE_M`, which is success.
     """
 
     CLOSE_M: Final = 0.04
@@ -145,7 +145,7 @@ class Push(Task):
 
 
 class PushPictures(Push):
-    """`Push` by sight: the block is seen in pictures of the camera `arm/overview` alone."""
+    """`Push` by sight: only the pictures of the camera `arm/overview` show the block."""
 
     scene_address: ClassVar[str] = f"{Push.scene_address}&camera-size=96x72"
     space_mode: ClassVar[SpaceMode] = "dict"
@@ -154,11 +154,11 @@ class PushPictures(Push):
 
 
 class Walk(Task):
-    """The quadruped walks with the velocity it is told: ahead, to the left and turning, drawn anew for each episode.
+    """The quadruped follows a velocity command (forward, left and yaw rate), drawn for each episode.
 
-    Its PD controller holds joint targets, which actions are. Observed besides its positions and velocities: the
-    command, m/s and rad/s, base frame. The reward is between 0 and 1.5 and counts how well the command is followed; an
-    episode ends when the robot falls. Success is to follow the command within `CLOSE`.
+    Actions are joint targets of its PD controller. Observations add the command, m/s and rad/s, base frame, to the
+    positions and velocities. The reward, between 0 and 1.5, measures how closely the robot follows the command. The
+    episode terminates when the robot falls. Success means that the velocity error is below `CLOSE`.
     """
 
     LOW: Final = np.array([-0.2, -0.1, -0.4])
@@ -195,10 +195,10 @@ class Walk(Task):
         return np.linalg.norm(self._moves(states) - states.goal["command"], axis=1) < self.CLOSE
 
     def _moves(self, states: States) -> Floats:
-        """Return the velocity ahead and to the left, and the rate of turn, base frame, shape (n, 3)."""
+        """Return the forward and leftward velocity and the yaw rate, base frame, shape (n, 3)."""
         w, x, y, z = states.body_quaternion("quadruped/trunk").T
         heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
-        velocity = states.velocities("quadruped")  # of a free joint: linear in the world's frame, angular in its own
+        velocity = states.velocities("quadruped")  # free joint: linear in the world frame, angular in the body frame
         ahead = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
         left = velocity[:, 1] * np.cos(heading) - velocity[:, 0] * np.sin(heading)
         return np.stack([ahead, left, velocity[:, 5]], axis=1)

@@ -1,4 +1,4 @@
-"""What an agent sees and does: articulations as Gymnasium spaces, flat or as dictionaries, single or in batches."""
+"""Observation and action spaces: articulations as Gymnasium spaces, flat or as dictionaries, single or in batches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SpaceMode = Literal["flat", "dict"]
 Field = Literal["qpos", "qvel", "ctrl", "act", "sensors"]
 Space = spaces.Space[Any]
 Observation = Any
-"""An array of shape (…, n) in flat mode, else a dictionary of arrays by articulation and field."""
+"""An array of shape (…, n) in flat mode, otherwise a dictionary of arrays by articulation and field."""
 
 FIELDS: Final[tuple[Field, ...]] = get_args(Field)
 LEVELS: Final[Mapping[str, tuple[Field, ...]]] = {"minimal": ("qpos", "qvel"), "standard": FIELDS}
@@ -52,17 +52,17 @@ class _Articulation:
 
 
 class SpaceMapping:
-    """How the articulations of a scene map to an action space and an observation space.
+    """Mapping of the articulations of a scene to an action space and an observation space.
 
-    Actions are the set-points in `ctrl_array`, float32 as Gymnasium's own MuJoCo environments have them; their bounds
-    are the actuators' `ctrlrange`, infinite without one. An articulation without actuators, such as a block to push,
-    has none. Observations are float64 and unbounded: joints may overshoot
-    their ranges. Articulations come in the order of their keys in `client.articulations`, fields in the order asked
-    for. The flat spaces are the concatenation of the dictionaries' entries in that order.
+    Actions are the set-points in `ctrl_array`, float32 as in Gymnasium's own MuJoCo environments. Their bounds are the
+    actuators' `ctrlrange`, or infinite without one. An articulation without actuators, such as a block to push, has no
+    actions. Observations are float64 and unbounded, because joints may overshoot their ranges. Articulations follow
+    the order of their keys in `client.articulations`; fields follow the requested order. The flat spaces concatenate
+    the dictionaries' entries in that order.
 
     Attributes:
         keys: Articulation keys, in order.
-        observed: Those of them that are observed.
+        observed: Keys of the observed articulations.
         fields: Observed fields, in order.
         mode: `flat` or `dict`.
         action_space: `Box(n,)`, or `Dict` of one `Box` per articulation.
@@ -81,13 +81,13 @@ class SpaceMapping:
 
         Args:
             model: The scene.
-            prefixes: Keys of the articulations, and what the names of their elements in the model begin with.
-            fields: What to observe.
+            prefixes: Prefix of the compiled element names of each articulation, by key.
+            fields: Fields to observe.
             mode: `flat` or `dict`.
-            observed: Keys of the articulations that are observed; all for None.
+            observed: Keys of the articulations to observe, or None for all.
 
         Raises:
-            ValueError: An unknown field, mode or articulation, or nothing to observe.
+            ValueError: A field, the mode or an articulation is unknown, or there is nothing to observe.
         """
         unknown = [field for field in fields if field not in FIELDS]
         if unknown or not fields:
@@ -98,7 +98,7 @@ class SpaceMapping:
         self.observed: tuple[str, ...] = self.keys if observed is None else tuple(observed)
         if missing := set(self.observed) - set(self.keys):
             raise ValueError(
-                f"no articulation {', '.join(sorted(missing))} to observe; there are: {', '.join(self.keys)}"
+                f"cannot observe {', '.join(sorted(missing))}; the articulations are: {', '.join(self.keys)}"
             )
         self.fields: tuple[Field, ...] = tuple(fields)
         self.mode: SpaceMode = mode
@@ -113,22 +113,22 @@ class SpaceMapping:
         self.observation_space: Space = self._make_observation_space()
 
     def layout(self, key: str) -> ArticulationLayout:
-        """Return where an articulation's values live in the compiled model."""
+        """Return the layout of an articulation's values in the compiled model."""
         return self._parts[key].layout
 
     def width(self, key: str, field: Field) -> int:
-        """Return how many numbers a field of an articulation has."""
+        """Return the length of a field of an articulation."""
         return self._parts[key].widths[field]
 
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
-        """Return the hinge and slide joints of an articulation: those whose position is one number."""
+        """Return the names of the hinge and slide joints of an articulation: joints with a scalar position."""
         return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
 
     def set_points(self, action: Any) -> dict[str, Floats]:
         """Return the set-points of each articulation, shape (…, n_ctrl), from an action.
 
         Raises:
-            ValueError: The action has another shape, or holds NaN or infinity.
+            ValueError: The action has the wrong shape, or contains NaN or infinity.
         """
         if self.mode == "dict":
             if set(action) != set(self._driven):
@@ -145,7 +145,7 @@ class SpaceMapping:
             if values.ndim == 0 or values.shape[-1] != n_ctrl:
                 raise ValueError(f"the action of {key} has shape {values.shape}; its last axis must be {n_ctrl} long")
             if not np.isfinite(values).all():
-                raise ValueError(f"the action of {key} holds NaN or infinity: {values}")
+                raise ValueError(f"the action of {key} contains NaN or infinity: {values}")
         return found
 
     def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
@@ -157,17 +157,17 @@ class SpaceMapping:
     def field(self, observation: Observation, key: str, field: Field) -> Floats:
         """Return the view of one field in an observation of either mode, shape (…, n).
 
-        Reward and termination functions written with this and `[..., i]` serve single and vector environments.
+        Reward and termination functions that use this and `[..., i]` work with single and vector environments.
 
         Raises:
-            ValueError: The field, or the articulation, is not observed.
+            ValueError: The field or the articulation is not observed.
         """
         if field not in self.fields:
             raise ValueError(
                 f"{field!r} is not observed: the environment was made with observations={list(self.fields)!r}"
             )
         if key not in self.observed:
-            raise ValueError(f"{key!r} is not observed; there are: {', '.join(self.observed)}")
+            raise ValueError(f"{key!r} is not observed; the observed articulations are: {', '.join(self.observed)}")
         if self.mode == "dict":
             return observation[key][field]
         return observation[..., self._where[key, field]]
@@ -224,32 +224,32 @@ def _unbounded(n: int) -> Space:
 
 
 def dict_space(entries: Mapping[str, Space]) -> Space:
-    """Return the `Dict` of some spaces, in their order."""
+    """Return a `Dict` of spaces, in the given order."""
     return spaces.Dict(dict(entries))
 
 
 def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
-    """Return a mapping's observation space with pictures, by camera, as its entry `cameras`.
+    """Return a mapping's observation space with an entry `cameras` that holds the pictures by camera.
 
     Raises:
-        ValueError: They have no room in it.
+        ValueError: The space is flat, or an articulation is named `cameras`.
     """
     if not cameras:
         return mapping.observation_space
     if mapping.mode != "dict":
-        raise ValueError("images do not fit into a flat observation: use space_mode='dict' with cameras")
+        raise ValueError("a flat observation cannot contain images: use space_mode='dict' with cameras")
     if "cameras" in mapping.keys:
-        raise ValueError("an articulation is called 'cameras', which is where images go: give it another actor id")
+        raise ValueError("an articulation is named 'cameras', which is the entry for images: give it another actor id")
     observed = cast("Mapping[str, Space]", mapping.observation_space)
     return dict_space({**observed, "cameras": dict_space(cameras)})
 
 
 def camera_space(mode: CameraMode | str, resolution: tuple[int, int]) -> Space:
-    """Return the space of `observed_pixels`: depths in metres, RGB as `render` has it, BGRA of segmentations.
+    """Return the space of `observed_pixels`: depth in metres, RGB as in `render`, or BGRA of segmentations.
 
     Args:
-        mode: What the pixels mean.
-        resolution: Width and height.
+        mode: Meaning of the pixels.
+        resolution: Width and height, pixels.
     """
     width, height = resolution
     if mode == CameraMode.DEPTH:

@@ -1,4 +1,4 @@
-"""Where episodes start: noise on joints, within their ranges and in their units."""
+"""Noise on joint positions at the start of episodes, within joint ranges and in joint units."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _SLIDE: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class ResetNoise:
-    """Largest deviation of joints at a reset. Where a joint has a range, it stays within it.
+    """Largest deviation of joints at a reset. A joint with a range stays within it.
 
     Attributes:
-        hinge: Of hinge joints, radians.
-        slide: Of slide joints, metres.
+        hinge: Largest deviation of hinge joints, radians.
+        slide: Largest deviation of slide joints, metres.
     """
 
     hinge: float = 0.0
@@ -53,16 +53,16 @@ class ResetNoise:
         scale = np.where(model.jnt_type[joints] == _SLIDE, self.slide, self.hinge)
         limited = model.jnt_limited[joints].astype(bool)
         lower, upper = model.jnt_range[joints].T
-        # A joint that is out of its range already, as after a keyframe, is not moved further out.
+        # A joint that is already outside its range, for example after a keyframe, must not move further out.
         low = np.where(limited, np.clip(positions - scale, np.minimum(lower, positions), None), positions - scale)
         high = np.where(limited, np.clip(positions + scale, None, np.maximum(upper, positions)), positions + scale)
         return rng.uniform(low, high)
 
 
 def noise_of(reset_noise: float | ResetNoise) -> ResetNoise:
-    """Return noise as given; a number is for hinge joints, in radians, and leaves slide joints alone.
+    """Return a `ResetNoise` as given, or one made from a number, which applies to hinge joints only (radians).
 
     Raises:
-        ValueError: It is negative or not finite.
+        ValueError: The noise is negative or not finite.
     """
     return reset_noise if isinstance(reset_noise, ResetNoise) else ResetNoise(hinge=reset_noise)

@@ -1,4 +1,4 @@
-"""`Task`: what robots are to do, written once for single environments, servers and batches."""
+"""`Task`: starts, goals, rewards and ends of episodes, defined once for all kinds of environments."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ Bools = NDArray[np.bool_]
 
 
 class TaskScene:
-    """The compiled scene of a task, by the names that its models use: `ARTICULATION/NAME`.
+    """The compiled scene of a task. Elements are looked up by the names in their models: `ARTICULATION/NAME`.
 
     Attributes:
-        model: The compiled model; not to be changed.
+        model: The compiled model. Do not change it.
         mapping: Its articulations as spaces.
     """
 
@@ -51,7 +51,7 @@ class TaskScene:
         """Return the id of a `body`, `site`, `geom` or `joint`.
 
         Raises:
-            KeyError: There is none of this name.
+            KeyError: The scene has no such element.
         """
         known = self._ids.setdefault(kind, {n: i for i, n in enumerate(model_names(self.model, kind))})
         found = known.get(name, known.get(name.replace("/", "_", 1)))
@@ -60,13 +60,13 @@ class TaskScene:
         return found
 
     def geoms(self, name: str) -> NDArray[np.intp]:
-        """Return the geoms of a body, without those of its children, or one geom by its name.
+        """Return the ids of the geoms of a body, without those of its children, or the id of one geom.
 
         Args:
-            name: Of a body or a geom; where both have it the body's, and `geom:NAME` is the geom's.
+            name: Name of a body or a geom. If both have the same name, it means the body, and `geom:NAME` the geom.
 
         Raises:
-            KeyError: Neither has this name.
+            KeyError: No body or geom has this name.
         """
         if not name.startswith("geom:"):
             try:
@@ -81,8 +81,8 @@ class Start:
 
     Attributes:
         scene: The scene.
-        qpos: Positions of the whole scene, shape (nq,), as the keyframe or the model has them; written in place.
-        goal: What the episode is about, by name: numbers or arrays of one shape for all episodes.
+        qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write in place.
+        goal: Goal of the episode, by name: numbers or arrays whose shape is the same in all episodes.
     """
 
     def __init__(self, scene: TaskScene, qpos: Floats) -> None:
@@ -91,16 +91,16 @@ class Start:
         self.goal: dict[str, Floats] = {}
 
     def joint(self, name: str, position: float) -> None:
-        """Set a hinge or slide joint, radians or metres."""
+        """Set the position of a hinge joint (radians) or slide joint (metres)."""
         self.qpos[self.scene.model.jnt_qposadr[self.scene.id("joint", name)]] = position
 
     def place(self, body: str, position: Sequence[float] | Floats, quaternion: Sequence[float] = (1, 0, 0, 0)) -> None:
         """Place a body that has a free joint.
 
         Args:
-            body: Its name.
-            position: Metres, world frame, shape (3,).
-            quaternion: (w, x, y, z), world frame.
+            body: Name of the body.
+            position: Position, metres, world frame, shape (3,).
+            quaternion: Orientation, (w, x, y, z), world frame.
 
         Raises:
             ValueError: The body has no free joint.
@@ -114,7 +114,7 @@ class Start:
         self.qpos[address + 3 : address + 7] = quaternion
 
     def noise(self, rng: np.random.Generator, key: str, noise: ResetNoise) -> None:
-        """Move the hinge and slide joints of an articulation at random, within their ranges."""
+        """Add random noise to the hinge and slide joints of an articulation, within their ranges."""
         model, mapping = self.scene.model, self.scene.mapping
         joints = mapping.layout(key).joints
         ids = np.array([joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
@@ -123,16 +123,16 @@ class Start:
 
 
 class States:
-    """The states of n environments, as a task sees them. Arrays have a leading axis of n.
+    """The states of n environments, as passed to a task. Arrays have a leading axis of n.
 
-    Poses belong to `qpos` as it is, also right after a step; they are computed when first asked for.
+    Poses always match `qpos`, also directly after a step. They are computed on first use.
 
     Attributes:
         scene: The scene.
         qpos: Positions of the whole scene, shape (n, nq).
         qvel: Velocities, shape (n, nv).
         time: Simulation time, seconds, shape (n,).
-        goal: What `Task.reset` put into `Start.goal`, each with a leading axis.
+        goal: Values that `Task.reset` put into `Start.goal`, each with a leading axis.
     """
 
     def __init__(
@@ -142,9 +142,8 @@ class States:
         self.qpos = qpos
         self.qvel = qvel
         self.time = time
-        known = next(
-            filter(None, goals), dict[str, Floats]()
-        )  # one that has had no episode yet has no goal: it shows another's
+        # An environment without an episode so far has no goal: its row repeats another environment's.
+        known = next(filter(None, goals), dict[str, Floats]())
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
@@ -153,29 +152,29 @@ class States:
         return len(self.qpos)
 
     def positions(self, key: str) -> Floats:
-        """Return the positions of an articulation, shape (n, its nq), as `qpos_array` has them."""
+        """Return the positions of an articulation, shape (n, its nq), in the order of `qpos_array`."""
         return self.qpos[:, self.scene.mapping.layout(key).qpos_adr]
 
     def velocities(self, key: str) -> Floats:
-        """Return the velocities of an articulation, shape (n, its nv), as `qvel_array` has them."""
+        """Return the velocities of an articulation, shape (n, its nv), in the order of `qvel_array`."""
         return self.qvel[:, self.scene.mapping.layout(key).qvel_adr]
 
     def body_position(self, name: str) -> Floats:
-        """Return where a body is, metres, world frame, shape (n, 3)."""
+        """Return the position of a body, metres, world frame, shape (n, 3)."""
         return self._poses["xpos"][:, self.scene.id("body", name)]
 
     def body_quaternion(self, name: str) -> Floats:
-        """Return a body's orientation, (w, x, y, z), world frame, shape (n, 4)."""
+        """Return the orientation of a body, (w, x, y, z), world frame, shape (n, 4)."""
         return self._poses["xquat"][:, self.scene.id("body", name)]
 
     def site_position(self, name: str) -> Floats:
-        """Return where a site is, metres, world frame, shape (n, 3)."""
+        """Return the position of a site, metres, world frame, shape (n, 3)."""
         return self._poses["site_xpos"][:, self.scene.id("site", name)]
 
     def touching(self, one: str, other: str | None = None) -> Bools:
-        """Return whether bodies or geoms touch, shape (n,); with one name, whether it touches anything.
+        """Return whether two bodies or geoms touch, shape (n,). With one name: whether it touches anything.
 
-        Names are those of `TaskScene.geoms`.
+        Names are resolved as in `TaskScene.geoms`.
         """
         first = self.scene.geoms(one)
         second = None if other is None else self.scene.geoms(other)
@@ -211,10 +210,10 @@ class States:
 
 
 def joined(parts: Sequence[States | None]) -> States:
-    """Return states of several environments as one. One that is not known, None, shows what the first known one does.
+    """Return the states of several environments as one. A missing state (None) repeats the first known one.
 
     Raises:
-        ValueError: None is known.
+        ValueError: All states are missing.
     """
     known = next((part for part in parts if part is not None), None)
     if known is None:
@@ -230,7 +229,7 @@ def joined(parts: Sequence[States | None]) -> States:
 
 
 def with_task(space: Space, task: Task | None) -> Space:
-    """Return an observation space with room for what a task adds: at the end, or as `task` in a dictionary."""
+    """Return an observation space extended by what a task observes: at the end, or as `task` in a dictionary."""
     if task is None or not task.n_observed:
         return space
     if isinstance(space, spaces.Dict):
@@ -243,7 +242,7 @@ def add_observed(observation: Observation, task: Task, observed: Floats) -> Obse
     """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes.
 
     Raises:
-        ValueError: It has another shape.
+        ValueError: `observed` has the wrong shape.
     """
     if observed.shape[-1:] != (task.n_observed,):
         raise ValueError(
@@ -257,29 +256,29 @@ def add_observed(observation: Observation, task: Task, observed: Floats) -> Obse
 
 
 def check_alone(task: Task | None, **others: object) -> None:
-    """Refuse functions that a task takes the place of.
+    """Reject reward and termination functions beside a task, which replaces them.
 
     Raises:
-        ValueError: Some are given beside a task.
+        ValueError: A task and one of the functions are both given.
     """
     given = [name for name, value in others.items() if value]
     if task is not None and given:
-        raise ValueError(f"a task settles {', '.join(given)}: override its method instead")
+        raise ValueError(f"{', '.join(given)} cannot be given together with a task: override the task's method instead")
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeSettings:
-    """What episodes are like: as the arguments of an environment say, else its task, else the defaults.
+    """Settings of episodes: the arguments of an environment, else the values of its task, else the defaults.
 
     Attributes:
-        observations: Observed fields or level.
+        observations: Observed fields, or an observation level.
         n_substeps: Physics steps per action.
-        max_episode_steps: Actions per episode, or None.
-        keyframe: Where episodes start; the initial state for None.
-        reset_noise: Largest deviation of joints from there.
+        max_episode_steps: Actions per episode, or None for no limit.
+        keyframe: Keyframe in which episodes start, or None for the initial state.
+        reset_noise: Largest deviation of joints from the start.
         space_mode: `flat` or `dict`.
         cameras: Cameras whose pictures are observed.
-        articulations: Articulations that are observed; all for None.
+        articulations: Articulations that are observed, or None for all.
     """
 
     observations: str | Sequence[str]
@@ -304,10 +303,10 @@ class EpisodeSettings:
         space_mode: SpaceMode | None,
         cameras: Sequence[str] | None = None,
     ) -> EpisodeSettings:
-        """Return the settings in force; None asks for those of the task, or the defaults.
+        """Return the effective settings. None selects the value of the task, or the default without a task.
 
         Raises:
-            ValueError: A number is below 1, or noise negative.
+            ValueError: A number is below 1, or the noise is negative.
         """
         defaults = _NO_TASK if task is None else task
         settings = cls(
@@ -331,25 +330,26 @@ _NO_TASK: Final = EpisodeSettings("standard", 1, None, None, ResetNoise(), "flat
 
 
 class Task:
-    """What robots are to do. Derive from it, and give an object of it to any of the environments.
+    """What robots are to do. Derive a class from it and pass an instance to any of the environments.
 
-    All methods but `reset` see n environments at once, n being 1 in a single one, and return arrays of n. An object
-    serves one environment, single or vector.
+    All methods except `reset` handle n environments at once and return arrays of length n; a single environment has
+    n = 1. An instance serves one environment, single or vector.
 
-    The arguments of an environment that have the names of attributes here win over these.
+    Arguments of an environment override the attributes of the same name here.
 
     Attributes:
-        scene_address: Where the scene comes from.
-        observations: Observed fields or level; see `URLabEnv`. What is judged does not depend on them.
-        n_observed: Numbers that `observe` adds to an observation.
+        scene_address: Address of the scene.
+        observations: Observed fields, or an observation level; see `URLabEnv`. Rewards, terminations and success do
+            not depend on them.
+        n_observed: Length of what `observe` adds to an observation.
         n_substeps: Physics steps per action.
-        max_episode_steps: Actions per episode, or None.
-        keyframe: Where episodes start before `reset` changes that; the initial state for None.
-        reset_noise: Largest deviation of joints from there, before `reset` changes that; see `URLabEnv`.
+        max_episode_steps: Actions per episode, or None for no limit.
+        keyframe: Keyframe in which episodes start before `reset` changes the start, or None for the initial state.
+        reset_noise: Largest deviation of joints from the start, before `reset` changes it; see `URLabEnv`.
         space_mode: `flat` or `dict`.
-        cameras: Cameras whose pictures are observed, which takes `dict`.
-        articulations: Articulations whose fields are observed; all for None.
-        scene: The scene, from `setup` on.
+        cameras: Cameras whose pictures are observed. Requires `dict`.
+        articulations: Articulations whose fields are observed, or None for all.
+        scene: The scene, available from `setup` on.
     """
 
     scene_address: ClassVar[str]
@@ -365,37 +365,37 @@ class Task:
     scene: TaskScene
 
     def setup(self, scene: TaskScene) -> None:
-        """Take note of the scene; called once, before anything else. Look names up here."""
+        """Store the scene. Called once, before any other method; look up names here."""
         self.scene = scene
 
     def reset(self, rng: np.random.Generator, start: Start) -> None:
-        """Choose where one episode starts and what it is about.
+        """Choose the start and the goal of one episode.
 
         Args:
-            rng: The environment's generator: all that may vary with the seed is drawn from it.
-            start: To be changed.
+            rng: The environment's random generator. Draw everything that depends on the seed from it.
+            start: The start, to be changed in place.
         """
 
     def observe(self, states: States) -> Floats:
-        """Return what an observation holds besides the fields, shape (n, n_observed): goals, commands."""
+        """Return what observations hold besides the fields, such as goals and commands, shape (n, n_observed)."""
         return np.zeros((len(states), self.n_observed))
 
     def reward(self, states: States, actions: Any) -> Floats:
-        """Return the rewards for the states that actions led to, shape (n,)."""
+        """Return the rewards for the states that the actions led to, shape (n,)."""
         raise NotImplementedError
 
     def terminated(self, states: States) -> Bools:
-        """Return which episodes end for good, shape (n,)."""
+        """Return which episodes terminate, shape (n,)."""
         return np.zeros(len(states), dtype=bool)
 
     def success(self, states: States) -> Bools | None:
-        """Return which states are a success, shape (n,): `success` in `info`. None for a task that knows none."""
+        """Return which states are a success, shape (n,); `info` has it as `success`. None if the task defines none."""
         return None
 
     def ended(self, success: bool, steps: int) -> None:
-        """Learn how an episode ended, for a curriculum: what `reset` draws from may depend on it.
+        """Handle the end of an episode. A curriculum can use it to adapt what `reset` draws.
 
         Args:
-            success: Whether its last state was a success.
-            steps: Actions it took.
+            success: Whether the last state of the episode was a success.
+            steps: Number of actions in the episode.
         """

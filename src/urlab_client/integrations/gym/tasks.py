@@ -27,22 +27,22 @@ TASKS: Final[dict[str, type[Task]]] = {
 
 
 def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
-    """Make the environment of a task over a client of its own, which it closes.
+    """Make the environment of a task. It creates its own client and closes it.
 
     Args:
         task_id: Key of `TASKS`.
-        address: Where the robot is; a simulated server of its own by default.
+        address: Address of the server; by default, a simulated server is started.
         options: Further arguments of `URLabEnv`.
 
     Raises:
-        URLabError: The server cannot be reached, or has no articulation.
+        URLabError: The server cannot be reached or has no articulation.
     """
     task = TASKS[task_id]()
     return URLabEnv.connect(address or task.scene_address, task=task, **options)
 
 
 def make_endless(task_id: str, **options: Any) -> URLabEnv:
-    """Make an environment that leaves it to Gymnasium to end episodes: `gymnasium.make(…, max_episode_steps=…)`."""
+    """Make an environment that leaves truncation to Gymnasium: `gymnasium.make(…, max_episode_steps=…)`."""
     return make(task_id, max_episode_steps=sys.maxsize, **options)
 
 
@@ -54,11 +54,12 @@ def make_vec(
     Args:
         task_id: Key of `TASKS`.
         num_envs: Number of environments.
-        backend: `servers` for a simulated server each, `batch` for physics in this process without a wire.
+        backend: `servers` for one simulated server per environment, `batch` for physics in this process without a
+            wire.
         options: Further arguments of `URLabVectorEnv` or `URLabBatchEnv`.
 
     Raises:
-        ValueError: An unknown backend.
+        ValueError: The backend is unknown.
         URLabError: A server cannot be started.
     """
     if backend not in ("servers", "batch"):
@@ -69,12 +70,12 @@ def make_vec(
 
 
 def register() -> None:
-    """Register the tasks with Gymnasium; again is without effect."""
+    """Register the tasks with Gymnasium. Calling it again has no effect."""
     for task_id, task in TASKS.items():
         if task_id not in gymnasium.registry:
             gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
                 task_id,
-                # As text, so that a specification can be stored: Minari keeps it with what it collects.
+                # A string, so that the specification can be serialised: Minari stores it with its datasets.
                 entry_point=f"{__name__}:{make_endless.__name__}",
                 vector_entry_point=f"{__name__}:{make_vec.__name__}",
                 max_episode_steps=task.max_episode_steps,

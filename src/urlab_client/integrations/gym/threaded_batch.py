@@ -1,7 +1,7 @@
-"""What `mujoco.batch` does for environments, for MuJoCo releases that are older than it.
+"""Substitute for `mujoco.batch` with MuJoCo releases that lack it.
 
-One `MjData` per simulation and Python's own threads: `mj_step` runs without the interpreter lock. Not `mujoco.rollout`,
-which does not return what warm-starts the next step, so that its results would differ from those of a server.
+It uses one `MjData` per simulation and Python threads; `mj_step` releases the GIL. `mujoco.rollout` is no alternative:
+it does not return the warm start of the next step, so its results would differ from a server's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ThreadedBatch:
     """Many simulations of one model.
 
     Args:
-        model: The model, shared by all until `expand`.
+        model: The model, shared by all simulations until `expand`.
         nsim: Number of simulations.
         nthread: Threads that step; 0 for one per processor.
     """
@@ -48,13 +48,13 @@ class ThreadedBatch:
             self.bind(name)
 
     def bind(self, name: str) -> NDArray[Any]:
-        """Return an `MjData` field of all simulations, shape (nsim, …). Writing to a part of the state has effect."""
+        """Return an `MjData` field of all simulations, shape (nsim, …). Writes to parts of the state take effect."""
         if name not in self._bound:
             self._bound[name] = np.array([np.copy(getattr(data, name)) for data in self._data])
         return self._bound[name]
 
     def expand(self, name: str) -> NDArray[Any]:
-        """Return a field of the model, with a value for each simulation, shape (nsim, …). Writing to it has effect."""
+        """Return a model field with a value for each simulation, shape (nsim, …). Writes to it take effect."""
         if name not in self._expanded:
             if self._models[0] is self._model:
                 self._models = [copy.copy(self._model) for _ in self._models]
@@ -62,7 +62,7 @@ class ThreadedBatch:
         return self._expanded[name]
 
     def set_const(self, ids: Indices) -> None:
-        """Compute the constants that follow from fields of the model, for some simulations."""
+        """Recompute the derived constants of the model, for some simulations."""
         for i in map(int, ids):
             model = self._varied(i)
             mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -70,7 +70,7 @@ class ThreadedBatch:
                 values[i] = field_of(model, name)
 
     def reset(self, ids: Indices, keyframe: int = -1) -> None:
-        """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""
+        """Reset some simulations to the model's defaults or a keyframe, and run forward dynamics."""
 
         def reset(model: mujoco.MjModel, data: mujoco.MjData) -> None:
             if keyframe < 0:
@@ -82,7 +82,7 @@ class ThreadedBatch:
         self._run(ids, reset, write=False)
 
     def forward(self, ids: Indices) -> None:
-        """Compute what follows from the state of some simulations."""
+        """Run forward dynamics for some simulations."""
         self._run(ids, mujoco.mj_forward)
 
     def step(self, ids: Indices, nstep: int = 1) -> None:
@@ -90,7 +90,7 @@ class ThreadedBatch:
         self._run(ids, lambda model, data: mujoco.mj_step(model, data, nstep))
 
     def _varied(self, i: int) -> mujoco.MjModel:
-        """Return the model of a simulation, brought up to the expanded fields."""
+        """Return the model of a simulation, updated from the expanded fields."""
         model = self._models[i]
         for name, values in self._expanded.items():
             field_of(model, name)[...] = values[i]

@@ -1,4 +1,4 @@
-"""`URLabVectorEnv`: several sessions, each with a server of its own, driven concurrently from one event loop."""
+"""`URLabVectorEnv`: several sessions, each with its own server, driven concurrently from one event loop."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ T = TypeVar("T")
 
 
 def _processors() -> int:
-    """Return how many servers may start at once: each keeps a processor busy until it is up."""
+    """Return how many servers may start at the same time: each occupies a processor until it is up."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
 class _Rendered:
-    """That pictures are drawn, and of which camera; the first one for None."""
+    """Request to draw pictures of a camera; None selects the first colour camera."""
 
     camera: str | None
 
 
 class _Session:
-    """One environment: its client, and what is needed to start it again."""
+    """One environment: its client, and the arguments for starting it again."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class _Session:
         self._earlier: EnvEpisode | None = None
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None, seed: int | None) -> Observation:
-        """Start an episode. Where there is no session, one is started, which goes on when this is cancelled."""
+        """Start an episode. Without a session, start one; cancelling this call does not stop that."""
         if self.episode is None:
             opening = self._opening or self.reopen()
             await asyncio.shield(opening)
@@ -78,20 +78,20 @@ class _Session:
         return await self.episode.reset(rng, keyframe, seed)
 
     async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
-        """Act."""
+        """Apply set-points and forces for one action."""
         if self.episode is None:
-            raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
+            raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
         return await self.episode.act(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
-        """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
+        """Drop the session and begin to start a new one, which the next reset waits for."""
         if self._opening is None:
             self._opening = asyncio.create_task(self._reopen(), name="urlab-environment")
             self._opening.add_done_callback(self._opened)
         return self._opening
 
     async def close(self) -> None:
-        """Give the client up."""
+        """Close the client."""
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait((self._opening,))
@@ -100,7 +100,7 @@ class _Session:
         await self._close_client()
 
     async def open(self) -> None:
-        """Start the session when it is its turn."""
+        """Start the session as soon as a start slot is free."""
         async with self._starts:
             client = URLabClient(with_model_options(self.address), **self._client_options)
             try:
@@ -127,19 +127,19 @@ class _Session:
     def _opened(self, task: asyncio.Task[None]) -> None:
         self._opening = None
         if not task.cancelled():
-            task.exception()  # a reset that waits gets it; without one the next reset tries again
+            task.exception()  # a waiting reset raises it; otherwise the next reset tries again
 
 
 class URLabVectorEnv(Vectorized):
     """Environments over several servers at once, in lockstep.
 
-    Every environment has a session, and with `sim://` a server process, of its own; requests of one step travel
-    concurrently from one event loop in a background thread. `infos` carries `step_count`, `sim_time` and `restarts`
-    as arrays, and `error` where something failed (see `Vectorized`). A failed or too slow environment loses its
-    client, and for `sim://` its server with it. New ones are started meanwhile, and the environment is back with the
-    first reset that finds them ready within `step_timeout`; the others are never held up for longer than that.
+    Each environment has its own session and, with `sim://`, its own server process. One event loop in a background
+    thread sends the requests of a step concurrently. `infos` contains `step_count`, `sim_time` and `restarts` as
+    arrays, and `error` after a failure (see `Vectorized`). An environment that fails or takes too long loses its
+    client, and with `sim://` its server. Replacements start in the background. The environment returns at the first
+    reset that finds them ready within `step_timeout`; it never delays the others for longer than that.
 
-    As many servers start at once as there are processors, so that many come up one after another.
+    At most one server per processor starts at the same time.
     """
 
     def __init__(
@@ -168,35 +168,35 @@ class URLabVectorEnv(Vectorized):
         """Start the sessions.
 
         Args:
-            addresses: One `sim://` address for all environments, or the address of each. Servers that are started
-                honour the model's `<option>`, unless an address says `?no-mjcf-options`.
-            num_envs: Number of environments; needed with one address only.
-            space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
+            addresses: One `sim://` address for all environments, or one address per environment. Servers started here
+                honour the model's `<option>`, unless the address contains `?no-mjcf-options`.
+            num_envs: Number of environments; required only with a single address.
+            space_mode: See `URLabEnv`.
             observations: See `URLabEnv`.
-            reward_fn: As for `URLabEnv`, with a leading axis of environments in all arguments and the result.
-            termination_fn: Likewise.
+            reward_fn: See `URLabEnv`. All arguments and the result have a leading axis of environments.
+            termination_fn: See `URLabEnv`. All arguments and the result have a leading axis of environments.
             max_episode_steps: See `URLabEnv`.
             cameras: See `URLabEnv`.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
             keyframe: See `URLabEnv`.
-            render_mode: None or `rgb_array`, with which every step draws a picture of each environment.
-            render_camera: Camera that `render` shows; the first one of the scene by default.
-            task: See `URLabEnv`. One object serves all environments.
+            render_mode: None or `rgb_array`. With `rgb_array`, every step draws a picture of each environment.
+            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
+            task: See `URLabEnv`. One instance serves all environments.
             randomise: See `URLabEnv`.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
-            step_timeout: Seconds an environment may take for a step or reset.
-            start_timeout: Seconds a server may take to start, each counted from its own start.
+            step_timeout: Longest time for a step or reset of one environment, seconds.
+            start_timeout: Longest time for the start of one server, seconds, counted from its own start.
             client_options: Further options of the clients.
 
         Raises:
-            URLabError: A session cannot be started; the message names its index.
-            ValueError: An option out of range, or environments whose spaces differ.
+            URLabError: A session cannot be started. The message names its index.
+            ValueError: An option is out of range, or the spaces of the environments differ.
         """
         if isinstance(addresses, str):
             if num_envs is None or not addresses.startswith(SCHEME):
                 raise ValueError(
-                    "one address needs num_envs, and to start servers with sim://; else list the addresses"
+                    "a single address needs num_envs and the scheme sim://; otherwise list one address per environment"
                 )
             addresses = [addresses] * num_envs
         if num_envs not in (None, len(addresses)) or not addresses:
@@ -258,12 +258,12 @@ class URLabVectorEnv(Vectorized):
         self._step_count = np.zeros(self.num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return each environment's picture of the last reset or step, shape (H, W, 3), RGB; None without a mode.
+        """Return the picture of each environment after the last reset or step, shape (H, W, 3), RGB.
 
-        An environment that failed shows its last picture, or black before its first.
+        An environment that failed shows its last picture, or black if it has none. None without a render mode.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no reset yet.
+            gymnasium.error.ResetNeeded: `reset` has not been called yet.
         """
         if self.render_mode is None:
             return None
@@ -277,7 +277,7 @@ class URLabVectorEnv(Vectorized):
         return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the clients, and the servers they started."""
+        """Close the clients and the servers that they started."""
         self._portal.close(self._close_all)
 
     async def _open_all(self) -> EnvEpisode:
@@ -289,7 +289,7 @@ class URLabVectorEnv(Vectorized):
         spaces = [(e.mapping.action_space, e.observation_space) for e in episodes]
         for i, pair in enumerate(spaces):
             if pair != spaces[0]:
-                raise ValueError(f"environment {i} at {self._addresses[i]} has other spaces than environment 0")
+                raise ValueError(f"environment {i} at {self._addresses[i]} has different spaces from environment 0")
         return episodes[0]
 
     async def _close_all(self) -> None:
@@ -316,7 +316,7 @@ class URLabVectorEnv(Vectorized):
         return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
 
     def draws(self, index: int) -> dict[str, Any] | None:
-        """Return what was drawn for the episode of an environment; see `URLabEnv.draws`."""
+        """Return the values drawn for the episode of an environment; see `URLabEnv.draws`."""
         episode = self._sessions[index].episode
         return None if episode is None else episode.draws()
 
@@ -353,7 +353,7 @@ class URLabVectorEnv(Vectorized):
         tasks = {i: asyncio.create_task(call()) for i, call in calls.items()}
         late: set[asyncio.Task[T]] = set()
         try:
-            # One deadline for all: one for each would be a tenth of what the client does.
+            # One deadline for all: a deadline per environment would cost a tenth of the client's work.
             await asyncio.wait(tasks.values(), timeout=self._step_timeout)
         finally:
             for task in tasks.values():
@@ -365,7 +365,7 @@ class URLabVectorEnv(Vectorized):
         results: dict[int, T | Exception] = {}
         for i, task in tasks.items():
             if task in late and task.cancelled():
-                what = "did not answer" if self._sessions[i].episode else "is still being started"
+                what = "did not answer" if self._sessions[i].episode else "is still starting"
                 results[i] = TimeoutError(f"environment {i} {what} within {self._step_timeout:g} s")
                 continue
             try:

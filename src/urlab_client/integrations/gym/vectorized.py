@@ -1,4 +1,4 @@
-"""What vector environments have in common: episodes that end one by one, rewards in one call, and autoreset."""
+"""Base of the vector environments: individually ending episodes, rewards in one call, and autoreset."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Found = tuple[Observation, Mapping[int, Exception]]
-"""Observations of some environments in a batch, and what failed, by index."""
+"""Batched observations of some environments, and the failures by index."""
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     """Base of vector environments.
 
-    Rewards and terminations of all environments are computed in one call, with a leading axis: the same functions
-    serve `URLabEnv` when they index with `[..., i]` (see `SpaceMapping.field`).
+    One call computes the rewards or terminations of all environments, with a leading axis. The same functions work
+    with `URLabEnv` if they index with `[..., i]` (see `SpaceMapping.field`).
 
-    An environment that fails is reported, not raised: `infos["error"]` holds the exception at its index, its
-    observation is the last one, it counts as truncated, and its next reset starts it afresh. The others go on.
+    A failing environment does not raise. `infos["error"]` holds the exception at its index, its observation is the
+    last one, it counts as truncated, and its next reset starts it again. The others continue.
 
     Attributes:
         mapping: The articulations as spaces.
         task: The task, or None.
         randomise: What varies from episode to episode, or None.
-        reward_fn: The reward function, or None for rewards of 0.
-        termination_fn: The termination function, or None for episodes that never end by themselves.
-        autoreset_mode: What happens to environments whose episode ended.
+        reward_fn: The reward function. If None, rewards are 0.
+        termination_fn: The termination function. If None, episodes never terminate.
+        autoreset_mode: When environments whose episode ended are reset.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
@@ -71,7 +71,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._disturbances: list[Disturbances] = []
         if randomise is not None:
             self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
-        self._blurred = randomise is not None and randomise.disturbs_observations
+        self._observations_disturbed = randomise is not None and randomise.disturbs_observations
         self.task = task
         self.num_envs = num_envs
         self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
@@ -84,7 +84,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.termination_fn = termination_fn
         self._max_episode_steps = max_episode_steps
         self._observations: Observation = create_empty_array(observation_space, num_envs)
-        self._sensed: Observation = create_empty_array(observation_space, num_envs) if self._blurred else None
+        self._sensed: Observation = None
+        if self._observations_disturbed:
+            self._sensed = create_empty_array(observation_space, num_envs)
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
@@ -97,15 +99,15 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     @abstractmethod
     def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
-        """Reset some environments into `_keyframe` and step others, given the set-points of all."""
+        """Reset some environments to `_keyframe` and step others, given the set-points of all."""
 
     @abstractmethod
     def _states(self, indices: Indices) -> States:
-        """Return the states of some environments as the task sees them."""
+        """Return the states of some environments in the form passed to the task."""
 
     @abstractmethod
     def _clocks(self) -> dict[str, NDArray[Any]]:
-        """Return what `infos` says of every environment, by name."""
+        """Return the entries of `infos` that every environment has, by name."""
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -113,17 +115,18 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Start an episode in all environments, or in some.
 
         Args:
-            seed: Environment i gets `seed + i`; a list names each one's; None goes on with the present generators.
+            seed: Seed of environment 0; environment i gets `seed + i`. A list gives one seed per environment. None
+                continues with the current generators.
             options: `keyframe`: name of the keyframe to start from, also for later autoresets; `reset_mask`: boolean
                 array of the environments to reset.
 
         Raises:
-            ValueError: An unknown option, or a mask or list of another length.
+            ValueError: An option is unknown, or the mask or list has the wrong length.
         """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ValueError(f"reset_mask needs {self.num_envs} booleans, one of them true")
+            raise ValueError(f"reset_mask needs {self.num_envs} booleans, at least one of them true")
         self._keyframe = keyframe_option(options)
         seeds = (
             [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
@@ -137,32 +140,33 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         errors = self._start(np.flatnonzero(mask))
         self._started = True
         infos = self._infos(errors)
-        self._tell_success(infos, np.flatnonzero(~self._ended))
-        return self._told(), infos
+        self._add_success(infos, np.flatnonzero(~self._ended))
+        return self._disturbed_observations(), infos
 
     def step(self, actions: Any) -> tuple[Observation, Floats, Bools, Bools, dict[str, Any]]:
-        """Act in all environments.
+        """Step all environments.
 
-        Those that ended in the step before are reset instead with `AutoresetMode.NEXT_STEP`: their reward is 0.
+        With `AutoresetMode.NEXT_STEP`, environments whose episode ended in the previous step are reset instead, and
+        their reward is 0.
 
         Raises:
-            gymnasium.error.ResetNeeded: There was no reset yet.
-            ValueError: The actions do not fit; nothing was sent.
+            gymnasium.error.ResetNeeded: `reset` has not been called yet.
+            ValueError: The actions have the wrong shape or are not finite. Nothing was sent.
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        set_points = self._set_points(actions)  # refuses before anything moves
+        set_points = self._set_points(actions)  # validates before anything moves
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
         fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
-        before = None if self.reward_fn is None else self._copied()
+        before = None if self.reward_fn is None else self._true_observations()
         self._begin(fresh)
         delayed = self._delayed(acting, actions)
         if delayed is not actions:
             set_points = self._set_points(delayed)
         started, moved = self._reset_and_step(fresh, acting, set_points)
         if len(fresh):
-            self._took(fresh, started)
+            self._store_reset(fresh, started)
         if len(acting):
             _put(self._observations, acting, moved[0])
             self._see(acting)
@@ -184,7 +188,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 self.task.ended(bool(successes[i]), int(self._elapsed[i]))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._same_step_reset(infos)
-        return self._told(), rewards, terminated, truncated, infos
+        return self._disturbed_observations(), rewards, terminated, truncated, infos
 
     @property
     def max_episode_steps(self) -> int | None:
@@ -192,7 +196,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return self._max_episode_steps
 
     def episode_seeds(self) -> NDArray[np.int64]:
-        """Return the seed of each environment's episode, which decides what varies; -1 where nothing does."""
+        """Return the seed of each environment's episode, from which all variation follows; -1 if nothing varies."""
         found = np.full(self.num_envs, -1, dtype=np.int64)
         found[: len(self._disturbances)] = [disturbances.seed for disturbances in self._disturbances]
         return found
@@ -200,10 +204,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     def _start(self, indices: Indices) -> Mapping[int, Exception]:
         self._begin(indices)
         found = self._reset_some(indices, self._keyframe)
-        self._took(indices, found)
+        self._store_reset(indices, found)
         return found[1]
 
-    def _took(self, indices: Indices, found: Found) -> None:
+    def _store_reset(self, indices: Indices, found: Found) -> None:
         observations, errors = found
         _put(self._observations, indices, observations)
         self._see(indices)
@@ -214,9 +218,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        after = None if self.reward_fn is None and self.termination_fn is None else self._copied()
+        after = None if self.reward_fn is None and self.termination_fn is None else self._true_observations()
         failed = infos.get("_error", np.zeros(self.num_envs, dtype=bool))
-        if self.task is not None and not failed.all():  # else there may be no state at all
+        if self.task is not None and not failed.all():  # otherwise no state may exist
             states = self._states(np.arange(self.num_envs))
             rewards[:], terminated[:] = self.task.reward(states, actions), self.task.terminated(states)
             success = self.task.success(states)
@@ -233,16 +237,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         ended = self._ended.copy()
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
-            final[i] = _pick(self._sensed if self._blurred else self._observations, int(i))
+            final[i] = _pick(self._sensed if self._observations_disturbed else self._observations, int(i))
         errors = self._start(np.flatnonzero(ended))
         after = self._infos({**_errors_in(infos), **errors})
         if "success" in infos:
             after["success"], after["_success"] = infos["success"].copy(), infos["_success"].copy()
-            self._tell_success(after, np.flatnonzero(ended))
+            self._add_success(after, np.flatnonzero(ended))
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
 
-    def _tell_success(self, infos: dict[str, Any], fresh: Indices) -> None:
-        """Add whether episodes that have just begun are a success as they stand: a reset tells what a step does."""
+    def _add_success(self, infos: dict[str, Any], fresh: Indices) -> None:
+        """Add the `success` of episodes that have just begun: a reset reports it as a step does."""
         success = self.task.success(self._states(fresh)) if self.task is not None and len(fresh) else None
         if success is None:
             return
@@ -276,24 +280,24 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 )
         return found
 
-    def _copied(self) -> Observation:
-        """Return the observations as they are, which rewards and ends are judged by."""
+    def _true_observations(self) -> Observation:
+        """Return the true observations, from which rewards and terminations are computed."""
         return _map(np.copy, self._observations)
 
-    def _told(self) -> Observation:
-        """Return the observations as they are seen."""
-        return _map(np.copy, self._sensed if self._blurred else self._observations)
+    def _disturbed_observations(self) -> Observation:
+        """Return the observations with all disturbances."""
+        return _map(np.copy, self._sensed if self._observations_disturbed else self._observations)
 
     def _begin(self, indices: Indices) -> None:
         for i, disturbances in self._disturbed(indices):
             disturbances.begin(self._rngs[i])
 
     def _see(self, indices: Indices) -> None:
-        for i, disturbances in self._disturbed(indices) if self._blurred else ():
+        for i, disturbances in self._disturbed(indices) if self._observations_disturbed else ():
             _put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
 
     def _delayed(self, indices: Indices, actions: Any) -> Any:
-        """Return the actions that have effect now; those of other environments are left as they are."""
+        """Return the actions that take effect now; those of other environments are unchanged."""
         if self.randomise is None or not self.randomise.delays_actions:
             return actions
         delayed = _map(np.array, actions)
@@ -302,22 +306,22 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return delayed
 
     def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
-        """Return the pushes during the next action by environment; those without one are left out."""
+        """Return the pushes during the next action, by environment; environments without a push are omitted."""
         if self.randomise is None or not self.randomise.push:
             return {}
         pushed = {i: disturbances.forces() for i, disturbances in self._disturbed(indices)}
         return {i: forces for i, forces in pushed.items() if forces}
 
     def _disturbed(self, indices: Indices) -> list[tuple[int, Disturbances]]:
-        """Return what disturbs some environments."""
+        """Return the disturbances of some environments."""
         return [(i, self._disturbances[i]) for i in indices.tolist()] if self._disturbances else []
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuse what is not a render mode.
+    """Check a render mode.
 
     Raises:
-        ValueError: It is neither None nor `rgb_array`.
+        ValueError: The mode is neither None nor `rgb_array`.
     """
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")

@@ -1,7 +1,7 @@
-"""What `mujoco.batch` does for environments, by MuJoCo Warp, for NVIDIA GPUs. Needs the extra `warp`.
+"""Substitute for `mujoco.batch` on MuJoCo Warp, for NVIDIA GPUs. Needs the extra `warp`.
 
-Resets are MuJoCo's own, in this process and in float64. Only steps are Warp's, in float32: the state of all copies goes
-to its device before an action and comes back after it.
+MuJoCo itself resets, in this process and in float64. Warp only steps, in float32: the state of all copies is copied to
+the device before an action and back after it.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class WarpBatch:
     """Many simulations of one model.
 
     Args:
-        model: The model, shared by all.
+        model: The model, shared by all simulations.
         nsim: Number of simulations.
-        contacts: Most contacts of a simulation at one time; MuJoCo Warp's own guess for 0.
-        constraints: Most rows of constraints of a simulation at one time; likewise.
+        contacts: Largest number of contacts in one simulation at any time; 0 for MuJoCo Warp's own estimate.
+        constraints: Largest number of constraint rows in one simulation at any time; 0 for MuJoCo Warp's own estimate.
 
     Raises:
         MissingExtra: MuJoCo Warp is not installed.
-        URLabError: MuJoCo Warp has not what the model uses.
+        URLabError: The model uses a feature that MuJoCo Warp lacks.
     """
 
     def __init__(self, model: mujoco.MjModel, nsim: int, contacts: int = 0, constraints: int = 0) -> None:
@@ -65,33 +65,33 @@ class WarpBatch:
             )
         except NotImplementedError as error:
             raise URLabError(
-                f"MuJoCo Warp cannot step this scene: {error}", hint="Leave `engine` out: MuJoCo itself can."
+                f"MuJoCo Warp cannot step this scene: {error}", hint="Omit `engine` to step it with MuJoCo itself."
             ) from error
 
     def bind(self, name: str) -> NDArray[Any]:
-        """Return an `MjData` field of all simulations, shape (nsim, …). Writing to a part of the state has effect.
+        """Return an `MjData` field of all simulations, shape (nsim, …). Writes to parts of the state take effect.
 
         Raises:
-            ValueError: It is not one of those that come back from the device.
+            ValueError: The field is not copied back from the device.
         """
         if name not in self._bound:
             if name not in {*_STATE, *_TAKEN}:
                 raise ValueError(
-                    f"{name} does not come back from MuJoCo Warp: there are {', '.join((*_STATE, *_TAKEN))}"
+                    f"{name} is not copied back from MuJoCo Warp; the fields are {', '.join((*_STATE, *_TAKEN))}"
                 )
             self._bound[name] = np.array([np.copy(getattr(self._data, name))])
         return self._bound[name]
 
     def expand(self, name: str) -> NDArray[Any]:
-        """Refuse a field of the model with a value for each simulation.
+        """Reject a model field with a value for each simulation.
 
         Raises:
             ValueError: Always.
         """
-        raise ValueError(f"with engine='warp' all copies have one model: {name} cannot vary among them")
+        raise ValueError(f"with engine='warp' all copies share one model: {name} cannot vary among them")
 
     def reset(self, ids: Indices, keyframe: int = -1) -> None:
-        """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""
+        """Reset some simulations to the model's defaults or a keyframe, and run forward dynamics."""
         if keyframe < 0:
             mujoco.mj_resetData(self._model, self._data)
         else:
@@ -101,7 +101,7 @@ class WarpBatch:
             values[ids] = getattr(self._data, name)
 
     def forward(self, ids: Indices) -> None:
-        """Compute what follows from the state of some simulations."""
+        """Run forward dynamics for some simulations."""
         for i in map(int, ids):
             for name in _STATE:
                 setattr(self._data, name, self._bound[name][i])
@@ -113,10 +113,12 @@ class WarpBatch:
         """Advance some simulations; the others stay as they are.
 
         Raises:
-            URLabError: The device's arrays have no room for the contacts or constraints of one; all stay as they were.
+            URLabError: A simulation has more contacts or constraints than the device's arrays can hold. No simulation
+                advanced.
         """
         for name in _STATE:
-            # Its arrays have the shapes of MuJoCo's with a leading axis; an empty one, as of no `act`, has no memory.
+            # Warp's arrays have MuJoCo's shapes with a leading axis. An empty array, such as a missing `act`, has no
+            # memory to assign to.
             if self._bound[name].size:
                 getattr(self._device, name).assign(self._bound[name].astype(np.float32))
         self._device.overflow.assign(np.zeros(len(self._bound["time"]), dtype=np.int32))
@@ -125,9 +127,9 @@ class WarpBatch:
         overflow = self._device.overflow.numpy()[ids]
         if overflow.any():
             raise URLabError(
-                f"Copies {', '.join(map(str, ids[overflow != 0][:8]))} have more contacts or constraints than there is "
-                "room for.",
-                hint="Give engine_options={'contacts': …, 'constraints': …}.",
+                f"Copies {', '.join(map(str, ids[overflow != 0][:8]))} have more contacts or constraints than the "
+                "arrays of MuJoCo Warp can hold.",
+                hint="Pass larger engine_options={'contacts': …, 'constraints': …}.",
             )
         for name in _TAKEN:
             if self._bound[name].size:

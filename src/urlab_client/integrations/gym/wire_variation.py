@@ -1,4 +1,4 @@
-"""Episodes that vary on a server that varies nothing by itself, such as an editor: by the ops of its protocol."""
+"""Variation by ops of the protocol, for servers that vary nothing themselves, such as an editor."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class _Controlled:
     controller: URLabPDController
     actuators: NDArray[np.intp]
     gains: dict[str, dict[str, float]]
-    """Without variation, by gain and actuator, in the order of `actuators`."""
+    """Unvaried gains, by gain and actuator, in the order of `actuators`."""
 
 
 class WireVariation:
-    """What varies, applied before and after the reset that starts an episode.
+    """Variation applied before and after the reset that starts an episode.
 
     Attributes:
-        variation: The numbers, the same as those of a server that varies by itself.
+        variation: The variation; it draws the same numbers as a server that varies its own scene.
         controlled: Controllers whose gains vary, by articulation.
     """
 
@@ -55,21 +55,21 @@ class WireVariation:
 
         Args:
             client: The client, after the handshake.
-            model: Its model.
-            layouts: Where the articulations are in the model, by key.
-            declared: What is to vary.
-            earlier: That of an earlier session with the server, which may have left gravity and gains varied; for None
-                the present ones are those without variation.
+            model: The client's model.
+            layouts: Layouts of the articulations in the model, by key.
+            declared: What varies.
+            earlier: The variation of an earlier session with the server, which may have left gravity and gains varied.
+                If None, the current gravity and gains count as unvaried.
 
         Raises:
             UnsupportedRandomisation: No op changes one of the quantities.
-            ValueError: A name fits no element.
+            ValueError: A name matches no element.
         """
         controlled = controlled_actuators(client, layouts)
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
-        self._told = OVER_WIRE[client] = VariedOverWire(declared)
+        self._registered = OVER_WIRE[client] = VariedOverWire(declared)
         self._model_fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields
         }
@@ -84,8 +84,8 @@ class WireVariation:
                 self.controlled[key] = _Controlled(controller, np.array(actuators, dtype=np.intp), gains)
 
     async def apply(self, draws: EpisodeDraws) -> None:
-        """Set what a reset leaves alone: gravity, and the gains of controllers."""
-        self._told.draws = draws
+        """Set the quantities that a reset does not change: gravity, and the gains of controllers."""
+        self._registered.draws = draws
         if self._model_fields:
             self.variation.write(draws, self._model_fields.__getitem__)
             await self._set_gravity()
@@ -98,13 +98,13 @@ class WireVariation:
             await each.controller.set_gains(scaled.get("kp"), scaled.get("kv"))
 
     def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
-        """Vary where the episode starts, in place; see `Variation.start`."""
+        """Vary the start of the episode in place; see `Variation.start`."""
         self.variation.start(draws, qpos)
 
     async def undo(self) -> None:
-        """Set gravity and gains as they were."""
-        self._told.draws = None
-        if OVER_WIRE.get(self._client) is self._told:
+        """Restore gravity and gains."""
+        self._registered.draws = None
+        if OVER_WIRE.get(self._client) is self._registered:
             del OVER_WIRE[self._client]
         if self._model_fields:
             self.variation.restore(self._model_fields.__getitem__)

@@ -1,6 +1,6 @@
-"""Inverse kinematics: where joints must be for a site or body of a robot to be somewhere, within their limits.
+"""Inverse kinematics: joint positions, within their limits, that bring a site or body of a robot to a pose.
 
-It is solved by mink, which needs the extra `teleop`.
+The solver is mink. Needs the extra `teleop`.
 """
 
 from urlab_client._extras import need

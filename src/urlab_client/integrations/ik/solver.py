@@ -1,4 +1,4 @@
-"""The search: from where the joints are, or from elsewhere, by steps that are quadratic programs of mink."""
+"""The search: starts at the current joint positions, then at others, and iterates quadratic programs of mink."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ __all__ = ["IkSolution", "InverseKinematics", "UnreachableTarget"]
 Vector = Sequence[float] | Floats
 
 _ITERATIONS: Final = 60
-_STALLED: Final = 1e-6  # rad or m that an iteration moves the joints when no further one helps
-_LARGEST_STEP: Final = 0.5  # rad or m per iteration: Jacobians hold nearby alone
+_STALLED: Final = 1e-6  # rad or m; if an iteration moves the joints by less, the search has converged
+_LARGEST_STEP: Final = 0.5  # rad or m per iteration: Jacobians are only valid locally
 _DAMPING: Final = 1e-6
 _LM_DAMPING: Final = 1e-2
 _STARTS: Final = 8
 
 
 class IkSolution(Serializable, Struct, frozen=True, kw_only=True):
-    """Joint positions, and how close they bring the frame to its target.
+    """Joint positions, and the remaining distance of the frame from its target.
 
     Attributes:
-        joints: Position of each joint that was solved for, rad or m, by name: what `move_to` takes.
-        set_points: What holds them there, by actuator name: what `set_ctrl` takes.
+        joints: Position of each solved joint, rad or m, by name, in the format of `move_to`.
+        set_points: Set-points that hold these positions, by actuator name, in the format of `set_ctrl`.
         position_error: Distance of the frame's origin from the target, metres.
-        rotation_error: Angle between its orientation and the target's, rad; 0 where none was asked for.
-        reached: Whether both are within the tolerances.
-        iterations: Quadratic programs that were solved.
+        rotation_error: Angle between the frame's orientation and the target's, rad; 0 without a target orientation.
+        reached: Whether both errors are within the tolerances.
+        iterations: Number of quadratic programs solved.
     """
 
     joints: dict[str, float]
@@ -57,10 +57,10 @@ class IkSolution(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class UnreachableTarget(URLabError, ValueError):
-    """No joint positions within the limits were found that reach a target.
+    """The search found no joint positions within the limits that reach the target.
 
     Attributes:
-        nearest: The nearest that were found.
+        nearest: The nearest solution found.
     """
 
     def __init__(self, message: str, nearest: IkSolution, *, hint: str | None = None) -> None:
@@ -71,15 +71,15 @@ class UnreachableTarget(URLabError, ValueError):
 class InverseKinematics:
     """Solves for the joints that move one frame of a robot.
 
-    They are the hinge and slide joints between the frame and the robot's root that a position servo or a PD controller
-    holds. Everything else stays as it is in the state of the last reply: other joints, a free base, other robots. Make
-    a new one after another `discover()`. One object serves one thread at a time.
+    These are the hinge and slide joints between the frame and the robot's root that a position servo or a PD controller
+    holds. Everything else (other joints, a free base, other robots) stays in the state of the last reply. Make a new
+    instance after another `discover()`. Use an instance from one thread at a time.
 
-    Poses are those of the MuJoCo world: metres, z up, quaternions (w, x, y, z). Collisions are not considered.
+    Poses are in the MuJoCo world frame: metres, z up, quaternions (w, x, y, z). Collisions are not considered.
 
     Attributes:
         frame: Name of the site or body.
-        joints: The joints, from the root on.
+        joints: Names of the joints, starting at the root.
     """
 
     def __init__(
@@ -91,20 +91,21 @@ class InverseKinematics:
         body: str | None = None,
         joints: Iterable[str] | None = None,
     ) -> None:
-        """Prepare.
+        """Set up the solver.
 
         Args:
             client: A client of either flavour after `discover()`, with a local model.
-            articulation: Key of the robot; not needed where there is only one.
-            site: The frame, as a site's short name.
-            body: The frame, as a body's short name; give one of the two.
-            joints: Solve for these alone.
+            articulation: Key of the robot; optional if the scene has only one.
+            site: Short name of a site, the frame. Give either `site` or `body`.
+            body: Short name of a body, the frame.
+            joints: Joints to solve for; by default, all that move the frame.
 
         Raises:
-            KeyError: There is no such articulation, site, body or joint.
-            ValueError: Not one frame is given, nothing that is held at a position moves it, or a joint of `joints`
+            KeyError: The articulation, site, body or joint does not exist.
+            ValueError: Not exactly one frame is given, no position-controlled joint moves it, or a joint of `joints`
                 does not.
-            URLabError: The client has no local model, or several robots and `articulation` names none.
+            URLabError: The client has no local model, or the scene does not have exactly one robot and `articulation`
+                is None.
         """
         model = client.model
         if model is None:
@@ -116,7 +117,7 @@ class InverseKinematics:
         self._source = model
         self._robot = _robot(client, articulation)
         if (site is None) is (body is None):
-            raise ValueError("give one frame: either site=NAME or body=NAME")
+            raise ValueError("give exactly one frame: either site=NAME or body=NAME")
         kind, name = ("site", site) if site is not None else ("body", body or "")
         self.frame: str = name
         self._kind = kind
@@ -138,13 +139,13 @@ class InverseKinematics:
         self._dofs = dofs
 
     def pose(self, joints: dict[str, float] | None = None) -> tuple[Floats, Floats]:
-        """Return where the frame is.
+        """Return the pose of the frame.
 
         Args:
-            joints: Positions of some of `self.joints`, rad or m; others are as in the last reply.
+            joints: Positions of some of `self.joints`, rad or m. The others are those of the last reply.
 
         Returns:
-            Position, metres, shape (3,), and orientation (w, x, y, z), shape (4,), in the world's frame.
+            Position, metres, shape (3,), and orientation (w, x, y, z), shape (4,), in the world frame.
 
         Raises:
             KeyError: A joint is not one of `self.joints`.
@@ -170,23 +171,23 @@ class InverseKinematics:
     ) -> IkSolution:
         """Return joint positions that bring the frame to a pose. Nothing is sent, and nothing moves.
 
-        The search begins where the joints are, so that small changes of the target lead to small movements. Where it
-        gets stuck, it begins anew in the middle of their ranges and then at random positions, always the same ones.
+        The search starts at the current joint positions, so that small changes of the target lead to small movements.
+        If it gets stuck, it restarts in the middle of the joint ranges and then at random positions, always the same.
 
         Args:
-            position: Of the frame's origin, metres, world frame, shape (3,).
-            quaternion: Its orientation (w, x, y, z), world frame, of any length but 0; None leaves it open.
-            start: Begin at these positions of some of `self.joints`, rad or m.
-            starts: How often to begin, at most.
+            position: Target of the frame's origin, metres, world frame, shape (3,).
+            quaternion: Target orientation (w, x, y, z), world frame, of any length except 0. None leaves it free.
+            start: Positions of some of `self.joints` to start from, rad or m.
+            starts: Largest number of starts.
             tolerance: Distance within which the target counts as reached, metres.
-            rotation_tolerance: Angle likewise, rad.
-            nearest: Return the nearest positions for a target that is not reached, with `reached` False.
+            rotation_tolerance: Angle within which the target counts as reached, rad.
+            nearest: Whether to return the nearest positions, with `reached` False, if the target is not reached.
 
         Raises:
-            UnreachableTarget: The target was not reached; `.nearest` has what comes closest.
-            ValueError: A number is NaN, infinite or out of range, or a vector has another length.
+            UnreachableTarget: The target was not reached. `.nearest` is the nearest solution.
+            ValueError: A number is NaN, infinite or out of range, or a vector has the wrong length.
             KeyError: A joint of `start` is not one of `self.joints`.
-            URLabError: The client has been given another model since.
+            URLabError: The client's model has been replaced since.
         """
         aim = _vector("position", position, 3)
         turn = None if quaternion is None else _unit(quaternion)
@@ -194,7 +195,7 @@ class InverseKinematics:
             raise ValueError(f"starts must be at least 1, not {starts}")
         limits = _positive("tolerance", tolerance), _positive("rotation_tolerance", rotation_tolerance)
         found: list[IkSolution] = []
-        for qpos in self._beginnings(start, starts):
+        for qpos in self._initial_positions(start, starts):
             found.append(self._descend(qpos, aim, turn, limits))
             if found[-1].reached:
                 break
@@ -207,13 +208,13 @@ class InverseKinematics:
             f"{self._kind} {self.frame!r} of {self._robot.name!r} does not reach {_listed(aim)} m: the nearest found "
             f"is {best.position_error:.3f} m away{angle}, after {starts} starts.",
             best,
-            hint="Choose a target within reach, or pass nearest=True to go as near as possible.",
+            hint="Choose a target within reach, or pass nearest=True for the nearest solution.",
         )
 
     def _present(self) -> Floats:
         if self._client.model is not self._source:
             raise URLabError(
-                "The client has been given another model since.", hint="Make a new InverseKinematics after discover()."
+                "The client's model has been replaced since.", hint="Make a new InverseKinematics after discover()."
             )
         data = self._client.data
         if data is None:
@@ -221,7 +222,7 @@ class InverseKinematics:
         with self._client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
             return np.array(data.qpos)
 
-    def _beginnings(self, start: dict[str, float] | None, starts: int) -> Iterable[Floats]:
+    def _initial_positions(self, start: dict[str, float] | None, starts: int) -> Iterable[Floats]:
         qpos = self._present()
         rng = np.random.default_rng(0)
         first: NDArray[np.float64] = qpos[self._qpos]
@@ -238,13 +239,13 @@ class InverseKinematics:
 
     def _descend(self, qpos: Floats, aim: Floats, turn: Floats | None, limits: tuple[float, float]) -> IkSolution:
         configuration, task = self._configuration, self._task
-        solve: Any = getattr(mink, "solve_ik")  # noqa: B009 - whose options have no types
+        solve: Any = getattr(mink, "solve_ik")  # noqa: B009 - its options have no types
         configuration.update(qpos)
         task.set_orientation_cost(0.0 if turn is None else 1.0)
         iterations = 0
         while True:
             at, turned = self._frame_pose()
-            # With an open orientation the target turns along: else the error, a twist, would mix both.
+            # With a free orientation the target rotates with the frame: otherwise the error, a twist, mixes both.
             goal = turned if turn is None else turn
             errors = float(np.linalg.norm(aim - at)), 0.0 if turn is None else _angle(turned, turn)
             reached = errors[0] <= limits[0] and errors[1] <= limits[1]
@@ -299,7 +300,7 @@ def _robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulat
     if len(robots) != 1:
         raise URLabError(
             f"Name the articulation: the scene has {', '.join(robots) or 'none'}.",
-            hint="InverseKinematics(client, KEY).",
+            hint="Call InverseKinematics(client, KEY).",
         )
     return next(iter(robots.values()))
 
@@ -317,7 +318,7 @@ def _frame_id(model: mujoco.MjModel, robot: URLabArticulation | AsyncArticulatio
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the joints that move a body, from the root on."""
+    """Return the joints that move a body, starting at the root."""
     found: list[int] = []
     while body:
         first = int(model.body_jntadr[body])
@@ -329,7 +330,7 @@ def _chain(model: mujoco.MjModel, body: int) -> list[int]:
 def _held(
     robot: URLabArticulation | AsyncArticulation, chain: list[int], wanted: list[str] | None, frame: str
 ) -> dict[str, Actuator]:
-    """Return the joints of a chain that something holds at a position, with what does."""
+    """Return the position-controlled joints of a chain, each with its actuator."""
     by_id = {joint.id: joint for joint in robot.joints.values()}
     found: dict[str, Actuator] = {}
     for joint in (by_id[i] for i in chain if i in by_id):
@@ -339,18 +340,20 @@ def _held(
     if wanted is not None:
         names = [robot.joints[name].name for name in wanted]
         if others := [name for name in names if name not in found]:
-            raise ValueError(f"no position servo of joint {others[0]!r} moves {frame}; there are: {', '.join(found)}")
+            raise ValueError(
+                f"joint {others[0]!r} has no position servo that moves {frame}; joints with one: {', '.join(found)}"
+            )
         found = {name: actuator for name, actuator in found.items() if name in names}
     if not found:
         raise ValueError(
-            f"nothing that is held at a position moves {frame} of {robot.name!r}: its joints need position servos, or "
-            "a PD controller in force"
+            f"no position-controlled joint moves {frame} of {robot.name!r}: its joints need position servos or an "
+            "active PD controller"
         )
     return found
 
 
 def _range(joint: Joint, actuator: Actuator) -> tuple[float, float]:
-    """Return where a joint may be: within its own limits, and where its actuator can be told to hold it."""
+    """Return the range of a joint: its own limits, intersected with the range that its actuator can hold."""
     low, high = joint.limits or (-np.inf, np.inf)
     limits = actuator.describe().limits
     per_unit = actuator.set_point_for(1.0)
@@ -361,7 +364,7 @@ def _range(joint: Joint, actuator: Actuator) -> tuple[float, float]:
 
 
 def _restricted(model: mujoco.MjModel, joints: list[int], low: Floats, high: Floats) -> mujoco.MjModel:
-    """Return a copy whose joints have these ranges, and no others: what stands still may be outside of its own."""
+    """Return a copy in which only these joints have ranges: other joints may be outside their own ranges."""
     private = copy.copy(model)
     private.jnt_limited[:] = 0
     private.jnt_limited[joints] = np.isfinite(low) & np.isfinite(high)
@@ -380,7 +383,7 @@ def _unit(quaternion: Vector) -> Floats:
     given = _vector("quaternion", quaternion, 4)
     length = float(np.linalg.norm(given))
     if length < 1e-9:
-        raise ValueError("quaternion is all zeros, which is no orientation")
+        raise ValueError("quaternion is all zeros, which is not a valid orientation")
     return given / length
 
 

@@ -1,6 +1,6 @@
-"""Policies from ONNX files: a network, a TOML file that says what it sees and does, and running it on a robot.
+"""Policies from ONNX files: a network, a TOML file that declares its inputs and outputs, and running it on a robot.
 
-Running a network needs the extra `onnx`; declarations, mappings and policies of your own callables do not.
+Running a network needs the extra `onnx`. Declarations, mappings and policies made from your own callables do not.
 """
 
 from urlab_client.integrations.policy.evaluation import (

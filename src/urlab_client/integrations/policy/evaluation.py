@@ -1,4 +1,4 @@
-"""How good a policy is: success rate and return over many seeded episodes, with confidence intervals."""
+"""Evaluation of policies: success rate and return over many seeded episodes, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 __all__ = ["Estimate", "Evaluation", "Outcome", "bootstrap_mean", "evaluate_in", "evaluate_on", "wilson"]
 
 RESAMPLES: Final = 10_000
-_SEED_BITS: Final = 31  # what every server keeps
+_SEED_BITS: Final = 31  # every server keeps at least this many
 
 OnEpisode = Callable[["Outcome"], None]
-"""Called after each episode."""
+"""Callback invoked with the outcome after each episode."""
 
 
 class Estimate(Serializable, Struct, frozen=True):
@@ -44,13 +44,13 @@ class Estimate(Serializable, Struct, frozen=True):
 
 
 class Outcome(Serializable, Struct, frozen=True, kw_only=True):
-    """What came of one episode.
+    """The result of one episode.
 
     Attributes:
-        seed: Its seed, with which it can be repeated.
-        total: Its return: the sum of its rewards.
-        actions: Actions taken.
-        success: Whether it was a success; None for a task that knows none.
+        seed: Seed of the episode; the same seed repeats it.
+        total: Return of the episode: the sum of its rewards.
+        actions: Number of actions.
+        success: Whether the episode was a success; None if the task defines none.
     """
 
     seed: int
@@ -60,13 +60,13 @@ class Outcome(Serializable, Struct, frozen=True, kw_only=True):
 
 
 class Evaluation(Serializable, Struct, frozen=True, kw_only=True):
-    """What came of many episodes.
+    """The result of many episodes.
 
     Attributes:
         confidence: Coverage of the intervals, 0 to 1.
-        success_rate: Share of successes, with Wilson's score interval; None for a task that knows none.
+        success_rate: Proportion of successes, with Wilson's score interval; None if the task defines none.
         mean_return: Mean of the returns, with a percentile bootstrap interval.
-        mean_actions: Mean number of actions, likewise.
+        mean_actions: Mean number of actions, with a percentile bootstrap interval.
         outcomes: The episodes.
     """
 
@@ -78,13 +78,13 @@ class Evaluation(Serializable, Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, outcomes: Sequence[Outcome], confidence: float) -> Evaluation:
-        """Sum episodes up.
+        """Summarise episodes.
 
         Raises:
-            ValueError: There are none, or the confidence is not between 0 and 1.
+            ValueError: There are no episodes, or the confidence is not between 0 and 1.
         """
         if not outcomes:
-            raise ValueError("there is no episode to evaluate")
+            raise ValueError("there are no episodes to evaluate")
         if not 0 < confidence < 1:
             raise ValueError(f"confidence must be between 0 and 1, not {confidence}")
         successes = [outcome.success for outcome in outcomes if outcome.success is not None]
@@ -100,7 +100,7 @@ class Evaluation(Serializable, Struct, frozen=True, kw_only=True):
 def wilson(successes: int, n: int, confidence: float = 0.95) -> Estimate:
     """Return a proportion with the score interval of E. B. Wilson (1927).
 
-    It keeps its coverage for few episodes, and for rates near 0 and 1.
+    The interval keeps its coverage with few episodes and with rates near 0 and 1.
 
     Args:
         successes: Number of successes.
@@ -118,7 +118,7 @@ def bootstrap_mean(values: Sequence[float], confidence: float = 0.95) -> Estimat
     """Return a mean with the percentile interval of B. Efron's bootstrap (1979), of 10,000 seeded resamples.
 
     Args:
-        values: One per episode.
+        values: One value per episode.
         confidence: Coverage, 0 to 1.
     """
     given = np.asarray(values, dtype=np.float64)
@@ -129,10 +129,10 @@ def bootstrap_mean(values: Sequence[float], confidence: float = 0.95) -> Estimat
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:
-    """Return the seeds of the episodes of an evaluation; the first ones of a longer evaluation are the same.
+    """Return the seeds of an evaluation's episodes. A longer evaluation begins with the same seeds.
 
     Raises:
-        ValueError: There are fewer than one, or the seed is negative.
+        ValueError: The number of episodes is below 1, or the seed is negative.
     """
     if episodes < 1 or seed < 0:
         raise ValueError(f"episodes must be at least 1 and the seed at least 0, not {episodes} and {seed}")
@@ -148,22 +148,22 @@ def evaluate_in(
     confidence: float = 0.95,
     on_episode: OnEpisode | None = None,
 ) -> Evaluation:
-    """Evaluate a network that maps observations to actions in a batch of environments, or over servers.
+    """Evaluate a network that maps observations to actions, in a batch of environments or over servers.
 
-    Each episode has a seed of its own, so its outcome does not depend on the number of environments.
+    Each episode has its own seed, so its outcome does not depend on the number of environments.
 
     Args:
-        env: The environments, with a limit of actions, and `autoreset_mode=AutoresetMode.DISABLED`.
-        network: Maps an observation, flat or a dictionary, to an action, shape (n,), which is clipped to the bounds of
-            the action space. With dictionaries, it is that of the only articulation that is driven.
+        env: The environments, with `max_episode_steps` and `autoreset_mode=AutoresetMode.DISABLED`.
+        network: Function that maps an observation, flat or a dictionary, to an action, shape (n,), which is clipped to
+            the bounds of the action space. With dictionaries, it is the action of the only articulation with actuators.
         episodes: Number of episodes.
         seed: Seed of the evaluation.
         confidence: Coverage of the intervals, 0 to 1.
-        on_episode: Called after each episode.
+        on_episode: Callback invoked with the outcome after each episode.
 
     Raises:
-        ValueError: A number is out of range, the network does not fit the spaces, the environments are of another kind,
-            or more than one articulation is driven by dictionaries.
+        ValueError: A number is out of range, the network does not fit the spaces, the environments lack
+            `max_episode_steps` or the autoreset mode, or dictionary actions have more than one articulation.
         URLabError: A server failed.
     """
     if env.autoreset_mode.name != "DISABLED" or env.max_episode_steps is None:
@@ -173,7 +173,7 @@ def evaluate_in(
     driven: str | None = None
     if env.mapping.mode == "dict":
         if len(space) != 1:
-            raise ValueError(f"an evaluation drives one articulation, not {len(space)}: {', '.join(space)}")
+            raise ValueError(f"an evaluation controls one articulation, not {len(space)}: {', '.join(space)}")
         ((driven, space),) = space.items()
     found: dict[int, Outcome] = {}
     for first in range(0, episodes, env.num_envs):
@@ -215,21 +215,21 @@ async def evaluate_on(
     confidence: float = 0.95,
     on_episode: OnEpisode | None = None,
 ) -> Evaluation:
-    """Evaluate a policy on its robot: a success is an episode without a fall, which ends it.
+    """Evaluate a policy on its robot. A fall ends an episode; an episode without a fall is a success.
 
     Args:
         client: A discovered client. Episodes differ if its server varies its scene.
         policy: The policy.
-        articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
+        articulation: Key, actor id or class name of the robot, instead of the declared one.
         episodes: Number of episodes.
-        seconds: Simulated seconds of an episode.
+        seconds: Duration of an episode, simulated seconds.
         seed: Seed of the evaluation.
         confidence: Coverage of the intervals, 0 to 1.
-        on_episode: Called after each episode.
+        on_episode: Callback invoked with the outcome after each episode.
 
     Raises:
-        PolicyMismatch: The policy cannot drive this robot in this session.
-        URLabError: The server refused something.
+        PolicyMismatch: The policy cannot control this robot in this session.
+        URLabError: The server refused a request.
         ValueError: A number is out of range.
     """
     outcomes: list[Outcome] = []
@@ -251,7 +251,7 @@ def _of(observations: Any, index: int) -> Any:
 
 
 def _raise_any(infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
-    """Raise what failed in one of these environments: an episode without an end has no outcome."""
+    """Raise the first error of these environments: an unfinished episode has no outcome."""
     for error in infos["error"][which] if "error" in infos else ():
         if error is not None:
             raise error

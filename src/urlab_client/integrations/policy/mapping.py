@@ -1,7 +1,7 @@
-"""From a robot's state to what the network sees, and from its outputs to set-points.
+"""Maps a robot's state to network inputs, and network outputs to set-points.
 
-All functions take single robots and batches alike: arrays may have leading axes. Training and running use the same
-ones, so a network sees the same numbers in both.
+All functions accept single robots and batches: arrays may have leading axes. Training and running use the same
+functions, so a network sees the same numbers in both.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ _COMMAND: Final = 3
 
 
 class PolicyMismatch(URLabError):
-    """A policy does not fit the robot or the session; says what is there, what it requires, and how to get it."""
+    """A policy does not fit the robot or the session. The message names what was found, what is required and a fix."""
 
 
 class Input(NamedTuple):
-    """What one input of the network holds.
+    """Shape and type of one network input.
 
     Attributes:
-        shape: Its shape.
-        dtype: uint8 for colours; other pictures and numbers are float32.
+        shape: Shape without the batch axis.
+        dtype: uint8 for colours; float32 for other pictures and numbers.
     """
 
     shape: tuple[int, ...]
@@ -60,7 +60,7 @@ class Input(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """What a term may look at."""
+    """The values that terms can read."""
 
     state: RobotState
     command: Floats
@@ -77,20 +77,20 @@ class PolicyMapping:
 
     Attributes:
         spec: The declaration.
-        observation_size: Numbers in one observation, without pictures.
-        action_size: Outputs of the network.
+        observation_size: Length of one observation, without pictures.
+        action_size: Number of network outputs.
         joints: Joint of each output.
         actuators: Actuator of each output.
-        ctrl: Position of each output in `ctrl_array`.
+        ctrl: Index of each output in `ctrl_array`.
     """
 
     def __init__(self, spec: PolicySpec, robot: PolicyRobot, source: str) -> None:
-        """Bind.
+        """Bind a declaration to a robot.
 
         Args:
             spec: The declaration.
             robot: An articulation of a discovered client with a local model.
-            source: Names the declaration in errors, usually its file.
+            source: Name of the declaration in errors, usually its file.
 
         Raises:
             PolicyMismatch: The robot lacks a joint, an actuator, a sensor, a camera or a free base.
@@ -145,7 +145,7 @@ class PolicyMapping:
             command: (vx, vy, yaw rate), shape (…, 3).
             last_action: The last output after clipping, shape (…, action_size).
             time: Seconds since the start.
-            goal: What to reach, shape (…, n_goal); the declaration's default for None.
+            goal: Goal, shape (…, n_goal), or None for the declared default.
         """
         moment = _Moment(state, command, last_action, time, self.default_goal if goal is None else goal)
         parts: list[Floats] = []
@@ -156,11 +156,11 @@ class PolicyMapping:
         return np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)
 
     def named(self, observations: Sequence[Floats], robot: PolicyRobot) -> dict[str, NDArray[Any]]:
-        """Return what the network's inputs hold, by name.
+        """Return the values of the network inputs, by name.
 
         Args:
-            observations: As `observe` returns them, as many as the history has.
-            robot: The articulation, whose cameras show the same moment as the last of them.
+            observations: Results of `observe`, as many as `history` declares.
+            robot: The articulation. Its cameras show the same moment as the last observation.
 
         Raises:
             PolicyMismatch: A camera has no picture.
@@ -173,15 +173,15 @@ class PolicyMapping:
             frame = robot.cameras[term.camera].latest_frame
             if frame is None:
                 raise PolicyMismatch(
-                    f"{self._source}: there is no picture of camera {term.camera!r} of {robot.prefix!r} yet.",
-                    hint=f"Step with include_cameras={{'{robot.prefix}/{term.camera}': 'sync'}}, or capture() one.",
+                    f"{self._source}: camera {term.camera!r} of {robot.prefix!r} has no picture yet.",
+                    hint=f"Step with include_cameras={{'{robot.prefix}/{term.camera}': 'sync'}}, or call capture().",
                 )
             inputs[term.input] = observed_pixels(frame, term.mode)
         return inputs
 
     @property
     def inputs(self) -> dict[str, Input]:
-        """What the network's inputs hold, by name, where the declaration tells them apart."""
+        """Shape and type of the network inputs, by name, if the declaration names them."""
         numbers = {
             name: Input((len(columns) * self.spec.history,), np.dtype(np.float32))
             for name, columns in self._columns.items()
@@ -189,24 +189,24 @@ class PolicyMapping:
         return numbers | {term.input: _picture(term) for term in self.spec.pictures}
 
     def clipped(self, output: Floats) -> Floats:
-        """Return the network's outputs within their limits."""
+        """Return the network's outputs clipped to their limits."""
         return np.clip(output, *self.spec.action.clip)
 
     def targets(self, action: Floats) -> Floats:
-        """Return joint targets or torques of a clipped output, shape (…, action_size)."""
+        """Return the joint targets or torques for a clipped output, shape (…, action_size)."""
         return self._offset + self._scale * action
 
     def torques(self, targets: Floats, state: RobotState) -> Floats:
-        """Return what the PD law of `gains` gives for some joint targets, shape (…, action_size)."""
+        """Return the torques of the PD law of `gains` for joint targets, shape (…, action_size)."""
         gains = self.spec.gains
         if gains is None:
-            raise ValueError(f"{self._source} has no gains: its action goes via actuators")
+            raise ValueError(f"{self._source} has no gains: its action.via is 'actuators'")
         limit = _array(gains.torque_limit)
         wanted = _array(gains.kp) * (targets - state.qpos[..., self._qpos])
         return np.clip(wanted - _array(gains.kv) * state.qvel[..., self._qvel], -limit, limit)
 
     def gains(self) -> dict[str, dict[str, float]]:
-        """Return the gains as `set_gains` takes them: by the name of each, then by actuator."""
+        """Return the gains in the format of `set_gains`: by gain, then by actuator."""
         gains, names = self.spec.gains, [actuator.name for actuator in self.actuators]
         if gains is None:
             return {}
@@ -222,7 +222,7 @@ class PolicyMapping:
         return np.zeros(0) if self.spec.goal is None else np.array(self.spec.goal.default)
 
     def goal_error(self, state: RobotState, goal: Floats) -> Floats | None:
-        """Return the distance from the goal, by the first goal term that is relative to a sensor; None without one."""
+        """Return the distance from the goal in the first goal term with `relative_to`; None without such a term."""
         measured = [term.relative_to for term in self.spec.observation if isinstance(term, GoalTerm)]
         name = next(filter(None, measured), None)
         return None if name is None else np.linalg.norm(goal - state.sensors[self._sensor_names[name]], axis=-1)
@@ -265,7 +265,7 @@ class PolicyMapping:
             raise self._misfit(f"{where}.size", f"{term.camera!r} has {there} pixels, not {wanted}")
 
     def _term(self, robot: PolicyRobot, term: NumberTerm, where: str) -> tuple[int, _Read]:
-        """Return how many numbers a term has, and how to read them."""
+        """Return the number of values of a term, and a function that reads them."""
         match term:
             case JointPosition():
                 qpos, _ = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
@@ -351,13 +351,13 @@ def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
         raise PolicyMismatch(
             f"{source}: action.joints: {len(found)} actuators of {robot.prefix!r} drive {joint.name!r}; "
-            "it takes one, with one input."
+            "it needs exactly one, with one input."
         )
     return found[0]
 
 
 def _offsets(joints: Sequence[Joint]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return where joints are in `qpos_array` and in `qvel_array`."""
+    """Return the indices of joints in `qpos_array` and in `qvel_array`."""
     return (
         np.array([joint.qpos_local_offset for joint in joints], dtype=np.intp),
         np.array([joint.qvel_local_offset for joint in joints], dtype=np.intp),

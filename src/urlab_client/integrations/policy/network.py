@@ -1,4 +1,4 @@
-"""A network in an ONNX file: what goes in, what comes out, and running it."""
+"""A network in an ONNX file: its inputs, its outputs, and running it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BYTES: Final = "tensor(uint8)"
 
 
 class Network(Protocol):
-    """What turns an observation into outputs; any callable of this kind will do."""
+    """Any callable that maps an observation to outputs."""
 
     def __call__(self, observation: Floats, /) -> Floats:
         """Return the outputs, shape (n_outputs,), for an observation, shape (n_inputs,)."""
@@ -29,41 +29,42 @@ class Network(Protocol):
 
 
 class PicturesNetwork(Protocol):
-    """What turns inputs with names, pictures among them, into outputs; any callable of this kind will do."""
+    """Any callable that maps named inputs, which may include pictures, to outputs."""
 
     def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
-        """Return the outputs, shape (n_outputs,), for the inputs of a declaration by name."""
+        """Return the outputs, shape (n_outputs,), for the declared inputs, by name."""
         ...
 
 
 class Entry(Protocol):
-    """What an input is to hold: a space of Gymnasium's is one."""
+    """Shape and type of an input. Gymnasium spaces satisfy this protocol."""
 
     @property
     def shape(self) -> tuple[int, ...] | None:
-        """Its shape."""
+        """Shape of the input."""
         ...
 
     @property
     def dtype(self) -> np.dtype[Any] | None:
-        """Its type; numbers of any width are fed as float32."""
+        """Type of the input; numbers of any width are passed as float32."""
         ...
 
 
 class OnnxNetwork:
-    """A network with one input and one output of numbers, run by ONNX Runtime on one thread.
+    """A network with one numeric input and one numeric output, run by ONNX Runtime on one thread.
 
     Attributes:
         path: The file.
-        inputs: Numbers that go in, or None when the file leaves it open.
-        outputs: Numbers that come out, or None when the file leaves it open.
+        inputs: Size of the input, or None if the file does not fix it.
+        outputs: Size of the output, or None if the file does not fix it.
     """
 
     def __init__(self, path: Path) -> None:
         """Load a file.
 
         Raises:
-            PolicyFileError: It is missing, no ONNX file, or has other inputs and outputs than one of each.
+            PolicyFileError: The file is missing, is not an ONNX file, or does not have exactly one input and one
+                output.
             ImportError: The extra `onnx` is not installed.
         """
         self._session = _session(path)
@@ -71,8 +72,8 @@ class OnnxNetwork:
         for kind, found in ends.items():
             if len(found) != 1 or found[0].type != "tensor(float)" or not 1 <= len(found[0].shape) <= 2:
                 raise PolicyFileError(
-                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_told(found)}.",
-                    hint="A declaration for a network with several inputs names the `input` of each term.",
+                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_described(found)}.",
+                    hint="If the network has several inputs, declare the `input` of each term.",
                 )
         self.path = path
         self._input = ends["input"][0].name
@@ -88,20 +89,20 @@ class OnnxNetwork:
 
 
 class OnnxInputs:
-    """A network in an ONNX file whose inputs are told apart by name, run by ONNX Runtime on one thread.
+    """A network in an ONNX file with named inputs, run by ONNX Runtime on one thread.
 
-    Each input has the shape of what it sees behind an axis for the batch; pictures are uint8, numbers float32.
+    Each input has a batch axis followed by the shape of its entry. Pictures are uint8, numbers are float32.
 
     Attributes:
         path: The file.
-        inputs: Names of its inputs.
+        inputs: Names of the inputs.
     """
 
     def __init__(self, path: Path) -> None:
         """Load a file.
 
         Raises:
-            PolicyFileError: It is missing, or no ONNX file.
+            PolicyFileError: The file is missing or is not an ONNX file.
             ImportError: The extra `onnx` is not installed.
         """
         self._session = _session(path)
@@ -110,17 +111,17 @@ class OnnxInputs:
         self.inputs: tuple[str, ...] = tuple(self._types)
 
     def require(self, entries: Mapping[str, Entry], outputs: int) -> None:
-        """Check that it sees some of the entries, and returns so many numbers.
+        """Check that the inputs are among the entries, and that the network has the given number of outputs.
 
         Raises:
-            PolicyFileError: It does not.
+            PolicyFileError: A check fails.
         """
         made = self._session.get_outputs()
         for one in self._session.get_inputs():
             entry = entries.get(one.name)
             if entry is None:
                 raise PolicyFileError(
-                    f"{self.path}: its input {one.name!r} is not an entry of the observation; there are: "
+                    f"{self.path}: its input {one.name!r} is not an entry of the observation; the entries are: "
                     f"{', '.join(entries)}."
                 )
             wanted = _BYTES if entry.dtype == np.uint8 else "tensor(float)"
@@ -132,26 +133,26 @@ class OnnxInputs:
                 )
         if len(made) != 1 or made[0].type != "tensor(float)" or not _fits(made[0].shape[1:], [outputs]):
             raise PolicyFileError(
-                f"{self.path}: it needs one output, float32 of shape ['batch', {outputs}]; it has: {_told(made)}."
+                f"{self.path}: it needs one output, float32 of shape ['batch', {outputs}]; it has: {_described(made)}."
             )
 
     def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
-        """See `PicturesNetwork`; further entries are not used."""
+        """See `PicturesNetwork`. Further entries are ignored."""
         fed = {name: np.asarray(inputs[name], dtype)[None] for name, dtype in self._types.items()}
         (outputs,) = self._session.run(None, fed)
         return np.asarray(outputs[0], dtype=np.float64)
 
 
 class OnnxDictNetwork:
-    """A network in an ONNX file that maps dictionary observations, with pictures for example, to actions.
+    """A network in an ONNX file that maps dictionary observations, which may include pictures, to actions.
 
-    Each input has the name of an entry, such as `arm/qpos`, `task` or `cameras/arm/overview`, and its shape behind an
-    axis for the batch; pictures are uint8, numbers float32. Entries that no input is named after are not used. The only
-    output is the action of the only articulation that is driven.
+    Each input is named after an entry, such as `arm/qpos`, `task` or `cameras/arm/overview`, and has a batch axis
+    followed by the shape of that entry. Pictures are uint8, numbers are float32. Entries without an input are ignored.
+    The only output is the action of the only articulation with actuators.
 
     Attributes:
         path: The file.
-        inputs: Names of the entries that it sees.
+        inputs: Names of the entries that the network uses.
     """
 
     def __init__(self, path: Path, observation_space: Any, outputs: int) -> None:
@@ -160,10 +161,10 @@ class OnnxDictNetwork:
         Args:
             path: The file.
             observation_space: `single_observation_space` of the environment, a `Dict`.
-            outputs: Numbers of an action.
+            outputs: Size of an action.
 
         Raises:
-            PolicyFileError: The file is missing, no ONNX file, or does not fit.
+            PolicyFileError: The file is missing, is not an ONNX file, or does not fit the environment.
             ImportError: The extra `onnx` is not installed.
         """
         self._network = OnnxInputs(path)
@@ -177,11 +178,11 @@ class OnnxDictNetwork:
 
 
 def _session(path: Path) -> Any:
-    """Return ONNX Runtime's session of a file, on one thread: small networks lose more by threads than they gain."""
+    """Return an ONNX Runtime session of a file, on one thread: more threads slow small networks down."""
     need("onnxruntime", extra="onnx")
     if not path.is_file():
-        raise PolicyFileError(f"{path}: no such file.", hint="A policy is a .onnx file and a .toml file beside it.")
-    runtime: Any = importlib.import_module("onnxruntime")  # it brings no types
+        raise PolicyFileError(f"{path}: no such file.", hint="A policy is a .onnx file with a .toml file beside it.")
+    runtime: Any = importlib.import_module("onnxruntime")  # it has no type stubs
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -192,7 +193,7 @@ def _session(path: Path) -> Any:
 
 
 def _entries(nested: Any, prefix: str = "") -> dict[str, Any]:
-    """Return what a dictionary of dictionaries holds, by names such as `arm/qpos`."""
+    """Return the entries of a nested dictionary, by names such as `arm/qpos`."""
     found: dict[str, Any] = {}
     for name, entry in nested.items():
         found |= _entries(entry, f"{prefix}{name}/") if hasattr(entry, "items") else {f"{prefix}{name}": entry}
@@ -200,13 +201,13 @@ def _entries(nested: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _fits(shape: list[Any], sizes: list[int]) -> bool:
-    """Return whether a shape, whose open axes are names, can be of these sizes."""
+    """Return whether a shape, whose dynamic axes are names, matches these sizes."""
     return len(shape) == len(sizes) and all(
         one in (size, None) or isinstance(one, str) for one, size in zip(shape, sizes, strict=True)
     )
 
 
-def _told(ends: list[Any]) -> str:
+def _described(ends: list[Any]) -> str:
     return ", ".join(f"{end.name} {end.type} {end.shape}" for end in ends)
 
 

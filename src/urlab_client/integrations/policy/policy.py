@@ -1,4 +1,4 @@
-"""`Policy`: a network with its declaration, and what it remembers of one robot."""
+"""`Policy`: a network with its declaration and its state for one robot."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ __all__ = ["Policy", "load"]
 
 
 class Policy:
-    """Drives one robot at a time.
+    """A policy that controls one robot at a time.
 
-    It remembers what its observations need: the clock, the last action, earlier observations. `reset()` forgets it.
+    It keeps the state that observations need: the clock, the last action and earlier observations. `reset()` clears
+    this state.
 
     Attributes:
         spec: The declaration.
-        source: What errors call the declaration, usually its file.
+        source: Name of the declaration in errors, usually its file.
     """
 
-    # Two signatures rather than a union, from which type checkers cannot tell what a lambda takes.
+    # Two overloads: with a union, type checkers cannot infer the parameter type of a lambda.
     @overload
     def __init__(self, spec: PolicySpec, network: Network, *, source: str = "policy") -> None: ...
 
@@ -37,12 +38,12 @@ class Policy:
     def __init__(self, spec: PolicySpec, network: PicturesNetwork, *, source: str = "policy") -> None: ...
 
     def __init__(self, spec: PolicySpec, network: Network | PicturesNetwork, *, source: str = "policy") -> None:
-        """Make a policy of a declaration and any callable that maps observations to outputs.
+        """Make a policy from a declaration and any callable that maps observations to outputs.
 
         Args:
             spec: The declaration.
-            network: The network; `load` makes one from a file. A `PicturesNetwork` where terms name their `input`.
-            source: What errors call the declaration.
+            network: The network; `load` makes one from a file. If terms name their `input`, a `PicturesNetwork`.
+            source: Name of the declaration in errors.
         """
         self.spec = spec
         self.source = source
@@ -59,8 +60,8 @@ class Policy:
         """The command (vx, vy, yaw rate), m/s and rad/s, base frame. May be assigned at any time.
 
         Raises:
-            ValueError: On assigning another number of values, values it was not trained for, or any to a policy that
-                takes none.
+            ValueError: On assignment, the number of values is wrong, a value is outside the declared range, or the
+                policy takes no command.
         """
         return self._command.copy()
 
@@ -72,18 +73,18 @@ class Policy:
             raise ValueError(f"{self.source} takes no command")
         if given.shape != (3,) or not np.all((given >= known.low) & (given <= known.high)):
             raise ValueError(
-                f"a command is vx, vy, yaw rate from {list(known.low)} to {list(known.high)} (m/s, m/s, rad/s), "
+                f"a command must be vx, vy, yaw rate from {list(known.low)} to {list(known.high)} (m/s, m/s, rad/s), "
                 f"not {given.tolist()}"
             )
         self._command = given
 
     @property
     def goal(self) -> Floats:
-        """The goal, as the declaration's table `goal` has it. May be assigned at any time.
+        """The goal, in the units of the declared table `goal`. May be assigned at any time.
 
         Raises:
-            ValueError: On assigning another number of values, values it was not trained for, or any to a policy that
-                has none.
+            ValueError: On assignment, the number of values is wrong, a value is outside the declared range, or the
+                policy has no goal.
         """
         return self._goal.copy()
 
@@ -95,7 +96,7 @@ class Policy:
             raise ValueError(f"{self.source} has no goal")
         inside = given.shape == (len(known.default),) and np.all((given >= known.low) & (given <= known.high))
         if not inside:
-            raise ValueError(f"a goal is from {known.low} to {known.high}, not {given.tolist()}")
+            raise ValueError(f"a goal must be from {known.low} to {known.high}, not {given.tolist()}")
         self._goal = given
 
     @property
@@ -104,11 +105,11 @@ class Policy:
         return self._action.copy()
 
     def bind(self, robot: PolicyRobot) -> PolicyMapping:
-        """Fit the policy to an articulation of a discovered client, and return how.
+        """Bind the policy to an articulation of a discovered client, and return the mapping.
 
         Raises:
-            PolicyMismatch: The robot lacks what the declaration names.
-            PolicyFileError: The network has other sizes than the declaration.
+            PolicyMismatch: The robot lacks an element that the declaration names.
+            PolicyFileError: The sizes of the network differ from the declaration.
         """
         mapping = PolicyMapping(self.spec, robot, self.source)
         network = self._network
@@ -133,26 +134,26 @@ class Policy:
         return mapping
 
     def reset(self) -> None:
-        """Forget: the clock starts again, the last action is zero."""
+        """Clear the state: the clock restarts, and the last action is zero."""
         self._acted = 0
         self._action: Floats = np.zeros(len(self.spec.action.joints))
         self._history: list[Floats] = []
 
     def act(self, robot: PolicyRobot, time: float | None = None) -> Floats:
-        """Look at a robot, and write its set-points for the next `decimation` physics steps.
+        """Observe a robot, and write its set-points for the next `decimation` physics steps.
 
-        With `via = "client"` they are the torques for the present state; `hold` computes them for later ones.
+        With `via = "client"`, the set-points are torques for the current state; `hold` computes them for later states.
 
         Args:
             robot: The articulation.
-            time: Seconds since the start; by default the actions since `reset()` times their period.
+            time: Seconds since the start; by default, the number of actions since `reset()` times their period.
 
         Returns:
             Joint targets or torques, shape (n_joints,).
 
         Raises:
-            PolicyMismatch: The robot lacks what the declaration names.
-            PolicyFileError: The network's sizes are not those declared, or it returned NaN or infinity.
+            PolicyMismatch: The robot lacks an element that the declaration names.
+            PolicyFileError: The sizes of the network differ from the declaration, or it returned NaN or infinity.
         """
         mapping = self._mapping if robot is self._robot and self._mapping is not None else self.bind(robot)
         now = self._acted * self.spec.period if time is None else time
@@ -178,16 +179,16 @@ class Policy:
         return self._targets
 
     def hold(self, robot: PolicyRobot) -> None:
-        """Write the torques that pull a robot, as it is now, towards the targets of the last action.
+        """Write the torques that move a robot from its current state towards the targets of the last action.
 
-        To be called before each physics step between two actions, for a policy with `via = "client"`.
+        For a policy with `via = "client"`, call this before each physics step between two actions.
 
         Raises:
-            PolicyMismatch: There was no action on this robot yet.
+            PolicyMismatch: `act` has not been called for this robot yet.
         """
         mapping = self._mapping
         if robot is not self._robot or mapping is None:
-            raise PolicyMismatch(f"{self.source}: there was no action on {robot.prefix!r} yet.", hint="Call act().")
+            raise PolicyMismatch(f"{self.source}: {robot.prefix!r} has had no action yet.", hint="Call act() first.")
         robot.ctrl_array[mapping.ctrl] = mapping.torques(self._targets, RobotState.of(robot))
 
     def __repr__(self) -> str:
@@ -199,10 +200,10 @@ def load(onnx: str | PathLike[str], toml: str | PathLike[str] | None = None) -> 
 
     Args:
         onnx: The network.
-        toml: Its declaration; by default the file of the same name that ends in `.toml`.
+        toml: The declaration; by default, the file with the same name and the suffix `.toml`.
 
     Raises:
-        PolicyFileError: A file is missing or wrong.
+        PolicyFileError: A file is missing or invalid.
         ImportError: The extra `onnx` is not installed.
     """
     path = Path(onnx)

@@ -1,4 +1,4 @@
-"""What a policy uses of a robot: an articulation of either flavour, and its state, alone or in a batch."""
+"""The interface that a policy needs from a robot of either flavour, and the robot's state, single or batched."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["PolicyCamera", "PolicyRobot", "RobotState"]
 
 
 class PolicyCamera(Protocol):
-    """What a policy uses of a camera of either flavour."""
+    """The interface that a policy needs from a camera of either flavour."""
 
     @property
     def mode(self) -> CameraMode | str:
-        """What its pixels mean."""
+        """Meaning of the pixels."""
         ...
 
     @property
@@ -37,7 +37,7 @@ class PolicyCamera(Protocol):
 
 
 class PolicyRobot(Protocol):
-    """What a policy uses of an articulation of either flavour."""
+    """The interface that a policy needs from an articulation of either flavour."""
 
     @property
     def prefix(self) -> str:
@@ -66,7 +66,7 @@ class PolicyRobot(Protocol):
 
     @property
     def control_mode(self) -> ControlMode:
-        """Whether the controller is in force."""
+        """Whether the controller is active or bypassed."""
         ...
 
     @property
@@ -100,7 +100,7 @@ class PolicyRobot(Protocol):
 
 
 class RobotState(NamedTuple):
-    """The state of a robot, or of a batch of them.
+    """The state of one robot or of a batch.
 
     Attributes:
         qpos: Joint positions in the order of `qpos_array`, shape (…, nq).
@@ -114,7 +114,7 @@ class RobotState(NamedTuple):
 
     @classmethod
     def of(cls, robot: PolicyRobot) -> RobotState:
-        """Return the state that an articulation has now."""
+        """Return the current state of an articulation."""
         return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
 
     @property
@@ -133,7 +133,7 @@ class RobotState(NamedTuple):
         return self.qvel[..., 3:6]
 
     def _rotation(self) -> Floats:
-        """Return what turns vectors of the base frame into the world frame, shape (…, 3, 3)."""
+        """Return the rotation from the base frame to the world frame, shape (…, 3, 3)."""
         w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,4 +1,4 @@
-"""Running a policy on a client: refuse what does not fit, then act, step, and count."""
+"""Runs a policy on a client: checks that it fits, then acts, steps and counts."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ _SMOOTHING_S: Final = 0.5
 _TIMESTEP_TOLERANCE: Final = 1e-9
 
 OnAction = Callable[["PolicyRun"], None]
-"""Called after each action with the run so far."""
+"""Callback invoked after each action with the run so far."""
 
 
 class PolicyRun(Serializable, Struct):
-    """What came of running a policy.
+    """The result of running a policy.
 
     Attributes:
         articulation: Key of the robot.
-        step_mode: How it was stepped.
-        actions: Actions taken.
-        steps: Physics steps taken; 0 in live mode, where nobody counts them.
-        sim_time: Simulated seconds.
-        wall_time: Seconds it took.
-        falls: Times the robot fell, each followed by a reset.
-        upright_time: Simulated seconds until the first fall, or `sim_time`.
-        distance: Length of the base's way, metres, as the sum of straight lines between two resets.
-        forward: Of that along the heading it had at each start, metres.
+        step_mode: Step mode of the session.
+        actions: Number of actions.
+        steps: Number of physics steps; 0 in live mode, where they are not counted.
+        sim_time: Simulated time, seconds.
+        wall_time: Wall time, seconds.
+        falls: Number of falls, each followed by a reset.
+        upright_time: Simulated time until the first fall, seconds, or `sim_time`.
+        distance: Distance covered by the base, metres, as the sum of straight lines between resets.
+        forward: Part of `distance` along the heading at each start, metres.
         velocity_error: Root mean square of commanded minus actual horizontal velocity, m/s, base frame, smoothed over
             half a second.
         reward: Mean reward per action.
-        goal_error: Distance of a sensor from the goal at the end, in its unit; None where nothing measures it.
-        late: Actions that came more than one period late, in live mode.
+        goal_error: Distance of a sensor from the goal at the end, in the sensor's unit; None if no sensor measures it.
+        late: Number of actions that were more than one period late, in live mode.
     """
 
     articulation: str
@@ -76,36 +76,38 @@ class PolicyRun(Serializable, Struct):
 
 
 def require(client: AsyncClient, policy: Policy, articulation: str | None = None) -> URLabArticulation:
-    """Check that a policy can drive its robot through a client as it is, and return the robot.
+    """Check that a policy can control its robot through a client in its current state, and return the robot.
 
     Args:
         client: A discovered client.
         policy: The policy.
-        articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
+        articulation: Key, actor id or class name of the robot, instead of the declared one.
 
     Raises:
-        PolicyMismatch: It cannot; says what is there, what is required, and how to get it.
-        PolicyFileError: The network has other sizes than the declaration.
+        PolicyMismatch: The policy cannot control the robot. The message names what was found, what is required, and
+            how to change it.
+        PolicyFileError: The sizes of the network differ from the declaration.
     """
     spec, source = policy.spec, policy.source
     if client.model is None or not client.articulations:
         raise PolicyMismatch(
-            f"{source}: the client knows no articulation to act on.",
-            hint="Start play and call discover() first, with local_model=True.",
+            f"{source}: the client has discovered no articulation to act on.",
+            hint="Start play, then call discover() with local_model=True.",
         )
     name = articulation or spec.robot
     robot = client.articulations.get(name)
     if robot is None:
         raise PolicyMismatch(
-            f"{source}: robot: no articulation is called {name!r}; there are: {', '.join(client.articulations)}.",
+            f"{source}: robot: no articulation is called {name!r}; the articulations are: "
+            f"{', '.join(client.articulations)}.",
             hint="Name one of them, by its key, actor id or class name.",
         )
     if client.step_mode not in spec.step_modes:
         wanted = " or ".join(map(repr, map(str, spec.step_modes)))
         raise PolicyMismatch(
             f"{source}: the session steps in {str(client.step_mode)!r} mode; step_modes requires {wanted}.",
-            hint=f"Make the client with step_mode={str(spec.step_modes[0])!r}; a server that pins its mode must be "
-            "told there.",
+            hint=f"Make the client with step_mode={str(spec.step_modes[0])!r}. If the server pins its mode, change "
+            "the mode there.",
         )
     timestep = float(client.model.opt.timestep)
     if abs(timestep - spec.timestep) > _TIMESTEP_TOLERANCE:
@@ -119,17 +121,17 @@ def require(client: AsyncClient, policy: Policy, articulation: str | None = None
 
 
 def _require_control(robot: URLabArticulation, mapping: PolicyMapping, source: str) -> None:
-    """Check that set-points will mean what the declaration says."""
+    """Check that set-points have the meaning that the declaration requires."""
     action, key, controller = mapping.spec.action, robot.prefix, robot.controller
-    in_force = controller is not None and robot.control_mode is not ControlMode.RAW
+    active = controller is not None and robot.control_mode is not ControlMode.RAW
     if action.via == "controller":
         if controller is None or controller.kind != ControllerKind.PD:
-            there = "no controller" if controller is None else f"a {controller.kind} controller"
+            actual = "no controller" if controller is None else f"a {controller.kind} controller"
             raise PolicyMismatch(
-                f"{source}: {key!r} has {there}; action.via = 'controller' requires a PD controller.",
-                hint=f"Serve it with --controller {robot.actor_id or key}=pd, or give it one in the editor.",
+                f"{source}: {key!r} has {actual}; action.via = 'controller' requires a PD controller.",
+                hint=f"Serve it with --controller {robot.actor_id or key}=pd, or add one in the editor.",
             )
-        if not in_force:
+        if not active:
             raise PolicyMismatch(
                 f"{source}: the controller of {key!r} is bypassed; action.via = 'controller' requires it.",
                 hint="Set articulation.control_mode = 'ue_controller'.",
@@ -137,11 +139,11 @@ def _require_control(robot: URLabArticulation, mapping: PolicyMapping, source: s
         bound = controller.params.get("kp", {})
         if missing := [actuator.name for actuator in mapping.actuators if actuator.name not in bound]:
             raise PolicyMismatch(f"{source}: the controller of {key!r} does not drive {', '.join(missing)}.")
-    elif in_force:
+    elif active:
         raise PolicyMismatch(
-            f"{source}: {key!r} has a controller in force; action.via = {action.via!r} requires that set-points reach "
+            f"{source}: {key!r} has an active controller; action.via = {action.via!r} requires that set-points reach "
             "the actuators unchanged.",
-            hint="Set articulation.control_mode = 'raw', which works in direct mode, or serve it without a controller.",
+            hint="In direct mode, set articulation.control_mode = 'raw'. Or serve the robot without a controller.",
         )
     servo = action.kind == "joint_position" and action.via == "actuators"
     required = ActuatorType.POSITION if servo else ActuatorType.MOTOR
@@ -149,7 +151,7 @@ def _require_control(robot: URLabArticulation, mapping: PolicyMapping, source: s
         raise PolicyMismatch(
             f"{source}: actuator {other[0].name!r} of {key!r} is a {other[0].type}; action.kind = {action.kind!r} via "
             f"{action.via!r} requires a {required}.",
-            hint="Change action.kind or action.via to what the robot has.",
+            hint="Change action.kind or action.via to match the robot.",
         )
 
 
@@ -163,24 +165,24 @@ async def run(
     until_fall: bool = False,
     on_action: OnAction | None = None,
 ) -> PolicyRun:
-    """Let a policy drive its robot for some simulated seconds.
+    """Run a policy on its robot for some simulated seconds.
 
-    Starts with a reset, and resets after each fall. In direct mode physics advances by `decimation` steps per action;
-    in live mode it advances by itself, is unpaused, and gets an action every period of its own clock. A PD controller
-    gets the declared gains; those it had are put back at the end.
+    The run starts with a reset, and resets after each fall. In direct mode, physics advances by `decimation` steps per
+    action. In live mode, the run unpauses physics, which advances on its own, and sends one action per period of the
+    simulation clock. A PD controller uses the declared gains during the run; afterwards its own gains are restored.
 
     Args:
         client: A discovered client.
         policy: The policy.
-        articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
-        seconds: Simulated seconds.
-        seed: Seed of the first reset, which decides what a server varies.
-        until_fall: End with the first fall.
-        on_action: Called after each action.
+        articulation: Key, actor id or class name of the robot, instead of the declared one.
+        seconds: Duration, simulated seconds.
+        seed: Seed of the first reset, which determines what the server varies.
+        until_fall: Whether to end the run at the first fall.
+        on_action: Callback invoked with the run so far after each action.
 
     Raises:
-        PolicyMismatch: The policy cannot drive this robot in this session; nothing was moved.
-        URLabError: The server refused something, or physics stands still in live mode.
+        PolicyMismatch: The policy cannot control this robot in this session. Nothing was moved.
+        URLabError: The server refused a request, or physics is paused in live mode.
     """
     robot = require(client, policy, articulation)
     before: dict[str, dict[str, float]] = {}
@@ -193,7 +195,7 @@ async def run(
         return await _PolicyLoop(client, robot, policy, on_action).until(seconds, seed, until_fall=until_fall)
     finally:
         if controller is not None and client.connected:
-            with contextlib.suppress(URLabError):  # a courtesy: play may be over
+            with contextlib.suppress(URLabError):  # best effort: play may have ended
                 await controller.configure(timeout=DEFAULT, **before)
 
 
@@ -205,13 +207,13 @@ def run_blocking(
     seconds: float = 10.0,
     on_action: OnAction | None = None,
 ) -> PolicyRun:
-    """Do what `run` does with a blocking client."""
+    """Run a policy like `run`, with a blocking client."""
     portal = portal_of(client)
     return portal.call(run, aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
 
 
 class _PolicyLoop:
-    """One run of a policy, and what it adds up."""
+    """One run of a policy and its statistics."""
 
     def __init__(
         self, client: AsyncClient, robot: URLabArticulation, policy: Policy, on_action: OnAction | None
@@ -257,7 +259,7 @@ class _PolicyLoop:
         return result
 
     async def _restart(self, seed: int | None = None) -> None:
-        """Put the simulation at its start; the policy forgets."""
+        """Reset the simulation and the policy."""
         self._travelled = (self._result.distance, self._result.forward)
         await self._client.reset(self._policy.spec.keyframe, seed)
         if self._cameras:
@@ -285,18 +287,18 @@ class _PolicyLoop:
         self._result.steps += spec.decimation
 
     async def _live_action(self) -> None:
-        """Send an action, and wait until the simulation's clock is one period further."""
+        """Send an action, and wait until the simulation clock has advanced by one period."""
         client, period = self._client, self._policy.spec.period
         loop = asyncio.get_running_loop()
         self._policy.act(self._robot, client.sim_time - self._began)
-        await client.step()  # stamps the set-points, and reads
+        await client.step()  # sends the set-points and reads the state
         self._due += period
-        give_up = loop.time() + _STANDSTILL_S
+        deadline = loop.time() + _STANDSTILL_S
         while (missing := self._due - client.sim_time) > 0:
-            if loop.time() > give_up:
+            if loop.time() > deadline:
                 raise URLabError(
                     f"Physics stands still at {client.sim_time:.2f} s.",
-                    hint="Something paused it: client.runtime.set_paused(False), or `urlab doctor`.",
+                    hint="If it is paused, call client.runtime.set_paused(False). Otherwise run `urlab doctor`.",
                 )
             await asyncio.sleep(missing)
             await client.step(include_cameras=self._look)
@@ -305,12 +307,12 @@ class _PolicyLoop:
             self._due = client.sim_time
 
     def _require_pictures(self) -> None:
-        """Refuse to go on with pictures of earlier states."""
+        """Raise an error if a picture is from an earlier state."""
         for term in self._policy.spec.pictures:
             if not self._robot.cameras[term.camera].delivered:
                 raise URLabError(
                     f"The server sent no picture of camera {term.camera!r} of {self._robot.prefix!r}.",
-                    hint="`urlab doctor` says whether the server can draw.",
+                    hint="Run `urlab doctor` to check whether the server can draw.",
                 )
 
     def _count(self, last_action: Floats, wall_time: float) -> None:
@@ -331,7 +333,7 @@ class _PolicyLoop:
             result.distance = self._travelled[0] + float(np.hypot(*way))
             result.forward = self._travelled[1] + float(way @ self._heading)
             error = policy.command[:2] - state.linear_velocity[:2]
-            # Steps make the base sway; what counts is where it goes.
+            # Walking makes the base sway; smoothing leaves the mean velocity.
             self._velocity += min(1.0, elapsed / _SMOOTHING_S) * (error - self._velocity)
             self._squared_error += float(self._velocity @ self._velocity)
             result.velocity_error = (self._squared_error / result.actions) ** 0.5

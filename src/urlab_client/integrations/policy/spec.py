@@ -1,7 +1,7 @@
-"""The file beside a network that says what it sees and what its outputs mean.
+"""The TOML file of a network, which declares its observations and the meaning of its outputs.
 
-Decoding is strict: an unknown key, a wrong type or a value that cannot work is a `PolicyFileError` that names the file,
-the key, and what would be right. Whether joints and sensors exist is known only with a robot: see `mapping`.
+Decoding is strict: an unknown key, a wrong type or an invalid value raises a `PolicyFileError` that names the file, the
+key and the valid choices. Whether joints and sensors exist is checked against a robot: see `mapping`.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ __all__ = [
 
 
 class PolicyFileError(URLabError, ValueError):
-    """A policy's files cannot be used; says which file, where in it, and what would be right."""
+    """The files of a policy cannot be used. The message names the file, the place in it and the valid choices."""
 
 
 class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """What the network's outputs mean: `offset + scale * clip(output)`, one for each joint.
+    """Meaning of the network's outputs: `offset + scale * clip(output)`, one output per joint.
 
     Attributes:
         kind: `joint_position` for targets in rad or m, `torque` for N m or N.
-        via: Who brings joints to their targets. `controller`: the articulation's PD controller, before each physics
-            step, with `gains`. `client`: this client, before each physics step, with `gains`. `actuators`: set-points
-            go straight to the actuators, which are position servos for targets and motors for torques.
+        via: How the robot reaches the targets. `controller`: the articulation's PD controller acts before each physics
+            step, with `gains`. `client`: this client acts before each physics step, with `gains`. `actuators`:
+            set-points go directly to the actuators, which are position servos for targets and motors for torques.
         joints: Joint names, in the order of the outputs.
-        scale: Factor, one or one for each joint.
-        offset: Joint position or torque for an output of 0, one or one for each joint.
-        clip: Lowest and highest output that is used.
+        scale: Factor, a single number or one per joint.
+        offset: Joint position or torque for an output of 0, a single number or one per joint.
+        clip: Lowest and highest output; outputs beyond them are clipped.
     """
 
     kind: Literal["joint_position", "torque"] = "joint_position"
@@ -70,21 +70,21 @@ class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if len(set(self.joints)) != len(self.joints):
-            raise ValueError("joints names a joint twice")
+            raise ValueError("joints contains a joint twice")
         check_numbers("scale", self.scale, len(self.joints))
         check_numbers("offset", self.offset, len(self.joints))
         check_clip(self.clip)
         if self.kind == "torque" and self.via != "actuators":
-            raise ValueError(f"torques go via 'actuators', not via {self.via!r}")
+            raise ValueError(f"kind = 'torque' requires via = 'actuators', not {self.via!r}")
 
 
 class Gains(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     """Gains of the PD law: `clamp(kp (target - position) - kv velocity)`.
 
     Attributes:
-        kp: N m/rad or N/m, one or one for each joint of the action.
-        kv: N m s/rad or N s/m, likewise.
-        torque_limit: N m or N, likewise.
+        kp: Position gain, N m/rad or N/m, a single number or one per joint of the action.
+        kv: Velocity gain, N m s/rad or N s/m, a single number or one per joint of the action.
+        torque_limit: Largest torque or force, N m or N, a single number or one per joint of the action.
     """
 
     kp: Numbers
@@ -96,16 +96,16 @@ class Gains(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
             value: Numbers = getattr(self, name)
             check_numbers(name, value)
             if min(listed(value)) < 0:
-                raise ValueError(f"{name} is 0 or more")
+                raise ValueError(f"{name} must be 0 or more")
 
 
 class Command(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     """The commands the network was trained for: (vx, vy, yaw rate), m/s and rad/s, base frame.
 
     Attributes:
-        default: Used when none is given.
-        low: Lowest of each.
-        high: Highest of each.
+        default: Command used if none is given.
+        low: Lowest value of each component.
+        high: Highest value of each component.
     """
 
     default: tuple[float, float, float]
@@ -118,12 +118,12 @@ class Command(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
 
 class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The goals the network was trained for, in units and frame of its own: metres in the world's frame, for example.
+    """The goals the network was trained for, in its own units and frame, for example metres in the world frame.
 
     Attributes:
-        default: Used when none is given.
-        low: Lowest of each number.
-        high: Highest of each number.
+        default: Goal used if none is given.
+        low: Lowest value of each component.
+        high: Highest value of each component.
     """
 
     default: Annotated[list[float], Meta(min_length=1)]
@@ -132,17 +132,17 @@ class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if not len(self.default) == len(self.low) == len(self.high):
-            raise ValueError("default, low and high need the same number of numbers")
+            raise ValueError("default, low and high must have the same length")
         if not all(low <= value <= high for low, value, high in zip(self.low, self.default, self.high, strict=True)):
             raise ValueError(f"default {self.default} is not between low and high")
 
 
 class Fall(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """When the robot has fallen, which ends an attempt.
+    """Limits beyond which the robot has fallen, which ends an attempt.
 
     Attributes:
-        height: Of the free base, metres, below which it has.
-        upright: Cosine of the tilt below which it has.
+        height: Lowest height of the free base, metres.
+        upright: Lowest cosine of the tilt.
     """
 
     height: float = -math.inf
@@ -153,23 +153,23 @@ _Weight = Annotated[float, Meta(ge=0)]
 
 
 class TrackingReward(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """How well a robot with a free base follows its command; what the network was trained on, per action.
+    """Reward per action for a robot with a free base that follows a command, as used in training.
 
     `alive + velocity exp(-|Δv|² / velocity_width) + yaw exp(-Δω² / yaw_width) + level exp(-|g_xy|² / level_width)`
     `- bounce v_z² - roll |ω_xy|² - change |Δoutput|² - spread Σ q²`, and 0 after a fall.
 
     Attributes:
-        alive: For each action before a fall.
-        velocity: For the horizontal velocity, base frame.
-        velocity_width: (m/s)².
-        yaw: For the yaw rate.
-        yaw_width: (rad/s)².
-        level: For a level base.
-        level_width: Square of the sine of the tilt.
-        bounce: Against vertical velocity, per (m/s)².
-        roll: Against roll and pitch rates, per (rad/s)².
-        change: Against changes of the outputs.
-        spread: Against positions of `spread_joints`, per rad².
+        alive: Reward for each action before a fall.
+        velocity: Weight of the horizontal velocity, base frame.
+        velocity_width: Width of the velocity term, (m/s)².
+        yaw: Weight of the yaw rate.
+        yaw_width: Width of the yaw term, (rad/s)².
+        level: Weight of a level base.
+        level_width: Width of the level term, squared sine of the tilt.
+        bounce: Penalty on vertical velocity, per (m/s)².
+        roll: Penalty on roll and pitch rates, per (rad/s)².
+        change: Penalty on changes of the outputs.
+        spread: Penalty on the positions of `spread_joints`, per rad².
         spread_joints: Joint names.
     """
 
@@ -191,19 +191,19 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     """A policy's declaration.
 
     Attributes:
-        robot: The articulation it was made for: key, actor id or class name.
-        step_modes: Step modes it can work in.
-        timestep: Physics timestep it was made for, seconds.
+        robot: Articulation that the policy controls: key, actor id or class name.
+        step_modes: Supported step modes.
+        timestep: Physics timestep the policy was trained with, seconds.
         decimation: Physics steps per action.
-        keyframe: Keyframe to start from; the initial state without.
-        history: Observations that the network sees at once, oldest first.
-        observation: What one observation consists of, in order.
-        action: What the outputs mean.
-        gains: Of the PD law; needed unless the action goes via `actuators`.
-        command: Commands it understands; needed by the term `command`.
-        goal: Goals it can reach; needed by the term `goal`.
-        fall: When it has fallen; never without.
-        reward: What it was trained on, for the figures of a run.
+        keyframe: Keyframe to start from, or None for the initial state.
+        history: Number of observations in one network input, oldest first.
+        observation: Terms of one observation, in order.
+        action: Meaning of the outputs.
+        gains: Gains of the PD law; required unless the action goes via `actuators`.
+        command: Supported commands; required by the term `command`.
+        goal: Supported goals; required by the term `goal`.
+        fall: Limits beyond which the robot has fallen. Without them it never falls.
+        reward: Training reward, for the figures of a run.
     """
 
     robot: str
@@ -222,14 +222,14 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if bad := [str(mode) for mode in self.step_modes if mode not in (StepMode.DIRECT, StepMode.LIVE)]:
-            raise ValueError(f"step_modes must be 'direct' and 'live', not {bad[0]!r}")
+            raise ValueError(f"step_modes can contain 'direct' and 'live', not {bad[0]!r}")
         if self.action.via == "client" and StepMode.LIVE in self.step_modes:
             raise ValueError(
-                "step_modes cannot have 'live' with action.via = 'client': only a controller keeps pace with physics"
+                "step_modes cannot contain 'live' with action.via = 'client': only a controller keeps pace with physics"
             )
         if (self.gains is None) is not (self.action.via == "actuators"):
-            what = "has no use for" if self.gains else "needs"
-            raise ValueError(f"action.via = {self.action.via!r} {what} the table [gains]")
+            verb = "does not use" if self.gains else "needs"
+            raise ValueError(f"action.via = {self.action.via!r} {verb} the table [gains]")
         if self.gains is not None:
             for name in ("kp", "kv", "torque_limit"):
                 check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
@@ -241,17 +241,17 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def _check_inputs(self) -> None:
         if self.named and not all(term.input for term in self.observation):
-            raise ValueError("each term of the observation needs its `input`, or none has one")
+            raise ValueError("either every term of the observation has an `input`, or none has")
         pictures = [term.input for term in self.pictures]
         others = {term.input for term in self.observation if not isinstance(term, PictureTerm)}
         if twice := [name for name in pictures if pictures.count(name) > 1 or name in others]:
-            raise ValueError(f"a picture needs an input of its own, but {twice[0]!r} is of several terms")
+            raise ValueError(f"a picture needs its own input, but several terms use {twice[0]!r}")
         if pictures and self.history > 1:
             raise ValueError("history must be 1 with the term 'picture'")
 
     @property
     def named(self) -> bool:
-        """Whether the network has several inputs, told apart by name."""
+        """Whether the network has named inputs."""
         return any(term.input for term in self.observation)
 
     @property
@@ -260,15 +260,15 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
         return [term for term in self.observation if isinstance(term, PictureTerm)]
 
     def simulated(self, model: str, actor: str) -> str:
-        """Return the `sim://` address of a server that has what the policy needs, of one robot.
+        """Return the `sim://` address of a server with one robot and everything the policy needs.
 
         Args:
-            model: What `sim://` takes.
-            actor: What a server calls it.
+            model: Model, as in a `sim://` address.
+            actor: Actor name of the robot on the server.
         """
         options = [("controller", f"{actor}=pd")] if self.action.via == "controller" else []
         sizes = {"x".join(map(str, term.size)) for term in self.pictures}
-        options += [("camera-size", size) for size in sorted(sizes)[:1]]  # more sizes are the MJCF's to say
+        options += [("camera-size", size) for size in sorted(sizes)[:1]]  # other sizes must be set in the MJCF
         options += [("camera-mode", f"{actor}/{term.camera}={term.mode}") for term in self.pictures]
         return f"sim://{model}{'?' if options else ''}{urlencode(options)}"
 
@@ -282,23 +282,23 @@ def read_spec(path: Path) -> PolicySpec:
     """Read a policy's TOML file.
 
     Raises:
-        PolicyFileError: It cannot be read, is not TOML, or does not declare a policy.
+        PolicyFileError: The file cannot be read, is not TOML, or does not declare a policy.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
         raise PolicyFileError(
-            f"{path}: cannot be read: {reason}.", hint="A policy is a .onnx file and a .toml file beside it."
+            f"{path}: cannot be read: {reason}.", hint="A policy is a .onnx file with a .toml file beside it."
         ) from None
     return parse_spec(text, str(path))
 
 
 def parse_spec(text: str, source: str) -> PolicySpec:
-    """Read a declaration; `source` names it in errors.
+    """Parse a declaration; `source` names it in errors.
 
     Raises:
-        PolicyFileError: It is not TOML, or does not declare a policy.
+        PolicyFileError: The text is not TOML, or does not declare a policy.
     """
     try:
         raw = tomllib.loads(text)
@@ -309,9 +309,9 @@ def parse_spec(text: str, source: str) -> PolicySpec:
     except msgspec.ValidationError as error:
         problem, separator, path = str(error).rpartition(" - at `")
         where = path.rstrip("`").removeprefix("$").removeprefix(".") if separator else ""
-        said = problem if separator else str(error)
+        message = problem if separator else str(error)
         at = f" {where}:" if where else ""
-        raise PolicyFileError(f"{source}:{at} {said}.", hint=_advice(raw, said, where)) from None
+        raise PolicyFileError(f"{source}:{at} {message}.", hint=_advice(raw, message, where)) from None
 
 
 _TERMS: Final[dict[str, type[Struct]]] = {str(kind.__struct_config__.tag): kind for kind in get_args(Term)}
@@ -327,7 +327,7 @@ _TABLES: Final[dict[str, type[Struct]]] = {
 
 
 def _advice(raw: dict[str, Any], problem: str, where: str) -> str | None:
-    """Say what would be right at a place of the file, where that is a choice of names."""
+    """Return a hint that lists the valid names at a place in the file, or None if it is not a choice of names."""
     if where.startswith("observation"):
         if where.endswith("term") or "`term`" in problem:
             return f"Terms are {', '.join(_TERMS)}."

@@ -1,4 +1,4 @@
-"""What an observation of a policy consists of: the terms of a declaration."""
+"""The terms of a declaration, which make up the observations of a policy."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 Numbers = float | list[float]
-"""One number for all, or one for each."""
+"""A single number for all, or one per element."""
 
 Positive = Annotated[float, Meta(gt=0)]
 
@@ -41,11 +41,11 @@ class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, 
     """One part of an observation: `clip((value - offset) * scale)`.
 
     Attributes:
-        scale: Factor, one or one for each number.
-        offset: What is subtracted before, one or one for each number.
+        scale: Factor, a single number or one per value.
+        offset: Offset subtracted before scaling, a single number or one per value.
         clip: Lowest and highest result.
-        input: The network's input that the numbers are part of, behind those of earlier terms; empty where the network
-            has only one.
+        input: Name of the network input that the values belong to, after those of earlier terms; empty if the network
+            has only one input.
     """
 
     scale: Numbers = 1.0
@@ -99,7 +99,7 @@ class SensorTerm(_Term, tag="sensor", kw_only=True, forbid_unknown_fields=True, 
     """The reading of a sensor, in its own units and frame.
 
     Attributes:
-        sensor: Its name.
+        sensor: Name of the sensor.
     """
 
     sensor: str
@@ -110,21 +110,22 @@ class CommandTerm(_Term, tag="command", kw_only=True, forbid_unknown_fields=True
 
 
 class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """What the policy is to reach, such as a place in the world; as many numbers as the table `goal` has.
+    """The goal of the policy, such as a position in the world; as many numbers as in the table `goal`.
 
     Attributes:
-        relative_to: Sensor whose reading is subtracted, so that the term is the way that is left; none if empty.
+        relative_to: Sensor whose reading is subtracted, so that the term is the remaining distance vector. Empty for
+            no subtraction.
     """
 
     relative_to: str = ""
 
 
 class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The network's last output after clipping, zeros at the start; one number for each joint of the action."""
+    """The network's last output after clipping, zeros at the start; one number per joint of the action."""
 
 
 class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Sine and cosine of a phase that goes on by itself; 2 numbers.
+    """Sine and cosine of a phase that advances with time; 2 numbers.
 
     Attributes:
         hz: Cycles per second.
@@ -134,16 +135,16 @@ class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, f
 
 
 class PictureTerm(Struct, tag_field="term", tag="picture", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """What a camera of the robot sees, in an input of its own, as environments observe it.
+    """The picture of a camera of the robot, in its own network input and in the format of environments.
 
-    `real` is RGB, uint8 of shape (H, W, 3); `depth` metres, float32 of shape (H, W); `semantic` and `instance` are
-    BGRA, uint8 of shape (H, W, 4).
+    `real` is RGB, uint8 of shape (H, W, 3). `depth` is in metres, float32 of shape (H, W). `semantic` and `instance`
+    are BGRA, uint8 of shape (H, W, 4).
 
     Attributes:
-        camera: Its name.
-        input: The network's input.
+        camera: Name of the camera.
+        input: Name of the network input.
         size: Width and height, pixels.
-        mode: What the pixels mean.
+        mode: Meaning of the pixels.
     """
 
     camera: str
@@ -169,29 +170,29 @@ Term = NumberTerm | PictureTerm
 
 
 def listed(value: Numbers) -> list[float]:
-    """Return numbers as a list, of one where there is one."""
+    """Return numbers as a list; a single number becomes a list of one."""
     return value if isinstance(value, list) else [value]
 
 
 def check_numbers(name: str, value: Numbers, length: int | None = None) -> None:
-    """Refuse numbers that are missing, not finite, or not one or as many as they should be.
+    """Check that numbers are present, finite, and either a single one or as many as expected.
 
     Raises:
-        ValueError: They are.
+        ValueError: A check fails.
     """
     if not value and isinstance(value, list):
         raise ValueError(f"{name} is empty")
     if not all(map(math.isfinite, listed(value))):
-        raise ValueError(f"{name} holds NaN or infinity")
+        raise ValueError(f"{name} contains NaN or infinity")
     if length is not None and isinstance(value, list) and len(value) != length:
         raise ValueError(f"{name} has {len(value)} numbers; it takes one, or one for each of the action's {length}")
 
 
 def check_clip(clip: tuple[float, float] | None) -> None:
-    """Refuse limits that are not in order.
+    """Check that the limits are in order.
 
     Raises:
-        ValueError: They are not.
+        ValueError: The lower limit is not below the upper one.
     """
     if clip is not None and not clip[0] < clip[1]:
-        raise ValueError(f"clip is [low, high], not {list(clip)}")
+        raise ValueError(f"clip must be [low, high] with low < high, not {list(clip)}")

@@ -1,4 +1,4 @@
-"""Teleoperation: moving a robot's hand by velocities, from keys, a gamepad or a script, and recording episodes of it.
+"""Teleoperation: velocity control of a robot's hand from keys, a gamepad or a script, and recording of episodes.
 
 Needs the extra `teleop`, and `gym` for tasks.
 """

@@ -1,4 +1,4 @@
-"""`HandControl`: velocities of a hand become set-points of the joints that move it."""
+"""`HandControl`: converts hand velocities to set-points of the joints that move the hand."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from urlab_client.sync.client import URLabClient
 
 __all__ = ["HandControl"]
 
-_LEASH_M: Final = 0.1
-"""How far the target may be ahead of the hand: no farther when the hand is stopped by what it pushes against."""
+_MAX_LEAD_M: Final = 0.1
+"""Largest distance of the target from the hand, so that the target stays close when the hand meets an obstacle."""
 
 _GRIPPER_S: Final = 0.5  # from open to closed
 _TOLERANCE_M: Final = 1e-3
 
 
 class HandControl:
-    """Moves a site of a robot, its hand, by velocities in the world's frame, and opens and closes its gripper.
+    """Moves a site of a robot (its hand) by velocities in the world frame, and opens and closes the gripper.
 
-    A target moves with the velocity, and inverse kinematics turns it into set-points within all limits. It stops at the
-    edge of the reachable, and a tenth of a metre ahead of a hand that is held up. `hold` begins anew where the hand is,
-    which is right after a reset.
+    A target moves with the commanded velocity, and inverse kinematics converts its pose to set-points within all
+    limits. The target stops at the edge of the workspace, and at most 0.1 m ahead of an obstructed hand. `hold` moves
+    the target to the current pose of the hand; call it after a reset.
 
     Attributes:
         ik: The inverse kinematics.
         key: Key of the articulation.
         gripper: Name of the actuator that opens and closes the gripper, or None.
         speed: Largest speed, m/s.
-        turn_speed: Largest rate of turn, rad/s.
-        set_points: Those that were set last, by actuator name.
-        blocked: Whether the target could not move as it was told to last.
+        turn_speed: Largest angular speed, rad/s.
+        set_points: The latest set-points, by actuator name.
+        blocked: Whether the target could not follow the last command.
     """
 
     def __init__(
@@ -52,20 +52,20 @@ class HandControl:
         speed: float = 0.25,
         turn_speed: float = 1.0,
     ) -> None:
-        """Prepare, and hold the hand where it is.
+        """Set up the control, and hold the hand at its current pose.
 
         Args:
             client: A client of either flavour after `discover()`, with a local model.
-            articulation: Key of the robot; not needed where there is only one.
-            site: The hand; not needed where the robot has one site.
-            gripper: Actuator of the gripper; by default the one that does not move the hand, if there is just one.
+            articulation: Key of the robot; optional if the scene has only one.
+            site: Site of the hand; optional if the robot has only one.
+            gripper: Actuator of the gripper; by default, the only actuator that does not move the hand, if any.
             speed: Largest speed, m/s.
-            turn_speed: Largest rate of turn, rad/s.
+            turn_speed: Largest angular speed, rad/s.
 
         Raises:
-            KeyError: There is no such articulation, site or actuator.
-            ValueError: A speed is not above 0, the gripper has no range, or nothing that is held at a position moves
-                the hand.
+            KeyError: The articulation, site or actuator does not exist.
+            ValueError: A speed is not above 0, the gripper has no range, or no position-controlled joint moves the
+                hand.
             URLabError: The client has no local model, or the robot or the site must be named.
         """
         robots = client.articulations
@@ -78,19 +78,22 @@ class HandControl:
         self.turn_speed: float = _above_zero("turn_speed", turn_speed)
         self.blocked: bool = False
         self.set_points: dict[str, float] = {}
-        present = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
-        found = self._gripper(gripper, present)
+        solution = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
+        found = self._gripper(gripper, solution)
         self.gripper: str | None = None if found is None else found.name
         self._range = (0.0, 0.0) if found is None else found.ctrlrange or (0.0, 0.0)
         self.hold()
 
     @property
     def target(self) -> tuple[Floats, Floats]:
-        """Where the hand is to be: position, metres, and orientation (w, x, y, z), world frame."""
+        """Target pose of the hand: position, metres, and orientation (w, x, y, z), world frame."""
         return self._position.copy(), self._quaternion.copy()
 
     def hold(self) -> None:
-        """Aim at where the hand is, and set the set-points that keep it there. The gripper keeps its set-point."""
+        """Move the target to the current pose of the hand, and set the set-points that keep it there.
+
+        The gripper keeps its set-point.
+        """
         self._position, self._quaternion = self.ik.pose()
         self._joints = {name: float(self._robot.joints[name].position) for name in self.ik.joints}
         self._opening = 0.0 if self.gripper is None else self._robot.actuators[self.gripper].value
@@ -98,19 +101,21 @@ class HandControl:
         self._aim(self._position, self._quaternion)
 
     def drive(self, linear: Vector, angular: Vector = (0, 0, 0), gripper: float = 0.0, *, dt: float) -> bool:
-        """Move the target on, and set the set-points. They travel with the next step.
+        """Advance the target, and set the set-points. The next step sends them.
 
         Args:
-            linear: Velocity as a share of `speed`, world frame, shape (3,); a longer one than 1 counts as 1.
-            angular: Rate of turn as a share of `turn_speed`, likewise: about the world's axes.
-            gripper: Towards its largest set-point (1) or its smallest (-1); what is in between is slower.
-            dt: Seconds that this is for.
+            linear: Velocity as a fraction of `speed`, world frame, shape (3,); its length is limited to 1.
+            angular: Angular velocity as a fraction of `turn_speed`, about the world axes, shape (3,); its length is
+                limited to 1.
+            gripper: Rate from -1 (towards the smallest set-point) to 1 (towards the largest).
+            dt: Duration of the command, seconds.
 
         Returns:
-            Whether the target could move so; if not, it stays.
+            Whether the target could move as commanded. If not, it stays.
 
         Raises:
-            ValueError: A number is NaN, infinite, or a vector has another length; nothing changed.
+            ValueError: A number is NaN or infinite, `dt` is not above 0, or a vector has the wrong length. Nothing
+                changed.
         """
         moving, turning = _within_one("linear", linear), _within_one("angular", angular)
         dt, opening = _above_zero("dt", dt), float(np.clip(finite("gripper", gripper), -1.0, 1.0))
@@ -119,13 +124,13 @@ class HandControl:
         hand, _ = self.ik.pose()
         ahead = self._position + self.speed * dt * moving - hand
         distance = float(np.linalg.norm(ahead))
-        position = hand + ahead * min(1.0, _LEASH_M / distance if distance else 1.0)
+        position = hand + ahead * min(1.0, _MAX_LEAD_M / distance if distance else 1.0)
         quaternion = _turned(self._quaternion, self.turn_speed * dt * turning)
         self.blocked = not self._aim(position, quaternion)
         return not self.blocked
 
     def _aim(self, position: Floats, quaternion: Floats) -> bool:
-        """Set the set-points for a pose; those of before if it is out of reach."""
+        """Set the set-points for a pose. If it is out of reach, keep the previous ones."""
         found = self.ik.solve(position, quaternion, start=self._joints, starts=1, tolerance=_TOLERANCE_M, nearest=True)
         if found.reached:
             self._position, self._quaternion, self._joints = position, quaternion, found.joints
@@ -141,7 +146,7 @@ class HandControl:
             others = [one for key, one in actuators.items() if key not in solution.set_points and one.ctrlrange]
             return others[0] if len(others) == 1 else None
         if actuators[name].ctrlrange is None:
-            raise ValueError(f"the gripper {name!r} has no control range to move in")
+            raise ValueError(f"the gripper {name!r} has no control range")
         return actuators[name]
 
     def __repr__(self) -> str:
@@ -153,7 +158,7 @@ def _only_site(client: URLabClient | AsyncClient, key: str) -> str:
     names = [] if client.model is None else model_names(client.model, "site")
     sites = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
     if client.model is not None and len(sites) != 1:
-        raise URLabError(f"Name the hand of {key!r}, one of its sites: it has {', '.join(sites) or 'none'}.")
+        raise URLabError(f"Name the site of the hand of {key!r}: it has {', '.join(sites) or 'none'}.")
     return sites[0] if sites else ""
 
 
@@ -172,7 +177,7 @@ def _above_zero(what: str, value: float) -> float:
 
 
 def _turned(quaternion: Floats, turn: Floats) -> Floats:
-    """Return an orientation (w, x, y, z) after a turn about the world's axes, rad."""
+    """Return an orientation (w, x, y, z) after a rotation about the world axes, rad."""
     angle = float(np.linalg.norm(turn))
     if not angle:
         return quaternion

@@ -1,4 +1,4 @@
-"""`KeyboardOperator`: keys as a terminal sends them, which tells when one is pressed but not when it is let go."""
+"""`KeyboardOperator`: keyboard control from a terminal, which reports key presses but not releases."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from urlab_client.integrations.teleop.session import TeleopCommand, TeleopView, 
 __all__ = ["HELP", "KeyboardOperator"]
 
 _HELD_S: Final = 0.12
-"""How long one press moves the hand: a little longer than keys that are held take to repeat."""
+"""Duration of the motion per key press: a little longer than the repeat interval of a held key."""
 
 _FINE: Final = 0.2
 
@@ -52,26 +52,26 @@ HELP: Final = (
     ("w s, a d, r f", "move along x, y, z; also the arrows for x and y; with shift slowly"),
     ("c z, b v, q e", "turn about x, y, z; with shift slowly"),
     ("space", "close or open the gripper"),
-    ("enter, n", "the episode is a success, a failure"),
+    ("enter, n", "end the episode as a success, as a failure"),
     ("backspace", "discard the episode"),
     ("ctrl-c", "end"),
 )
-"""Keys and what they do, world frame."""
+"""Keys and their effects, world frame."""
 
 
 class KeyboardOperator:
-    """Turns key presses into commands.
+    """Operator that converts key presses to commands.
 
     Attributes:
-        keys: Returns the characters that have come since the last call; empty for none.
+        keys: Function that returns the characters received since the last call, or an empty string.
     """
 
     def __init__(self, keys: Callable[[], str], *, clock: Callable[[], float] = time.monotonic) -> None:
         """Make an operator.
 
         Args:
-            keys: Returns the characters that have come since the last call.
-            clock: Seconds, of what keys are held by.
+            keys: Function that returns the characters received since the last call.
+            clock: Function that returns the time in seconds, for the duration of key presses.
         """
         self.keys = keys
         self._clock = clock

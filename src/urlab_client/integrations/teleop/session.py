@@ -1,4 +1,4 @@
-"""`teleoperate`: episode after episode, an operator moves the hand while a recording runs."""
+"""`teleoperate`: an operator moves the hand, episode by episode, while a recording runs."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Verdict = EpisodeOutcome | Literal["quit"]
 
 
 class TeleopCommand(Struct, frozen=True, kw_only=True):
-    """What an operator does in one period.
+    """The command of an operator for one period.
 
     Attributes:
-        linear: Velocity of the hand as a share of the largest, world frame.
-        angular: Rate of turn likewise, about the world's axes.
-        gripper: Towards its largest set-point (1) or its smallest (-1).
-        verdict: Ends the episode as `success`, `failure` or `discarded`, or with `quit` all; None goes on.
+        linear: Velocity of the hand as a fraction of the largest speed, world frame.
+        angular: Angular velocity as a fraction of the largest angular speed, about the world axes.
+        gripper: Rate from -1 (towards the smallest set-point) to 1 (towards the largest).
+        verdict: `success`, `failure` or `discarded` ends the episode; `quit` ends the session; None continues.
     """
 
     linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -46,7 +46,7 @@ class TeleopCommand(Struct, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> bool:
-        """Whether it moves anything."""
+        """Whether the command moves anything."""
         return any((*self.linear, *self.angular, self.gripper))
 
 
@@ -54,14 +54,14 @@ class TeleopView(Struct, frozen=True, kw_only=True):
     """What an operator sees in one period.
 
     Attributes:
-        episode: Number of the episode, from 0 on.
-        time: Simulated seconds since its beginning.
-        position: Where the hand is, metres, world frame, shape (3,).
-        quaternion: Its orientation (w, x, y, z), world frame, shape (4,).
-        goal: What the episode is about, as the task has it.
-        success: Whether the state is a success; None without a task that knows.
-        blocked: Whether the hand's target could not move as it was told to.
-        tally: Episodes up to now.
+        episode: Number of the episode, starting at 0.
+        time: Simulated time since the start of the episode, seconds.
+        position: Position of the hand, metres, world frame, shape (3,).
+        quaternion: Orientation of the hand, (w, x, y, z), world frame, shape (4,).
+        goal: Goal of the episode, as in `Start.goal` of the task.
+        success: Whether the state is a success; None if no task defines it.
+        blocked: Whether the target of the hand could not follow the last command.
+        tally: Episodes so far.
     """
 
     episode: int
@@ -75,12 +75,12 @@ class TeleopView(Struct, frozen=True, kw_only=True):
 
 
 class TeleopTally(Serializable, Struct, frozen=True):
-    """How many episodes ended how.
+    """Number of episodes by outcome.
 
     Attributes:
-        success: Successes.
-        failure: Failures.
-        discarded: Discarded episodes, and one that was broken off at the end.
+        success: Successful episodes.
+        failure: Failed episodes.
+        discarded: Discarded episodes, including one interrupted by the end of the session.
     """
 
     success: int = 0
@@ -89,10 +89,10 @@ class TeleopTally(Serializable, Struct, frozen=True):
 
 
 class Operator(Protocol):
-    """Who moves the hand: keys, a gamepad, or a script. Called once per period; may be a coroutine function."""
+    """Source of commands: keys, a gamepad or a script. Called once per period; may be a coroutine function."""
 
     def __call__(self, view: TeleopView, /) -> TeleopCommand | Awaitable[TeleopCommand]:
-        """Return what to do in the next period."""
+        """Return the command for the next period."""
         ...
 
 
@@ -109,30 +109,30 @@ async def teleoperate(
     seed: int = 0,
     paced: bool = False,
 ) -> TeleopTally:
-    """Let an operator move the hand, episode after episode, until it quits or there are enough.
+    """Let an operator move the hand, episode by episode, until it quits or has completed enough episodes.
 
-    An episode begins with a reset, after which time stands still until the operator moves something, and ends with a
-    verdict, which `recorder` notes with what the episode was about. What was broken off counts as discarded. Needs
-    direct mode, in which nothing is lost and a period is always as long.
+    An episode begins with a reset. Simulated time stands still until the operator moves something. The episode ends
+    with a verdict, which `recorder` stores together with the goal. An interrupted episode counts as discarded. This
+    function needs direct mode, in which every command takes effect and all periods have the same length.
 
     Args:
         client: A discovered client in direct mode.
-        operator: Decides on each period.
-        hand: The control of the hand; by default that of the only robot's only site.
-        task: Decides where episodes start and what they are about; see `urlab_client.integrations.gym.Task`.
-        recorder: A recording of this client that is under way.
-        episodes: Successes and failures after which to end; only the operator ends it for None.
-        seconds: Simulated seconds after which an episode ends by itself: a success if the task says so, else a
-            failure. No limit for None.
-        hz: Periods per simulated second; with a task its actions are the periods.
-        seed: Decides on the starts and goals of the episodes.
-        paced: Let simulated time pass no faster than the clock, for a person.
+        operator: Source of the command for each period.
+        hand: Control of the hand; by default, of the only site of the only robot.
+        task: Task that sets the starts and goals of episodes; see `urlab_client.integrations.gym.Task`.
+        recorder: A running recording of this client.
+        episodes: Number of successes and failures after which to stop. If None, only the operator stops.
+        seconds: Simulated seconds after which an episode ends, as a success if the task reports one, otherwise as a
+            failure. None means no limit.
+        hz: Periods per simulated second. With a task, its actions are the periods.
+        seed: Seed of the starts and goals of the episodes.
+        paced: Whether to limit simulated time to real time, for a human operator.
 
     Returns:
-        How many episodes ended how.
+        Number of episodes by outcome.
 
     Raises:
-        URLabError: The client is not in direct mode or has no model, or the server refused something.
+        URLabError: The client is not in direct mode or has no model, or the server refused a request.
         ValueError: A number is out of range.
     """
     session = _Session(client, operator, hand=hand, task=task, recorder=recorder, hz=hz, seed=seed, paced=paced)
@@ -155,7 +155,7 @@ def teleoperate_blocking(
     seed: int = 0,
     paced: bool = False,
 ) -> TeleopTally:
-    """Do what `teleoperate` does with a blocking client and a recorder of it."""
+    """Teleoperate like `teleoperate`, with a blocking client and its recorder."""
     return portal_of(client).call(
         teleoperate,
         aio_of(client),
@@ -210,7 +210,7 @@ class _Session:
         self._episode = 0
 
     async def run(self, episodes: int | None, seconds: float | None) -> TeleopTally:
-        """Go on until the operator quits or there are enough episodes."""
+        """Run episodes until the operator quits or enough are complete."""
         while episodes is None or self._tally.success + self._tally.failure < episodes:
             await self._start.reset(self._rng)
             self._hand.hold()
@@ -222,7 +222,7 @@ class _Session:
         return self._tally
 
     async def _drive(self, seconds: float | None) -> tuple[Verdict, bool]:
-        """Let the operator drive one episode; return how it ended, and whether anything moved."""
+        """Run one episode; return its verdict, and whether anything moved."""
         client, began, moved = self._client, self._client.sim_time, False
         loop = asyncio.get_running_loop()
         due = loop.time()
@@ -243,7 +243,7 @@ class _Session:
 
     def _view(self, time: float) -> TeleopView:
         position, quaternion = self._hand.ik.pose()
-        goal, success = self._start.look()
+        goal, success = self._start.goal_and_success()
         return TeleopView(
             episode=self._episode,
             time=time,
@@ -259,11 +259,11 @@ class _Session:
         self._episode += 1
         self._tally = self._tally.replace(**{verdict: getattr(self._tally, verdict) + 1})
         if self._recorder is not None:
-            await self._recorder.mark(verdict, goal=self._start.look()[0])
+            await self._recorder.mark(verdict, goal=self._start.goal_and_success()[0])
 
 
 class _Start:
-    """Episodes of a scene without a task: they begin where a reset leads."""
+    """Episodes of a scene without a task, which start in the reset state."""
 
     n_steps: int | None = None
 
@@ -276,8 +276,8 @@ class _Start:
             articulation.ctrl_array[:] = 0.0
         await self._client.reset()
 
-    def look(self) -> tuple[Mapping[str, Floats], bool | None]:
-        """Return what the episode is about, and whether its state is a success."""
+    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
+        """Return the goal of the episode, and whether the current state is a success."""
         return {}, None
 
 
@@ -307,7 +307,7 @@ class _TaskStart(_Start):
         seed = None if self._episode.randomise is None else int(rng.integers(2**31))
         await self._episode.reset(rng, seed=seed)
 
-    def look(self) -> tuple[Mapping[str, Floats], bool | None]:
+    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         states = self._episode.states()
         found = self._task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])

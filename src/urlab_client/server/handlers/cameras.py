@@ -1,6 +1,6 @@
 """Handlers of the ops that switch and delay cameras."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def set_camera_delay(server: ServerCore, request: SetCameraDelay) -> SetCameraDe
 
 
 def _known(running: Running, request: Request[Any], cameras: Mapping[str, T]) -> dict[str, T]:
-    """Return what a request says about cameras that there are, by their keys; letter case does not count.
+    """Return a request's entries for existing cameras, by camera key, ignoring case.
 
     Raises:
-        Refusal: `missing_field`; `bad_request` when it is about no camera at all.
+        Refusal: `missing_field`; `bad_request` if it contains no camera.
     """
     asked = need(request, cameras, "cameras")
     if not asked:
@@ -81,7 +81,7 @@ def _places(wanted: bool | CameraTransports) -> tuple[bool, bool]:
 
 
 def _latency(key: str, asked: CameraDelay, before: CameraDelayInForce | None) -> CameraDelayInForce:
-    """Return the latency that a request asks for.
+    """Return the requested latency.
 
     Raises:
         Refusal: `bad_request` for a clock that does not exist, and for a number that single precision cannot hold.

@@ -24,7 +24,7 @@ def _owner(request: ControlRequest[Any]) -> str:
 
 
 def check_owner(server: ServerCore, request: ControlRequest[Any], control: ArticulationControl) -> None:
-    """Refuse a write to a robot by anybody but its owner, where robots have owners.
+    """Refuse a write to a robot by a client that does not own it, if robots have owners.
 
     Raises:
         Refusal: `not_control_owner`.
@@ -34,7 +34,7 @@ def check_owner(server: ServerCore, request: ControlRequest[Any], control: Artic
 
 
 def check_all_owners(server: ServerCore, request: ControlRequest[Any]) -> None:
-    """Refuse a write to all robots while another client owns one of them, where robots have owners.
+    """Refuse a write to all robots while another client owns one of them, if robots have owners.
 
     Raises:
         Refusal: `not_control_owner`.

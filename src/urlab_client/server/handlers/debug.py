@@ -1,6 +1,6 @@
 """Handlers of the `debug` ops: drawing into the world."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import usable
 
 YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
-"""In place of an invalid colour."""
+"""Replaces an invalid colour."""
 
 _RED: Final[Vec3] = (1.0, 0.0, 0.0)
 _GREEN: Final[Vec3] = (0.0, 1.0, 0.0)
 _BLUE: Final[Vec3] = (0.0, 0.0, 1.0)
 
 _HEAD: Final = 0.2
-"""Share of an arrow's length that is its head."""
+"""Length of an arrow's head as a fraction of the arrow."""
 
 
 class RotatedBox(DrawBox, tag="draw_box", kw_only=True, omit_defaults=True):
-    """A box request with the angles that the plugin reads, too, although its clients do not send them."""
+    """A box request with the angles that the plugin also reads, although its clients do not send them."""
 
     rotation_euler: EulerDeg | None = None
 
@@ -54,7 +54,7 @@ def draw_marker(server: ServerCore, request: DrawMarker) -> DrawMarkerOk:
     at, color = need_point(request, request.location, "location"), _color(request.color)
     _draw(server, [Sphere(center=at, color=color)], request.ttl)
     if request.label:
-        # As in the plugin, where no time to live means no end for text.
+        # As in the plugin, text without a time to live is permanent.
         _draw(server, [Text(at=at, text=request.label, color=color)], request.ttl if request.ttl > 0.0 else -1.0)
     return DrawMarkerOk()
 
@@ -106,7 +106,7 @@ def draw_axes(server: ServerCore, request: DrawAxes) -> DrawAxesOk:
     rotation = _rotation(request, request.rotation_quat, request.rotation_euler)
     length = abs(request.scale) if math.isfinite(request.scale) else 0.2
     arrows: list[Primitive] = []
-    # Unreal's axes, whose y is the other way than MuJoCo's.
+    # Unreal's axes: y is opposite to MuJoCo's.
     for axis, color in (((length, 0.0, 0.0), _RED), ((0.0, -length, 0.0), _GREEN), ((0.0, 0.0, length), _BLUE)):
         dx, dy, dz = rotate(rotation, axis)
         x, y, z = origin
@@ -133,7 +133,7 @@ def _draw(server: ServerCore, primitives: Sequence[Primitive], ttl: float) -> No
 
 
 def _color(color: Vec3) -> Vec3:
-    """Return a colour in the steps of a byte; yellow for none."""
+    """Return a colour in steps of a byte; yellow by default."""
     red, green, blue = (_channel(value) for value in usable(color, YELLOW))
     return red, green, blue
 

@@ -1,6 +1,6 @@
 """Handler of `set_sim_options`."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 

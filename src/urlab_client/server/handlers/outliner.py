@@ -1,6 +1,6 @@
-"""Handlers of the `outliner` ops: looking at the world."""
+"""Handlers of the `outliner` ops: inspecting the world."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 

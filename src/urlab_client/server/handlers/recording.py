@@ -1,6 +1,6 @@
 """Handlers of the `recording` and `replay` ops."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
 
 
 def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
-    """Return the file meant by a request, relative to the folder of recordings, and that folder; links are resolved.
+    """Return the file that a request names, relative to the folder of recordings, and that folder; links are resolved.
 
     Raises:
-        Refusal: `code`, when it is a folder or not a usable path.
+        Refusal: `code`, if it is a folder or not a usable path.
     """
     try:
         folder = replay_folder(server.world.content.root).resolve()
@@ -68,7 +68,7 @@ def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
 
 
 def _to_write(server: ServerCore, path: str) -> Path:
-    """Return the file a recording is saved to: one of its folder, where it can be in the way of nothing else.
+    """Return the file to save a recording to, in the folder of recordings.
 
     Raises:
         Refusal: `path_not_writable`.
@@ -86,7 +86,7 @@ def _to_write(server: ServerCore, path: str) -> Path:
 
 
 def _to_read(server: ServerCore, path: str) -> Path:
-    """Return the file a recording is loaded from: one of its folder, or one below a model root.
+    """Return the file to load a recording from, in the folder of recordings or below a model root.
 
     Raises:
         Refusal: `path_not_readable`.

@@ -1,6 +1,6 @@
 """Handlers of the `runtime` ops: live changes to the running simulation."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ MAX_CONTACTS: Final = 64
 def set_mode(server: ServerCore, request: SetMode) -> SetModeOk:
     engine = server.play.running().engine
     if engine.pinned_mode is not None:
-        engine.set_mode(StepMode.LIVE)  # refuses, before the field is looked at
+        engine.set_mode(StepMode.LIVE)  # refuses before the field is checked
     previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode"), server.dialect))
     return SetModeOk(previous_mode=previous, current_mode=current)
 
@@ -91,9 +91,9 @@ def set_control_source(server: ServerCore, request: SetControlSource) -> SetCont
 
 
 class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
-    """Reads vectors of any length; elements that are not there count as 0."""
+    """Reads vectors of any length; missing elements count as 0."""
 
-    # Clients send three numbers, which is what the declared types say; a server takes any number of them.
+    # Clients send three numbers, as declared; a server accepts any number of them.
     linear: list[float] = field(default_factory=list[float])  # pyright: ignore[reportIncompatibleVariableOverride]
     angular: list[float] = field(default_factory=list[float])  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -241,7 +241,7 @@ def _contact(model: mujoco.MjModel, data: mujoco.MjData, number: int, wanted: Co
 
 
 def _side(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
-    """Return the names of a contact's geom and its body; both empty for what is not a geom, such as a flex."""
+    """Return the names of a contact's geom and its body; both empty if it is not a geom, for example a flex."""
     if geom < 0:
         return "", ""
     body = int(model.geom_bodyid[geom])

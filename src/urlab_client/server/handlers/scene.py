@@ -1,6 +1,6 @@
 """Handlers of the `scene` ops: authoring levels and actors."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def import_xml(server: ServerCore, request: ImportXml) -> ImportXmlOk:
 def create_level(server: ServerCore, request: CreateLevel) -> CreateLevelOk:
     name = need(request, request.name, "name")
     created = server.world.levels.create(name, force_overwrite=request.force_overwrite)
-    server.drawings.clear(in_play=False)  # what is drawn into a level goes with it
+    server.drawings.clear(in_play=False)  # drawings belong to their level
     return CreateLevelOk(level_path=created)
 
 
 class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
-    """Reads the second name of the level, which counts when the first one is there and empty."""
+    """Reads the alternative name of the level, which is used if the first one is present and empty."""
 
     name: str = ""
 
@@ -78,7 +78,7 @@ def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
     level = need(request, usable(request.name_or_path, "") or request.name, "level_path")
     server.world.levels.load(level)
     server.drawings.clear(in_play=False)
-    # As the plugin: expanded, but otherwise as it was asked for, so an object path stays one.
+    # As in the plugin: expanded, but otherwise as requested, so an object path stays one.
     return LoadLevelOk(level_path=level if level.startswith("/") else f"/Game/Levels/{level}")
 
 

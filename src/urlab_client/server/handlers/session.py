@@ -1,6 +1,6 @@
-"""Handlers of the ops without a namespace, and the handshake that `begin_pie` sends as well."""
+"""Handlers of the ops without a namespace, and the handshake that `begin_pie` also sends."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from urlab_client.server.rpc.dispatch import handles
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _PICTURES_WAIT_S: Final = 0.2
-"""How long a step waits for its pictures where it does not say."""
+"""Default wait of a step for its pictures, seconds."""
 
 
 @handles(Hello)
@@ -57,13 +57,13 @@ def hello(server: ServerCore, request: Hello) -> HelloOk:
     running = server.play.current
     if running is not None:
         running.engine.reset_step_count()
-    # Last: physics may be too busy to answer, and then the old session stays.
+    # Last: physics may be too busy to answer, and then the old session remains.
     reply.session_id = server.session.open(observations=request.observations, encoding=request.encoding)
     return reply
 
 
 def handshake(server: ServerCore, session_id: str, *, include_assets: bool = False) -> HelloOk:
-    """Describe the server as `hello` and the start of play do, without any effect on the session."""
+    """Describe the server for `hello` and the start of play, without affecting the session."""
     reply = HelloOk(
         session_id=session_id,
         urlab_version=server.dialect.urlab_version,
@@ -159,13 +159,13 @@ def _add_assets(reply: HelloOk, running: Running, *, attached: bool) -> None:
     try:
         reply.mjcf_compiled, reply.vfs_assets = running.scene.export(attached=attached)
     except (OSError, ValueError, mujoco.FatalError) as error:
-        logger.warning("the scene cannot be written as MJCF, so the handshake goes without: %s", error)
+        logger.warning("the scene cannot be written as MJCF, so the handshake omits it: %s", error)
 
 
 @handles(Meta)
 def meta(server: ServerCore, request: Meta) -> MetaOk:
-    # Also the ops that this server answers with `unsupported`: the catalogue says what the protocol is, and a client
-    # that reads it must not conclude that it talks to another version of the plugin.
+    # Includes ops that this server answers with `unsupported`: the catalogue describes the protocol, and a client must
+    # not conclude from it that it talks to another version of the plugin.
     del request
     return MetaOk(
         ops=[
@@ -220,11 +220,11 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
 
 def _pictures_wait_s(request: Step) -> float:
     wait_s = _PICTURES_WAIT_S if request.camera_timeout_ms is None else request.camera_timeout_ms / 1e3
-    return min(wait_s, FRAMES_DEADLINE_S) if wait_s > 0 else 0.0  # not a number is no wait, either
+    return min(wait_s, FRAMES_DEADLINE_S) if wait_s > 0 else 0.0  # NaN means no wait, too
 
 
 def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
-    """Refuse commands to robots that are not the sender's, where robots have owners.
+    """Refuse commands to robots that the sender does not own, if robots have owners.
 
     Raises:
         Refusal: `not_control_owner`; nothing was applied.

@@ -1,6 +1,6 @@
 """Handlers of the `sim` ops: the life cycle of a play session."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def begin_pie(server: ServerCore, request: BeginPie) -> BeginPieOk:
 
 
 def _open_level(server: ServerCore, path: str) -> None:
-    """Open a level in place of the one that may be playing; a level that cannot be opened leaves all as it is."""
+    """Open a level and end the current play session; if the level cannot be opened, nothing changes."""
     world = server.world
     was_running, world.pie_running = world.pie_running, False
     try:

@@ -1,6 +1,6 @@
-"""Handlers of the ops that bring a model to the server over the wire."""
+"""Handlers of the ops that upload a model."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 

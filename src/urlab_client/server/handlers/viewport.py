@@ -1,6 +1,6 @@
 """Handlers of the `viewport` ops: the camera of the editor's perspective view."""
 
-# ruff: noqa: D103 - what an op does stands once, on its request struct
+# ruff: noqa: D103 - the request struct documents the op
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def need_point(request: Request[Any], value: Vec3, field: str) -> Vec3:
     """Return the value of a required vector field.
 
     Raises:
-        Refusal: `missing_field` when it is absent, malformed or not finite.
+        Refusal: `missing_field` if it is absent, malformed or not finite.
     """
     point = need(request, value, field)
     if not all(map(math.isfinite, point)):
@@ -115,7 +115,7 @@ def need_rotator(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -
     """Return the rotator (roll, pitch, yaw), degrees, of a request's rotation in Unreal's frame; None without one.
 
     Raises:
-        Refusal: `missing_field` for numbers that are no rotation.
+        Refusal: `missing_field` for numbers that do not form a rotation.
     """
     try:
         return rotator(quat, euler)
@@ -124,7 +124,7 @@ def need_rotator(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -
 
 
 def look(server: ServerCore) -> ViewportCamera:
-    """Return the camera where it is now; what it follows may have moved."""
+    """Return the current camera; a followed actor may have moved."""
     actor = _tracked(server)
     if actor is not None:
         server.viewport.follow(*_pose(server, actor), time.monotonic())
@@ -140,7 +140,7 @@ def _actor(server: ServerCore, request: Request[Any], target: str, target_by: st
 
 
 def _tracked(server: ServerCore) -> Actor | None:
-    """Return the actor that is followed. Tracking ends by itself when it is gone."""
+    """Return the followed actor. Tracking ends when the actor is gone."""
     track = server.viewport.track
     if track is None:
         return None
@@ -151,7 +151,7 @@ def _tracked(server: ServerCore) -> Actor | None:
 
 
 def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
-    """Return where an actor is: during play its root body, else as authored."""
+    """Return the position of an actor: that of its root body during play, otherwise as authored."""
     running = server.play.current
     control = None if running is None else running.engine.articulations.controls.get(actor.name)
     if running is None or control is None:

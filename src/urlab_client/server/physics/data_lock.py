@@ -95,7 +95,7 @@ class DataLock:
         if overdue is not None:
             raise Refusal(
                 "not_ready",
-                f"physics has not come back from MuJoCo for {overdue.seconds:.0f} s: play goes on when it does, and "
+                f"MuJoCo has not returned for {overdue.seconds:.0f} s: play continues when it does, and "
                 "stop_pie ends it",
             )
         return self.inner.acquire(timeout=self._timeout)

@@ -1,7 +1,7 @@
 """From plain data to a request struct, field by field, by the plugin's rules of coercion.
 
-Odd spellings are understood, unusable values count as absent. There is a converter per field type, made once; each
-returns `ABSENT` for what it cannot use.
+Unusual spellings are accepted, and unusable values count as absent. There is one converter per field type; it returns
+`ABSENT` for unusable values.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = ["ABSENT", "INT32_MAX", "INT32_MIN", "as_text", "struct_converter"]
 _BINARY_SUFFIX: Final = "__b64__"
 """From plain data to a request struct, field by field, by the plugin's rules of coercion.
 
-Odd spellings are understood, unusable values count as absent. There is a converter per field type, made once; each
-returns `ABSENT` for what it cannot use.
+Unusual spellings are accepted, and unusable values count as absent. There is one converter per field type; it returns
+`ABSENT` for unusable values.
 """
 
 
@@ -76,7 +76,7 @@ def _flag(value: Plain) -> Any:
 
 
 def as_text(value: Plain) -> Any:
-    """Return what the plugin reads as a string, or `ABSENT`."""
+    """Return the value that the plugin reads as a string, or `ABSENT`."""
     if isinstance(value, str):
         return value
     if isinstance(value, bool):
@@ -121,7 +121,7 @@ def _converter(info: inspect.Type) -> Converter:
 
 
 def _binary(value: Plain) -> Any:
-    """Return bytes; text, in which JSON carries them, is base64."""
+    """Return bytes; JSON carries them as base64 text."""
     if isinstance(value, str):
         try:
             return base64.b64decode(value, validate=True)
@@ -146,7 +146,8 @@ _SIMPLE: Final[Mapping[type[inspect.Type], Converter]] = {
 
 
 def _item_converter(info: inspect.Type) -> Converter:
-    """Convert an element: numbers that are none read as 0, strings as empty, anything else unusable is left out."""
+    """Convert an element: unusable numbers read as 0, unusable strings as empty; other unusable elements are
+    omitted."""
     convert = _converter(info)
     if convert is _number:
         return lambda value: _or_zero(convert(value))

@@ -1,4 +1,4 @@
-"""From a request frame to a reply frame: the order of checks, the handlers and what becomes of their errors.
+"""From a request frame to a reply frame: the order of checks, the handlers and their errors.
 
 For the transports, which call a `Dispatcher`, and for the handler modules, which register with `handles`.
 """
@@ -33,23 +33,23 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 Q = TypeVar("Q", bound=Request[Any])
 A = TypeVar("A", bound=Reply | bytes)
 Handler = Callable[[ServerCore, Any], Reply | bytes]
-"""Returns the reply, or its msgpack frame where that is quicker to make; a session in JSON gets replies only."""
+"""Returns the reply, or its msgpack frame if that is faster; a session in JSON gets replies only."""
 
 _WITHOUT_SESSION: Final = frozenset({"hello", "meta"})
 _NO_SIGN_OF_USE: Final = frozenset({"hello", "meta", "pie_status", "op_status", "acquire_lease", "release_lease"})
 _BESIDE_JOBS: Final = frozenset({"op_status", "pie_status"})
-"""Ops of the editor that do not wait for jobs before them."""
+"""Editor ops that do not wait for earlier jobs."""
 
 BARE_NAMES: Final = ("recording", "replay")
-"""Namespaces whose ops are looked up in any case but recognise only their exact name."""
+"""Namespaces whose ops are looked up case-insensitively but recognise only their exact name."""
 
 
 class HandlerTable:
-    """Which function serves which op.
+    """The handlers of all ops.
 
     Attributes:
-        handlers: By op name.
-        structs: By op name, the struct that a handler reads where it is wider than the declared one.
+        handlers: Handler by op name.
+        structs: Struct that a handler reads, by op name, if it has more fields than the declared one.
     """
 
     def __init__(self) -> None:
@@ -93,25 +93,25 @@ handles = HANDLERS.handles
 
 
 RENEWED_S: Final = 0.25
-"""How soon a request notices that the lock it waits for is not the one any more."""
+"""How often a waiting request checks whether the lock has been replaced."""
 
 
 class Dispatcher:
-    """Answers requests, one at a time whatever transport they came by.
+    """Answers requests one at a time, from all transports.
 
     Attributes:
         served: The threads that call `answer`.
-        callbacks: Told of each request that was answered, on the thread that answers, before the next one begins.
+        callbacks: Called with each answered request, on the thread that answers, before the next request.
     """
 
     served: list[ServingThread]
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Prepare for a server.
+        """Create the dispatcher of a server.
 
         Args:
-            core: What the handlers work on.
+            core: State that the handlers share.
             table: The handlers.
         """
         self._core = core
@@ -125,11 +125,11 @@ class Dispatcher:
     def answer(
         self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
     ) -> bytes:
-        """Return the reply to a request; whatever happens, there is one.
+        """Return the reply to a request; errors become error replies.
 
         Args:
-            frame: The request's bytes.
-            transport: How it came; shared memory does not take the editor's ops.
+            frame: Bytes of the request.
+            transport: Transport of the request; editor ops are refused over shared memory.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
         lock = self._enter()
@@ -173,7 +173,7 @@ class Dispatcher:
 
     @contextmanager
     def standstill(self, timeout: float) -> Generator[bool]:
-        """Answer no request meanwhile; yields False if the one under way did not end within `timeout` seconds."""
+        """Pause answering; yields False if the request in progress did not finish within `timeout` seconds."""
         lock = self._lock
         idle = lock.acquire(timeout=timeout)
         try:
@@ -183,27 +183,27 @@ class Dispatcher:
                 lock.release()
 
     def relieve(self, thread: threading.Thread) -> bool:
-        """Answer the request that a thread does not come back from, and let another thread serve.
+        """Answer the request whose thread does not return, and let another thread serve.
 
-        What was asked for goes on, and takes effect when MuJoCo comes back, as a step does that is queued.
+        The request continues and takes effect when MuJoCo returns, like a queued step.
 
         Returns:
-            False when the thread serves no request, or has come back.
+            False if the thread serves no request, or has returned.
         """
         error = ErrorReply(
             code="step_timeout",
-            message=f"{self._name}: MuJoCo has not come back from it; it takes effect when MuJoCo does, "
-            "unless stop_pie ends play before",
+            message=f"{self._name}: MuJoCo has not returned yet; the request takes effect when it does, "
+            "unless stop_pie ends play first",
         )
         reply = encode_reply(error, json=self._core.session.json)
         return any(serving.relieve(thread, reply, self._renew) for serving in self.served)
 
     def _renew(self) -> None:
-        """Leave the lock to the thread that does not come back."""
+        """Leave the lock to the thread that does not return, and create another one."""
         self._lock = threading.Lock()
 
     def _enter(self) -> threading.Lock:
-        """Wait for one's turn and return the lock to release after it."""
+        """Wait for the turn of this request and return the lock to release afterwards."""
         while True:
             lock = self._lock
             if lock.acquire(blocking=False) or lock.acquire(timeout=RENEWED_S):
@@ -229,7 +229,7 @@ class Dispatcher:
         return handler(core, request)
 
     def _admitted(self, incoming: Incoming, transport: Transport) -> Op:
-        """Make the checks that come before any handler, in the plugin's order, and return the op."""
+        """Make the checks that precede every handler, in the plugin's order, and return the op."""
         op, name = incoming.op, incoming.name
         if self._core.health.failure is not None:
             raise Refusal("internal_error", f"{self._core.health.failure}; start the server again")
@@ -252,7 +252,7 @@ class Dispatcher:
         return op
 
     def _job(self, name: str, handler: Handler, request: Any) -> dict[str, Any]:
-        """Return what the handler of a job comes to, as plain data with the numbers of the wire."""
+        """Return the result of a job's handler as plain data with the numbers of the wire."""
         try:
             reply: Any = handler(self._core, request)
         except Exception as failure:  # noqa: BLE001 - whoever asks for the job must hear of it

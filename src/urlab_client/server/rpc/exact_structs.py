@@ -1,4 +1,4 @@
-"""Structs that decode a request that means exactly what it says, and refuse all others."""
+"""Structs that decode requests of exactly the declared types, and reject all others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from urlab_client.server.rpc.coercion import INT32_MAX, INT32_MIN
 __all__ = ["collision_test_of", "longest_string", "strict_array", "strict_struct", "string_measures_of", "type_info"]
 
 
-# Inspecting the types took most of a server's start, and gives the same for every server.
+# Cached: inspecting the types took most of a server's start, and the result is the same for every server.
 type_info = cache(inspect.type_info)
 
 
@@ -28,7 +28,7 @@ def strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.float
 
 @cache
 def strict_struct(struct: type[Struct]) -> type[Struct]:
-    """Derive a struct that refuses unknown fields and integers beyond 32 bits, here and in the structs it holds.
+    """Derive a struct that rejects unknown fields and integers beyond 32 bits, also in nested structs.
 
     Raises:
         TypeError: A field takes any value.
@@ -83,7 +83,7 @@ def _strict_annotation(annotation: Any) -> Any:
 
 
 def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:
-    """Return a test for maps with keys that differ in case only, which collapse; None if there can be none."""
+    """Return a test for maps with keys that differ only in case, which collapse; None if there can be none."""
     match info:
         case inspect.Metadata(type=inner):
             return _collision_test(inner)
@@ -101,7 +101,7 @@ def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:
 
 @cache
 def collision_test_of(kind: type) -> Callable[[Any], bool] | None:
-    """Return a test for maps with keys that differ in case only, which collapse; None if there can be none."""
+    """Return a test for maps with keys that differ only in case, which collapse; None if there can be none."""
     return _collision_test(type_info(kind))
 
 
@@ -129,7 +129,7 @@ def _struct_collision_test(tests: list[tuple[str, Callable[[Any], bool]]]) -> Ca
 
 
 def longest_string(value: object) -> int:
-    """Return the length of the longest string in a value of a request, whatever it is."""
+    """Return the length of the longest string in any value of a request."""
     match value:
         case str():
             return len(value)
@@ -146,9 +146,9 @@ def longest_string(value: object) -> int:
 
 @cache
 def string_measures_of(kind: type[Struct]) -> tuple[tuple[str, Callable[[Any], int]], ...]:
-    """Return how to find the longest string in each field that can hold one, for values of exactly this type.
+    """Return functions that find the longest string in each field that can hold one, for values of exactly this type.
 
-    What holds numbers alone, as nearly all of a step of many robots, is not looked at.
+    Fields that hold only numbers, which are most of a step with many robots, are skipped.
     """
     fields = msgspec.structs.fields(kind)
     return tuple((f.name, measure) for f in fields if (measure := _string_measure(type_info(f.type))) is not None)

@@ -1,4 +1,4 @@
-"""From a frame's bytes to plain data, as the plugin's decoder would deliver them."""
+"""From the bytes of a frame to plain data, as the plugin's decoder delivers it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from urlab_client.server.refusal import Refusal
 __all__ = ["Plain", "bad_request", "decode_plain", "fold_keys"]
 
 Plain: TypeAlias = Any
-"""What a frame holds: None, bool, int, float, str, list, or dict with str keys."""
+"""Contents of a frame: None, bool, int, float, str, list, or dict with str keys."""
 
 _JSON_FIRST = frozenset(b"{ \t\r\n")
 
@@ -22,7 +22,7 @@ def decode_plain(frame: bytes, depth: int) -> dict[str, Plain]:
 
     Args:
         frame: The frame.
-        depth: Levels that may be nested.
+        depth: Maximum nesting depth.
 
     Raises:
         Refusal: `bad_request`.
@@ -53,7 +53,7 @@ def _decode_json(frame: bytes) -> Plain:
 
 
 def _tidy(value: Plain, depth: int, most: int) -> Plain:
-    """Replace what the plugin's decoder would not deliver, all the way down."""
+    """Replace values that the plugin's decoder does not deliver, recursively."""
     if depth < 0:
         raise bad_request(f"the request is nested deeper than {most} levels (limit request_depth)")
     match value:
@@ -74,7 +74,7 @@ def _tidy_map(value: dict[object, Plain], depth: int, most: int) -> dict[str, Pl
     seen: dict[str, str] = {}
     for key, item in value.items():
         if isinstance(key, str):
-            # A byte string moves to another key, so the plain one is absent to whoever looks for it.
+            # A byte string moves to another key, so the plain key is absent.
             name = f"{key}__b64__" if isinstance(item, bytes) else key
             folded = name.lower()
             if folded in seen:
@@ -90,7 +90,7 @@ def fold_keys(fields: dict[str, Plain]) -> dict[str, Plain]:
 
 
 def _object_end(frame: bytes) -> int | None:
-    """Return where the first msgpack object ends, or None when it is cut off: bytes after it are to be ignored."""
+    """Return the end of the first msgpack object, or None if it is truncated. Bytes after it are ignored."""
     at, open_items, size = 0, 1, len(frame)
     while open_items:
         if at >= size:
@@ -128,7 +128,7 @@ _SHAPES: Final = (
     *((width, 0, 1) for width in (2, 4)),  # array
     *((width, 0, 2) for width in (2, 4)),  # map
 )
-"""By first byte from 0xC0: bytes of the length field, bytes of content besides, items per unit of length."""
+"""By first byte from 0xC0: bytes of the length field, bytes of further content, items per unit of length."""
 
 
 def bad_request(why: str) -> Refusal:

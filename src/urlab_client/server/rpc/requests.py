@@ -1,12 +1,12 @@
 """From the bytes of a request to a typed struct, by the plugin's rules of detection and coercion.
 
-For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: names
-and numbers in odd spellings are understood, unusable values count as absent. A `step` that means exactly what it says
-is decoded by msgspec in one go, and so is a piece of an upload. Both ways agree where the second succeeds.
+For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: unusual
+spellings of names and numbers are accepted, and unusable values count as absent. A `step` of exactly the declared types
+is decoded by msgspec directly, and so is a chunk of an upload. Both paths agree where the second one succeeds.
 
-What that saves, in processor time: field by field a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
-instead of 1.2, and a piece of an upload 4.5 ms a MiB instead of 0.1. The other ops come too seldom to be worth 0.8 ms
-each of the server's start.
+The direct path saves processor time: field by field, a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
+instead of 1.2, and a chunk of an upload 4.5 ms per MiB instead of 0.1. The other ops are too rare to justify 0.8 ms
+each at the server's start.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ T = TypeVar("T")
 
 
 class Incoming(Struct, frozen=True):
-    """One request as it was read.
+    """One decoded request.
 
     Attributes:
-        name: The op as sent, or None when there is none that reads as a string.
-        op: Its declaration, or None when no op has this name in any case.
-        session_id: The session it claims; empty when it claims none.
+        name: The op as sent, or None if it cannot be read as a string.
+        op: Its declaration, or None if no op has this name, ignoring case.
+        session_id: The session id in the request; empty if it has none.
         request: The typed request; None without a declaration. A required field whose value is missing or unusable
             holds `msgspec.UNSET`: read it through `need` or `usable`.
-        missing: Declared required fields whose key is not there, in order of declaration. A key with a null or a value
-            of the wrong type is there.
+        missing: Declared required fields whose key is absent, in order of declaration. A key with a null or a value of
+            the wrong type is present.
     """
 
     name: str | None
@@ -62,7 +62,7 @@ class Incoming(Struct, frozen=True):
 
 
 def usable(value: T, otherwise: T) -> T:
-    """Return the value of a required field, or `otherwise` when the request held nothing usable there."""
+    """Return the value of a required field, or `otherwise` if the request has no usable value there."""
     return otherwise if value is UNSET else value
 
 
@@ -72,10 +72,10 @@ def need(request: Request[Any], value: T, field: str) -> T:
     Args:
         request: The request, named in the refusal.
         value: The field's value.
-        field: Its name on the wire.
+        field: Name of the field on the wire.
 
     Raises:
-        Refusal: `missing_field` when the value is absent, of an unusable type, or an empty string.
+        Refusal: `missing_field` if the value is absent, of an unusable type, or an empty string.
     """
     if value is UNSET or (isinstance(value, str) and not value):
         op = request.__struct_config__.tag
@@ -84,11 +84,11 @@ def need(request: Request[Any], value: T, field: str) -> T:
 
 
 class _Nameless(Struct, tag_field="op", tag=""):
-    """Beside another struct in the decoder: alone, that one would take requests without an op."""
+    """Second member of the decoder's union: a single struct would accept requests without an op."""
 
 
 class RequestReader:
-    """Reads frames into requests. Has no state of its own, so any thread may use it."""
+    """Decodes frames into requests. Stateless, so any thread may use it."""
 
     def __init__(
         self,
@@ -97,12 +97,12 @@ class RequestReader:
         structs: Mapping[str, type[Request[Any]]] = types.MappingProxyType({}),
         limits: Limits = _DEFAULT_LIMITS,
     ) -> None:
-        """Prepare the decoders.
+        """Create the decoders.
 
         Args:
-            ops: The ops that there are, by name.
-            structs: By op name, a struct that reads more than the declared one, which it must derive from.
-            limits: What a request may be.
+            ops: All ops by name.
+            structs: Struct with more fields than the declared one, from which it must derive, by op name.
+            limits: Limits on requests.
         """
         self._limits = limits
         self._exact: dict[type, Op] = {}
@@ -124,10 +124,10 @@ class RequestReader:
             )
 
     def read(self, frame: bytes) -> Incoming:
-        """Read one frame.
+        """Decode one frame.
 
         Raises:
-            Refusal: `bad_request` when the frame is neither a msgpack map nor a JSON object, or exceeds a limit.
+            Refusal: `bad_request` if the frame is neither a msgpack map nor a JSON object, or exceeds a limit.
         """
         try:
             request = self._decoder.decode(frame)
@@ -145,7 +145,7 @@ class RequestReader:
 
     def _check_strings(self, op: Op, request: Request[Any], frame: bytes, *, exact: bool) -> None:
         most = self._limits.string_chars
-        if len(frame) <= most:  # which spares nearly every request the search
+        if len(frame) <= most:  # true for nearly every request, so that no search is needed
             return
         anything = ((name, longest_string) for name in request.__struct_fields__)
         for name, measure in string_measures_of(type(request)) if exact else anything:
@@ -182,14 +182,14 @@ def _session_id(fields: Mapping[str, Plain]) -> str:
 
 
 class _LooseOp:
-    """What the field-by-field way needs to know of an op."""
+    """What field-by-field decoding needs to know about an op."""
 
     def __init__(self, op: Op, struct: type[Request[Any]]) -> None:
         self.op = op
         self.exact = op.name in ("hello", "meta")
         self._struct = struct
 
-    # Computed on first use, so that a server starts sooner.
+    # Computed on first use, so that a server starts faster.
 
     @cached_property
     def declared(self) -> tuple[str, ...]:

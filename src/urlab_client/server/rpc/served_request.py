@@ -1,4 +1,4 @@
-"""What a server tells of a request that it has answered."""
+"""The record of a request that a server has answered."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ __all__ = ["ServedRequest"]
 
 
 class ServedRequest(Struct, frozen=True, kw_only=True):
-    """A request that was answered; see `SimulatedServer.add_request_callback`.
+    """An answered request; see `SimulatedServer.add_request_callback`.
 
     Attributes:
-        op: Its op; `unknown` if the server has none of that name.
-        error: Code of the error that it was answered with; empty if none.
+        op: Its op; `unknown` if the server does not have it.
+        error: Code of the error reply; empty if there was no error.
         seconds: Time from its turn to the reply.
         request_bytes: Size of the request.
         reply_bytes: Size of the reply.

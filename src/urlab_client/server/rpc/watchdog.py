@@ -1,8 +1,8 @@
-"""Keeps requests answered while physics does not come back from MuJoCo.
+"""Keeps the server answering while MuJoCo does not return.
 
-For `SimulatedServer`. A short step runs on the thread that serves requests; when MuJoCo then keeps it for longer than
-the step timeout, its client is told so, and another thread serves. What needs physics is refused meanwhile, by the
-engine's lock; the rest, such as `hello`, `meta` and `stop_pie`, does not wait for it.
+For `SimulatedServer`. A short step runs on the thread that serves requests. If MuJoCo holds that thread for longer than
+the step timeout, the client gets an error, and another thread serves. Meanwhile the engine's lock refuses requests that
+need physics; others, such as `hello`, `meta` and `stop_pie`, do not wait for it.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ INTERVAL_S: Final = 0.25
 
 
 class Watchdog:
-    """A thread that looks at the physics of a server a few times a second."""
+    """A thread that checks the physics of a server a few times a second."""
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
-        """Prepare; `start` begins to look."""
+        """Configure the thread; `start` starts it."""
         self._core = core
         self._dispatcher = dispatcher
         self._health = health
@@ -36,7 +36,7 @@ class Watchdog:
 
     @property
     def alive(self) -> bool:
-        """Whether it looks."""
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
     def start(self) -> None:
@@ -48,7 +48,7 @@ class Watchdog:
         self._stopping.set()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end after `stop`; return False if it takes longer."""
+        """Wait for the thread to end after `stop`; return False if it takes longer."""
         return self._thread.ident is None or ended(self._thread, timeout)
 
     def _run(self) -> None:
@@ -61,7 +61,5 @@ class Watchdog:
                     continue
                 if overdue.began_at != told:
                     told = overdue.began_at
-                    logger.warning(
-                        "physics has not come back from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds
-                    )
+                    logger.warning("physics has not returned from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds)
                 self._dispatcher.relieve(overdue.thread)

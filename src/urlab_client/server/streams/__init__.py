@@ -1,1 +1,1 @@
-"""What the server publishes without being asked: states, rows and camera pictures."""
+"""The streams that the server publishes: states, rows and camera pictures."""

@@ -1,4 +1,4 @@
-"""What a play session publishes: its ticks, copied on the physics thread and made messages of on another."""
+"""The messages of a play session: ticks are copied on the physics thread and encoded on another."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 Floats: TypeAlias = NDArray[np.float64]
 
 LOCK_S: Final = 0.02
-"""Longest wait for the physics lock in one go; what it was wanted for is tried again."""
+"""Longest single wait for the physics lock; the operation is then retried."""
 
 INFO_EVERY: Final = 50
 INFO_START_TICKS: Final = 2500
@@ -48,7 +48,7 @@ _LIVE: Final = frozenset({StepMode.LIVE, StepMode.AUTO})
 
 
 class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True):
-    """The map of a `state/full` message, every field of it but the last always present."""
+    """The map of a `state/full` message. All fields but the last are always present."""
 
     time: float
     step: int
@@ -61,16 +61,16 @@ class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True, omit_def
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """One tick as the physics thread left it.
+    """One tick, copied by the physics thread.
 
     Attributes:
-        live: Number of the tick among the live ones seen, from 1; 0 outside live mode.
+        live: Number of the tick among the live ones, from 1; 0 outside live mode.
         time: `mjData.time`, seconds.
         step: Step counter.
-        wall_time: When the copies were made.
-        arrays: Copies of what `Broadcast.sources` lists; empty when nobody wants them.
-        twists: Commanded twist and action keys of each articulation; likewise.
-        full: Whether the snapshot is wanted.
+        wall_time: Time of the copies.
+        arrays: Copies of the arrays in `Broadcast.sources`; empty without subscribers.
+        twists: Commanded twist and action keys of each articulation; empty without subscribers.
+        full: Whether the snapshot is subscribed to.
     """
 
     live: int
@@ -83,7 +83,7 @@ class Tick:
 
 
 class Broadcast:
-    """One play session on the air: takes ticks from its physics and makes messages of them.
+    """Turns the ticks of one play session into messages.
 
     Attributes:
         running: The simulation.
@@ -96,12 +96,12 @@ class Broadcast:
         hand_over: Callable[[Broadcast, Tick], None],
         memory: SharedMemoryServer | None,
     ) -> None:
-        """Prepare the messages of a scene; `want` decides which are made.
+        """Prepare the messages of a scene; `want` selects which are encoded.
 
         Args:
             running: The simulation.
-            hand_over: Takes a tick to the thread that sends; called under the engine's lock.
-            memory: Where snapshots go besides, whenever it wants them.
+            hand_over: Passes a tick to the sending thread; called under the engine's lock.
+            memory: Shared memory that also gets snapshots, when it wants them.
         """
         self.running = running
         self._hand_over = hand_over
@@ -127,10 +127,10 @@ class Broadcast:
         self._live_ticks = 0
         self._info_due = next_info(0)
 
-    # On the thread that sends.
+    # On the sending thread.
 
     def want(self, state: Iterable[bytes], info: Iterable[bytes]) -> None:
-        """Take over what is subscribed to on the two sockets; listen to physics only if that is anything."""
+        """Apply the subscriptions of the two sockets; listen to physics only if there are any."""
         prefixes = tuple(state)
         self._wanted_rows = [row for row in self._rows if row.topic.startswith(prefixes)] if prefixes else []
         self.full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
@@ -148,7 +148,7 @@ class Broadcast:
             self._engine.on_tick.remove(self._capture)
 
     def state_messages(self, tick: Tick) -> Iterator[tuple[bytes, bytes]]:
-        """Yield topic and payload of what a tick brings on the state socket, the snapshot last."""
+        """Yield topic and payload of a tick's messages on the state socket, the snapshot last."""
         if not tick.arrays:
             return
         for target, values in zip(self._targets, tick.arrays, strict=True):
@@ -187,7 +187,7 @@ class Broadcast:
             yield self._actuators.info(control, endpoints).encode()
 
     def command_topics(self) -> Iterator[bytes]:
-        """Yield the topics that the articulations listen to."""
+        """Yield the topics to which the articulations subscribe."""
         for control in self._controls:
             for kind in (TopicKind.CONTROL, TopicKind.SET_GAINS):
                 topic = topic_frame(kind, control.index.key)
@@ -195,13 +195,13 @@ class Broadcast:
                     yield topic
 
     def obey(self, commands: deque[StreamedCommand]) -> bool:
-        """Carry out and remove commands, which outside live mode have no effect.
+        """Apply and remove commands; outside live mode they have no effect.
 
         Returns:
-            False when physics is busy: the commands are still there.
+            False if physics is busy and the commands are still queued.
         """
         engine = self._engine
-        if engine.mode not in _LIVE:  # then physics may legally keep the lock for hours
+        if engine.mode not in _LIVE:  # physics may then legitimately hold the lock for hours
             commands.clear()
             return True
         if not engine.lock.inner.acquire(timeout=LOCK_S):
@@ -270,12 +270,12 @@ def _values(twist: Twist) -> tuple[float, float, float, int]:
 
 
 def _arrays(scene: CompiledScene, data: mujoco.MjData) -> list[Floats]:
-    """Return views of everything the messages show, never an empty list."""
+    """Return views of all arrays in the messages, never an empty list."""
     arrays = [data.qpos, data.qvel, data.qacc, data.ctrl, data.act, data.sensordata]
     return [*arrays, data.xpos, data.xquat] if scene.entities else arrays
 
 
 def next_info(tick: int) -> int:
-    """Return the first live tick after `tick` that brings the info messages."""
+    """Return the first live tick after `tick` with info messages."""
     every = INFO_EVERY if tick < INFO_START_TICKS else INFO_LATER_EVERY
     return (tick // every + 1) * every

@@ -1,8 +1,8 @@
-"""Camera images of live mode: a PUB socket per camera, each on a port of its own.
+"""Camera images of live mode: one PUB socket and port per camera.
 
-For `SimulatedServer`. One thread draws, about thirty times a second and whatever physics does, the cameras that
-somebody has subscribed to. In the stepped modes nothing is published: images come with `step` there, as in the plugin.
-Shared memory gets images in every mode.
+For `SimulatedServer`. One thread draws the cameras with subscribers about thirty times a second, independently of
+physics. In the stepped modes nothing is published; as in the plugin, images arrive with `step`. Shared memory gets
+images in every mode.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ PERIOD_S: Final = 1.0 / 30.0
 QUEUED_FRAMES: Final = 10
 
 MAX_FILTER_BYTES: Final = 4096
-"""A larger subscription costs its sender the connection."""
+"""Largest subscription; a larger one closes the connection."""
 
 PORTS: Final = 100
-"""How many ports above the first are tried for a camera."""
+"""Number of ports above the first that are tried for a camera."""
 
 
 class _Stream:
-    """The socket of one camera. An XPUB socket is a PUB socket that tells who listens."""
+    """The socket of one camera: XPUB, a PUB socket that reports subscriptions."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], guard: ZapAuthenticator, host: str, port: int) -> None:
         self.socket = context.socket(zmq.XPUB)
@@ -65,7 +65,7 @@ class _Stream:
             raise
 
     def wanted(self) -> bool:
-        """Whether somebody has subscribed to the camera."""
+        """Whether the camera has a subscriber."""
         with contextlib.suppress(zmq.Again):
             while True:
                 message = self.socket.recv(zmq.DONTWAIT)
@@ -76,17 +76,17 @@ class _Stream:
         return bool(self.key) and any(self.topic.startswith(prefix) for prefix in self._filters)
 
     def show(self, key: str, topic: str) -> None:
-        """Publish a camera from now on, by `ARTICULATION/CAMERA`; none, if it is empty."""
+        """Publish a camera, given as `ARTICULATION/CAMERA`, from now on; none if empty."""
         self.key = key
         self.topic = camera_filter(topic)
 
 
 class CameraStreams:
-    """Publishes the cameras of the play session. The first port is held for as long as the server is open.
+    """Publishes the cameras of the play session. The first port is bound while the server is open.
 
     Attributes:
-        filter: What becomes of an image to subscribers, from its topic and pixels: its pixels, or None for nothing.
-            Set it before `start`; called on the thread that sends.
+        filter: Called with topic and pixels of an image; returns the pixels to send, or None to drop it. Set it before
+            `start`; called on the sending thread.
     """
 
     def __init__(
@@ -102,16 +102,16 @@ class CameraStreams:
         """Bind the first port.
 
         Args:
-            health: Told when images cannot be published any more.
+            health: Notified when the thread dies.
             host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
-            curve_keys: Who may connect; None for anybody who reaches the interface.
-            memory: Shared memory that gets the images as well, in every mode.
-            dialect: Decides what streams when, under which topic and with what in front.
+            curve_keys: Who may connect; None for anyone who can reach the interface.
+            memory: Shared memory that also gets the images, in every mode.
+            dialect: Determines when images are sent, their topic and their header.
 
         Raises:
-            PortInUse: Somebody has the port.
-            OSError: The address is not one of this machine.
+            PortInUse: The port is in use.
+            OSError: The address does not belong to this machine.
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._dialect = dialect
@@ -140,7 +140,7 @@ class CameraStreams:
 
     @property
     def alive(self) -> bool:
-        """Whether images are published."""
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
     def start(self) -> None:
@@ -148,14 +148,14 @@ class CameraStreams:
         self._thread.start()
 
     def endpoint(self, articulation: str, camera: str) -> str:
-        """Return where a camera publishes; the first port for one that does not."""
+        """Return the endpoint of a camera; the first port for a camera that does not publish."""
         key = f"{articulation}/{camera}"
         with self._lock:
             port = next((stream.port for stream in self._streams if stream.key == key), self.port)
         return f"{tcp(self._host)}:{port}"
 
     def show(self, running: Running | None) -> None:
-        """Publish the cameras of a simulation instead of any other; None for none."""
+        """Publish the cameras of this simulation only; None for none."""
         with self._lock:
             if self._stopping.is_set():
                 return
@@ -182,13 +182,13 @@ class CameraStreams:
                 self._streams.append(stream)
 
     def switch(self, key: str, *, zmq: bool, shm: bool) -> None:
-        """Let a camera of the play session stream on its socket, in shared memory, on both or not at all."""
+        """Set whether a camera of the play session publishes on its socket and in shared memory."""
         with self._lock:
             running = self._running
             if running is None:
                 return
             if key not in self._zmq_on | self._shm_on and not self._dialect.cameras_repeat:
-                self._sent[key] = running.engine.snapshots.number  # nothing comes before the state has moved
+                self._sent[key] = running.engine.snapshots.number  # publish nothing until the state changes
             for on, wanted in ((self._zmq_on, zmq), (self._shm_on, shm)):
                 (on.add if wanted else on.discard)(key)
             if self._memory is not None:
@@ -208,7 +208,7 @@ class CameraStreams:
         self._stopping.set()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end and release the sockets; return False when a picture was still being drawn."""
+        """Wait for the thread to end and close the sockets; return False if a picture is still being drawn."""
         if self._thread.ident is not None:
             ended(self._thread, timeout)
         with self._lock:
@@ -240,9 +240,9 @@ class CameraStreams:
                 pause = max(0.0, began + PERIOD_S - time.monotonic())
 
     def _skip(self, what: str, error: Exception) -> None:
-        """Log what went wrong, unless the sockets were closed because the server closes."""
+        """Log an error, unless the sockets were closed because the server is closing."""
         self._failed += 1
-        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # what fails once often fails again
+        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # ever more rarely
             logger.error("%s (%d so far)", what, self._failed, exc_info=error)
 
     def _publish(self) -> None:
@@ -261,7 +261,7 @@ class CameraStreams:
         try:
             with running.engine.lock:
                 film = running.cameras.capture(shots, running.engine.snapshots.number)
-        except Refusal:  # physics is busy; the next time, then
+        except Refusal:  # physics is busy; retried next time
             return
         payloads = self._payloads(running, shots, film)
         if self._memory is not None:
@@ -284,7 +284,7 @@ class CameraStreams:
                         stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
 
     def _payloads(self, running: Running, shots: Sequence[Shot], film: Film) -> dict[str, bytes]:
-        """Draw, and return what is to be sent."""
+        """Draw, and return the messages to send."""
         frames = running.cameras.frames(shots, film) or {}
         with self._lock:
             if self._running is not running:
@@ -300,7 +300,7 @@ class CameraStreams:
         return news
 
     def _is_news(self, running: Running, key: str, number: int) -> bool:
-        """Whether a picture of snapshot `number` is to be sent, as far as the camera sends only what has changed."""
+        """Whether to send a picture of snapshot `number`, if the camera sends only changes."""
         latency = running.cameras.latency(key)
         repeats = self._dialect.cameras_repeat if latency is None else not latency.on_state_change
         before, self._sent[key] = self._sent.get(key), number

@@ -1,8 +1,8 @@
-"""What a server streams and what is streamed to it: its state, info and control sockets, and the thread behind them.
+"""The state, info and control sockets of a server, and their thread.
 
-For `SimulatedServer`, which opens them. The physics thread only copies arrays, and only while somebody subscribes to
-what they show; matching, encoding and sending happen here, behind a bounded hand-over that drops the oldest ticks.
-Camera images have sockets of their own.
+For `SimulatedServer`, which opens them. The physics thread only copies arrays, and only those with subscribers;
+matching, encoding and sending happen here, behind a bounded queue that drops the oldest ticks. Camera images have
+their own sockets.
 """
 
 from __future__ import annotations
@@ -34,34 +34,35 @@ __all__ = ["StreamServer"]
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 WAITING_TICKS: Final = 64
-"""Ticks that may wait to be sent; of more, the oldest go unsent."""
+"""Length of the queue of ticks to send; beyond that the oldest are dropped."""
 
 WAITING_COMMANDS: Final = 1024
-"""Control messages that may wait for the physics lock; of more, the oldest are lost."""
+"""Length of the queue of control messages that wait for the physics lock; beyond that the oldest are dropped."""
 
 BATCH: Final = 256
-"""Messages read from a socket before the others have their turn."""
+"""Messages read from a socket before the other sockets are served."""
 
 MAX_COMMAND_BYTES: Final = 1 << 20
-"""A larger control message costs its sender the connection."""
+"""Largest control message; a larger one closes the connection."""
 
 MAX_FILTER_BYTES: Final = 4096
-"""Likewise a larger subscription."""
+"""Largest subscription; a larger one closes the connection."""
 
 _WAKE: Final = "inproc://urlab-streams-wake"
 
 
 class StreamServer:
-    """The state, info and control sockets of a server. They are bound for its life and silent between play sessions.
+    """The state, info and control sockets of a server. They stay bound while it is open, and send nothing between play
+    sessions.
 
-    A slow subscriber loses the newest of its messages beyond ZeroMQ's 1000, all others get theirs.
+    A slow subscriber loses the newest messages beyond ZeroMQ's limit of 1000; other subscribers are not affected.
 
     Attributes:
         state_port: Port of the state stream.
         ctrl_port: Port of streamed controls and gains.
         info_port: Port of the info stream.
-        filter: What becomes of a message to subscribers, from its topic and payload: its payload, or None for nothing.
-            Set it before `start`; called on the thread that sends.
+        filter: Called with topic and payload of a message; returns the payload to send, or None to drop it. Set it
+            before `start`; called on the sending thread.
     """
 
     state_port: int
@@ -83,18 +84,18 @@ class StreamServer:
         """Bind the sockets; `start` begins to serve.
 
         Args:
-            cameras: Where the cameras of a scene publish, for the info stream.
-            health: Told when nothing can be streamed any more.
+            cameras: Returns the endpoints of a scene's cameras, for the info stream.
+            health: Notified when the thread dies.
             host: IP address of the interface.
-            state_port: TCP port; 0 picks a free one, here and below.
+            state_port: TCP port; 0 selects a free port, as for the other ports.
             ctrl_port: TCP port.
             info_port: TCP port.
-            curve_keys: Who may connect; None for anybody who reaches the interface.
-            memory: Shared memory that gets the snapshots as well.
+            curve_keys: Who may connect; None for anyone who can reach the interface.
+            memory: Shared memory that also gets the snapshots.
 
         Raises:
-            PortInUse: Somebody has a port.
-            OSError: The address is not one of this machine.
+            PortInUse: A port is in use.
+            OSError: The address does not belong to this machine.
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._cameras = cameras
@@ -104,7 +105,7 @@ class StreamServer:
         self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
         self._health = health
         self._failed = 0
-        # XPUB is PUB that tells what is subscribed to.
+        # XPUB is PUB that reports subscriptions.
         self._state = self._context.socket(zmq.XPUB)
         self._info = self._context.socket(zmq.XPUB)
         self._control = self._context.socket(zmq.SUB)
@@ -142,7 +143,7 @@ class StreamServer:
 
     @property
     def alive(self) -> bool:
-        """Whether the sockets are served."""
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
     def start(self) -> None:
@@ -150,7 +151,7 @@ class StreamServer:
         self._thread.start()
 
     def show(self, running: Running | None) -> None:
-        """Serve this simulation from now on, or none. Returns at once; may be called from any thread."""
+        """Serve this simulation from now on, or none. Returns immediately; thread-safe."""
         self._target = running
         self._rouse()
 
@@ -160,13 +161,13 @@ class StreamServer:
         self._rouse()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end after `stop`.
+        """Wait for the thread to end after `stop`.
 
         Args:
             timeout: Seconds to wait.
 
         Returns:
-            False when the thread was still busy then; it closes the sockets when it is done.
+            False if the thread is still busy; it then closes the sockets when it ends.
         """
         if self._thread.ident is None:
             self._close()
@@ -193,18 +194,18 @@ class StreamServer:
             poller.register(socket, zmq.POLLIN)
         try:
             while not self._stopping:
-                # Commands that physics was too busy for are tried again.
+                # Retry commands for which physics was too busy.
                 ready = dict(poller.poll(0 if self._commands else None))
                 if self._wake in ready:
                     self._wake.recv()
-                    self._awake = False  # before looking, so that what comes later rouses again
+                    self._awake = False  # before checking, so that later events wake it again
                 try:
                     self._turn(ready)
                 except zmq.ZMQError:
                     raise
                 except Exception as error:
                     if self._broadcast is None and self._shown is not None:
-                        raise  # a play session that cannot be streamed: subscribers would wait for nothing
+                        raise  # the play session cannot be streamed, and subscribers would wait in vain
                     self._skip(error)
         except BaseException as error:  # noqa: BLE001 - subscribers hear of it by the next request
             self._health.report(error)
@@ -213,11 +214,11 @@ class StreamServer:
             self._close()
 
     def _skip(self, error: Exception) -> None:
-        """Go on without the ticks and commands that were under way, and log what went wrong."""
+        """Log an error and continue without the current ticks and commands."""
         self._ticks.clear()
         self._commands.clear()
         self._failed += 1
-        if self._failed & (self._failed - 1) == 0:  # what fails once often fails again
+        if self._failed & (self._failed - 1) == 0:  # ever more rarely
             logger.error("messages were not streamed (%d times so far)", self._failed, exc_info=error)
 
     def _turn(self, ready: dict[Any, int]) -> None:
@@ -236,7 +237,7 @@ class StreamServer:
                 self._broadcast.obey(self._commands)
 
     def _read_subscriptions(self, socket: zmq.Socket[bytes]) -> bool:
-        """Keep up with who wants what, and return whether that changed."""
+        """Update the subscriptions, and return whether they changed."""
         topics = self._subscribed[socket]
         before = topics.copy()
         for frames in _waiting(socket):
@@ -259,7 +260,7 @@ class StreamServer:
         broadcast.want(self._subscribed[self._state], self._subscribed[self._info])
 
     def _leave(self) -> None:
-        """Be silent and deaf."""
+        """Stop publishing and listening."""
         broadcast, self._broadcast = self._broadcast, None
         if broadcast is not None:
             broadcast.leave()
@@ -296,7 +297,7 @@ class StreamServer:
                 self._commands.extend(read_commands(frames))
             except (ProtocolError, UnicodeDecodeError) as error:
                 self._malformed += 1
-                if self._malformed & (self._malformed - 1) == 0:  # a broken sender repeats itself
+                if self._malformed & (self._malformed - 1) == 0:  # ever more rarely
                     logger.warning("a control message is ignored (%d so far): %s", self._malformed, error)
 
     def _close(self) -> None:

@@ -1,4 +1,4 @@
-"""Telling the clients of a machine which servers run on it, by a file that is written again and again."""
+"""Registration of a server for clients on the same machine, by a file that is renewed regularly."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Registration:
     """Keeps the file of one server in the registry for as long as the server is open."""
 
     def __init__(self, directory: Path, describe: Callable[[], InstanceInfo]) -> None:
-        """Prepare; `start` writes the file.
+        """Configure the registration; `start` writes the file.
 
         Args:
             directory: The registry.
-            describe: Returns what the file is to say.
+            describe: Returns the contents of the file.
         """
         self._directory = directory
         self._describe = describe
@@ -35,7 +35,7 @@ class Registration:
         self._thread = threading.Thread(target=self._run, name="urlab-registry", daemon=True)
 
     def start(self) -> None:
-        """Write the file, and again whenever it would be taken for that of a dead server."""
+        """Write the file, and renew it before it would be considered stale."""
         self._write()
         self._thread.start()
 
@@ -44,7 +44,7 @@ class Registration:
         self._stopping.set()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end and remove the file; return False when the thread was still busy."""
+        """Wait for the thread to end and remove the file; return False if the thread is still busy."""
         if self._thread.ident is not None:
             ended(self._thread, timeout)
         if self._path is not None:

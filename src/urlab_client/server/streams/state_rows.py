@@ -1,4 +1,4 @@
-"""The rows of the state stream: which there are, and how each is encoded."""
+"""The rows of the state stream, and how each is encoded."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _ROW_KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class PublishedRow:
-    """A row of the state stream: its topic, and what encodes it from the data as they are; None for nothing."""
+    """A row of the state stream: its topic, and a function that encodes the current data; None for no message."""
 
     topic: bytes
     encode: Encoder
 
 
 def topic_frame(kind: TopicKind, owner: str, name: str = "") -> bytes | None:
-    """Return a topic frame; None for names that no topic can carry."""
+    """Return a topic frame; None for names that cannot be part of a topic."""
     try:
         return StreamTopic(kind, owner, name).encode()
     except ValueError as error:

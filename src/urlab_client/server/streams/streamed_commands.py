@@ -20,7 +20,7 @@ from urlab_client.server.physics.controllers import ArticulationControl
 
 __all__ = ["Actuators", "StreamedCommand", "read_commands"]
 NO_LIMIT: Final = 100.0
-"""What stands for the control range of an actuator that has none."""
+"""Control range of an actuator without one."""
 
 
 class Actuators:
@@ -38,11 +38,12 @@ class Actuators:
             self._place[actuators] = np.cumsum(widths) - widths
 
     def stage(self, command: ControlPayload, owned: Callable[[ArticulationControl], bool]) -> None:
-        """Store set-points; unknown ids are ignored, an actuator of several inputs gets its first.
+        """Store set-points. Unknown ids are ignored; an actuator with several inputs gets its first.
 
         Args:
             command: The set-points.
-            owned: Tells of which articulations they are ignored, too: those that somebody drives by requests.
+            owned: Returns whether an articulation is owned by a client that drives it by requests; its set-points are
+                ignored, too.
         """
         known = (command.actuator_ids >= 0) & (command.actuator_ids < len(self._owner))
         ids, values = command.actuator_ids[known], command.values[known]
@@ -53,7 +54,7 @@ class Actuators:
                 control.set_points.network[self._place[ids[mine]]] = values[mine]
 
     def info(self, control: ArticulationControl, cameras: tuple[CameraEndpoint, ...]) -> ActuatorInfo:
-        """Return what the info socket says about an articulation."""
+        """Return the info message of an articulation."""
         model, index = self._model, control.index
         first = control_starts(model)[index.actuators]
         limited = model.actuator_ctrllimited[first].astype(bool)

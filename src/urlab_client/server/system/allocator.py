@@ -1,4 +1,4 @@
-"""What a server that plays for days asks of glibc's memory allocation. Other C libraries are left alone."""
+"""Settings of glibc's memory allocator for long-running servers. No effect with other C libraries."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ _M_ARENA_MAX = -8  # of mallopt
 
 
 def limit_arenas() -> None:
-    """Have all threads of this process allocate from two heaps.
+    """Make all threads of this process allocate from two heaps.
 
-    Each play session draws and compiles in threads of its own. By default glibc gives each new thread a heap of its
-    own, up to eight per processor, and each keeps some ten MiB of what the renderer had in it.
+    Each play session draws and compiles in its own threads. By default glibc gives each new thread its own heap, up to
+    eight per processor, and each keeps about ten MiB of the renderer's memory.
     """
     _ask("mallopt", _M_ARENA_MAX, 2)
 
 
 def trim() -> None:
-    """Return free pages amid the heaps to the system: after many play sessions glibc keeps tens of MiB of them."""
+    """Return free pages of the heaps to the system; after many play sessions glibc keeps tens of MiB of them."""
     _ask("malloc_trim", 0)
 
 

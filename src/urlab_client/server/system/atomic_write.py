@@ -1,4 +1,4 @@
-"""Files that a reader, or a crash, finds either old or new."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["write_atomic"]
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that a reader, or a crash, sees the old file or the whole new one."""
+    """Write `data` to `path` so that readers, also after a crash, see either the old or the complete new file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -27,7 +27,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 def _sync_directory(folder: Path) -> None:
-    """See to it that a new name outlives a power failure, where the system lets a directory be synchronised."""
+    """Make a new name survive a power failure, if the system can synchronise directories."""
     if sys.platform == "win32":
         return
     descriptor = os.open(folder, os.O_RDONLY)

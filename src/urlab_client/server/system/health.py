@@ -1,7 +1,7 @@
-"""Whether the threads of a server run, and who is told when one of them died.
+"""Health of a server's threads, and callbacks for when one dies.
 
-For what has a thread, which reports its unexpected end here, for the dispatcher, which then refuses every request, and
-for `SimulatedServer`, which tells whoever runs it.
+Threads report their unexpected end here. The dispatcher then refuses every request, and `SimulatedServer` calls the
+user's callbacks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class Health:
-    """What became of the threads of one server. Safe to use from several threads."""
+    """Failures of the threads of one server. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -26,11 +26,11 @@ class Health:
 
     @property
     def failure(self) -> str | None:
-        """Which thread died first, and of what; None while all run."""
+        """Which thread died first, and why; None while all are running."""
         return self._failure
 
     def report(self, error: BaseException) -> str:
-        """Take note that the calling thread ends with an error, and return how that reads."""
+        """Record that the calling thread ends with an error, and return the message."""
         name = threading.current_thread().name
         detail = f": {error}" if str(error) else ""
         reason = f"the server's thread '{name}' died of {type(error).__name__}{detail}"
@@ -45,14 +45,14 @@ class Health:
 
     @contextmanager
     def watch(self) -> Generator[None]:
-        """Report what ends the block, and let the thread end quietly."""
+        """Report an exception that ends the block, and suppress it so that the thread ends quietly."""
         try:
             yield
         except BaseException as error:  # noqa: BLE001 - whatever it is, nobody else hears of it
             self.report(error)
 
     def add_callback(self, callback: Callable[[str], None]) -> None:
-        """Call this once with the first failure from now on, on the thread that dies; at once if there was one."""
+        """Call `callback` once with the first failure, on the thread that dies; immediately if there was one."""
         with self._lock:
             reason = self._failure
             if reason is None:
@@ -65,4 +65,4 @@ def _tell(callback: Callable[[str], None], reason: str) -> None:
     try:
         callback(reason)
     except Exception:
-        logger.exception("%r could not be told that the server failed", callback)
+        logger.exception("%r failed when called with the failure of the server", callback)

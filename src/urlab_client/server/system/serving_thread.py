@@ -1,7 +1,7 @@
-"""A thread that serves requests one after the other, and gives way to another when it does not come back from one.
+"""A thread that serves requests one by one, and is replaced when one of them does not return.
 
-For the request socket and shared memory. A thread inside a call of MuJoCo cannot be broken off; what can be done is to
-let it be, answer in its place, and go on with a fresh thread.
+For the request socket and shared memory. A thread inside a call of MuJoCo cannot be interrupted. It can only be
+abandoned: another thread sends the reply and serves from then on.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ __all__ = ["ServingThread"]
 
 
 class ServingThread:
-    """The thread that serves at present. It calls `begin` before it works on a request and `finish` after it."""
+    """The current serving thread. It calls `begin` before a request and `finish` after it."""
 
     def __init__(self, name: str, run: Callable[[bytes | None], None]) -> None:
-        """Prepare; `start` starts it.
+        """Configure the thread; `start` starts it.
 
         Args:
-            name: Of the thread.
-            run: What it does. Is given the reply to send first, when it stands in for another thread.
+            name: Name of the thread.
+            run: Target of the thread. Its argument is the reply to send first when it replaces another thread.
         """
         self._name = name
         self._run = run
@@ -34,7 +34,7 @@ class ServingThread:
         return threading.Thread(target=self._run, args=(owed,), name=self._name, daemon=True)
 
     def start(self) -> None:
-        """Start to serve."""
+        """Start the thread."""
         self._thread.start()
 
     @property
@@ -53,11 +53,11 @@ class ServingThread:
         return threading.current_thread() is self._thread
 
     def begin(self) -> None:
-        """Say that the calling thread works on a request."""
+        """Mark the calling thread as working on a request."""
         self._working = True
 
     def finish(self) -> bool:
-        """Say that it has done so; return False when another thread has answered in its place and serves now."""
+        """Mark the request as finished; return False if another thread has answered it and serves now."""
         with self._lock:
             if not self.is_current:
                 return False
@@ -65,12 +65,12 @@ class ServingThread:
             return True
 
     def relieve(self, thread: threading.Thread, owed: bytes, release: Callable[[], None]) -> bool:
-        """Let another thread serve if `thread` does so and works on a request.
+        """Replace `thread` if it is the serving thread and working on a request.
 
         Args:
-            thread: The thread that does not come back.
-            owed: The reply that the new one sends for it.
-            release: Called before the new one starts: gives it what the old one holds.
+            thread: The thread that does not return.
+            owed: The reply that the new thread sends for it.
+            release: Called before the new thread starts, to hand over what the old one holds.
         """
         with self._lock:
             if thread is not self._thread or not self._working:
@@ -82,7 +82,7 @@ class ServingThread:
             return True
 
     def join(self, timeout: float) -> bool:
-        """Wait for its end and return whether it has ended; a thread that was relieved is not waited for."""
+        """Wait for the thread to end and return whether it has. Does not wait for replaced threads."""
         if self.is_current:
             return False
         return ended(self._thread, timeout)

@@ -1,7 +1,7 @@
-"""Temporary folders that do not outlive their process for long, not even one that was killed.
+"""Temporary folders that are removed even if their process is killed.
 
-A folder holds a lock that ends with the process, however that dies. Whoever makes a folder removes those whose lock
-nobody holds. Likewise `working_in` and `sweep`, for folders that several processes work in.
+A folder contains a lock that ends with the process. Creating a folder removes those whose lock is free. `working_in`
+and `sweep` do the same for folders that several processes use.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class TemporaryFolder:
     path: Path
 
     def __init__(self) -> None:
-        """Make the folder, and remove those that killed processes have left."""
+        """Create the folder, and remove those of killed processes."""
         root = Path(tempfile.gettempdir())
         for folder in root.glob(f"{_PREFIX}*"):
             with contextlib.suppress(OSError):
@@ -48,7 +48,7 @@ class TemporaryFolder:
         self._lock: int | None = None
         while self._lock is None:
             self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
-            # Between making and locking the file somebody else may have taken it for one that was left.
+            # Between creating and locking the file, another process may have removed it as a leftover.
             self._lock = _hold(self.path / _LOCK, os.O_RDWR | os.O_CREAT)
 
     def close(self) -> None:
@@ -69,7 +69,7 @@ class TemporaryFolder:
 
 
 def _hold(file: Path, flags: int) -> int | None:
-    """Open and lock a file; None if another process holds it. Where there are no such locks, it is just opened."""
+    """Open and lock a file; None if another process holds it. Without support for locks, it is only opened."""
     descriptor = os.open(file, flags, 0o600)
     if sys.platform != "win32":
         import fcntl  # noqa: PLC0415
@@ -86,7 +86,7 @@ def _remove_if_left(folder: Path) -> None:
     if folder.is_symlink():
         return
     if sys.platform == "win32":
-        (folder / _LOCK).unlink()  # refused while its owner has it open
+        (folder / _LOCK).unlink()  # fails while its owner has it open
         shutil.rmtree(folder, ignore_errors=True)
         return
     if folder.stat().st_uid != os.geteuid():
@@ -101,15 +101,13 @@ def _remove_if_left(folder: Path) -> None:
 
 @contextlib.contextmanager
 def working_in(folder: Path) -> Generator[None]:
-    """Keep `sweep` in other processes from removing what is under way below a folder.
+    """Keep `sweep` in other processes from removing unfinished files below a folder.
 
     Raises:
         OSError: The folder cannot be opened.
     """
     if sys.platform == "win32":
-        works = NamedLock(
-            _name("works", folder)
-        )  # before it looks whether somebody sweeps, who looks in this order, too
+        works = NamedLock(_name("works", folder))  # before checking for a sweep, which checks in the same order
         try:
             while not _is_free("sweeps", folder):
                 time.sleep(_LOOK_S)
@@ -129,11 +127,11 @@ def working_in(folder: Path) -> Generator[None]:
 
 
 def sweep(folder: Path, *patterns: str) -> None:
-    """Remove what killed processes have left below a folder, unless another process works in it.
+    """Remove leftovers of killed processes below a folder, unless another process is using it.
 
     Args:
         folder: The folder; it need not exist.
-        patterns: What such things are called, relative to it.
+        patterns: Glob patterns of the leftovers, relative to the folder.
     """
     with contextlib.suppress(OSError), _alone_in(folder):
         for pattern in patterns:
@@ -145,16 +143,16 @@ def sweep(folder: Path, *patterns: str) -> None:
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Generator[None]:
-    """Lock a folder that nobody works in.
+    """Lock a folder that no process is using.
 
     Raises:
-        OSError: Somebody does, or there is no such folder.
+        OSError: A process is using it, or it does not exist.
     """
     if sys.platform == "win32":
         sweeps = NamedLock(_name("sweeps", folder))
         try:
             if not sweeps.held or not _is_free("works", folder):
-                raise BlockingIOError(f"another process works in {folder}")
+                raise BlockingIOError(f"another process is using {folder}")
             yield
         finally:
             sweeps.close()
@@ -170,13 +168,13 @@ def _alone_in(folder: Path) -> Generator[None]:
 
 
 def _name(what: str, folder: Path) -> str:
-    """Return the name of a lock of Windows', whose folders cannot be locked themselves."""
+    """Return the name of a lock file for Windows, where folders cannot be locked."""
     place = os.path.normcase(folder.resolve())
     return f"Local\\urlab_{what}_{hashlib.sha256(place.encode()).hexdigest()}"
 
 
 def _is_free(what: str, folder: Path) -> bool:
-    """Whether nobody has this lock of Windows'."""
+    """Whether this lock file for Windows is free."""
     lock = NamedLock(_name(what, folder))
     lock.close()
     return lock.held

@@ -1,4 +1,4 @@
-"""Waiting for threads to end, for a time in which they have a chance to."""
+"""Waiting for threads to end, robust against pauses of the process."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ SLICE_S: Final = 0.1
 
 
 def within(timeout: float, attempt: Callable[[float], bool]) -> bool:
-    """Try for `timeout` seconds, two slices of it at least, and return whether it worked.
+    """Try for `timeout` seconds, in at least two slices, and return whether it succeeded.
 
-    A process that is stopped, or gets no processor, finds its deadline over when it goes on, and no other thread has
-    had a turn. In slices that costs one of them, and after it comes another.
+    After a process was stopped or got no processor time, its deadline may have passed although no other thread has run.
+    With slices, such a pause uses up one of them, and another follows.
 
     Args:
         timeout: Seconds.
-        attempt: Waits for up to so many seconds, and returns whether it worked.
+        attempt: Waits for up to the given seconds, and returns whether it succeeded.
     """
     return any(attempt(SLICE_S) for _ in range(max(2, math.ceil(timeout / SLICE_S))))
 

@@ -1,7 +1,7 @@
-"""Who may connect to a server: CURVE on each of its sockets, and the answer to ZeroMQ's question who is welcome.
+"""Authentication of a server's clients: CURVE on each of its sockets, and ZeroMQ's authentication protocol (ZAP).
 
-For `SimulatedServer` and the modules that own its sockets. ZeroMQ asks once per connection, before anything else of
-the peer is read.
+For `SimulatedServer` and the modules that own its sockets. ZeroMQ asks once per connection, before it reads anything
+else from the peer.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _DOMAIN: Final = b"urlab"
 
 
 class UnprotectedServer(URLabError, ValueError):
-    """A server was to be open to the network without saying how it is protected."""
+    """A server was to be opened to a network without a choice of protection."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CurveServer:
-    """The key of a server and who may talk to it. Holds names of files, no secrets.
+    """The key of a server and the clients that may connect. Contains file names, no secrets.
 
     Attributes:
         server_key: The server's secret key file (`NAME.key_secret`).
-        allow: Public key files of clients, and folders of such; files are read when the server starts.
-        allow_any: Let in whoever knows the server's public key instead: traffic is then encrypted, and clients are
-            not told apart.
+        allow: Public key files of clients, and folders of them; files are read when the server starts.
+        allow_any: Accept everyone who knows the server's public key instead: traffic is encrypted, but clients are not
+            authenticated.
     """
 
     server_key: str | os.PathLike[str]
@@ -56,19 +56,20 @@ class CurveServer:
 
 
 class CurveKeys:
-    """What is known of a `CurveServer` once its files are read."""
+    """The keys of a `CurveServer`, read from its files."""
 
     def __init__(self, curve: CurveServer) -> None:
         """Read the key files.
 
         Raises:
-            KeyFileError: One of them is unusable.
+            KeyFileError: A file cannot be used.
         """
         self._pair: KeyPair = read_pair(curve.server_key)
         self._welcome = None if curve.allow_any else public_keys(curve.allow)
         if self._welcome is not None and self._pair.public in self._welcome and len(self._welcome) == 1:
             raise KeyFileError(
-                "the only client let in would be the server itself.", hint="Make a key for each client: urlab keys new"
+                "the only client let in would be the server itself.",
+                hint="Create a key for each client: urlab keys new",
             )
 
     @property
@@ -78,7 +79,7 @@ class CurveKeys:
 
     @property
     def clients(self) -> int | None:
-        """How many clients are welcome; None for any."""
+        """Number of clients that may connect; None for any."""
         return None if self._welcome is None else len(self._welcome)
 
     def welcomes(self, key: bytes) -> bool:
@@ -86,7 +87,7 @@ class CurveKeys:
         return self._welcome is None or key in self._welcome
 
     def protect(self, socket: zmq.Socket[bytes]) -> None:
-        """Make a socket speak CURVE; before it is bound."""
+        """Enable CURVE on a socket. Call before binding it."""
         socket.curve_server = True
         socket.curve_publickey = self._pair.public
         socket.curve_secretkey = self._pair.secret
@@ -94,11 +95,12 @@ class CurveKeys:
 
 
 class ZapAuthenticator:
-    """Guards the sockets of one ZeroMQ context. Without keys it has nothing to do, and no thread."""
+    """Authenticates the peers of one ZeroMQ context. Without keys it does nothing and has no thread."""
 
-    # Not zmq.auth.thread.ThreadAuthenticator: who is refused is not told at a level that is shown, nor its address to a
-    # callback; when its thread dies nobody is told and every new client waits for ever; and it needs an event loop,
-    # which on Windows takes tornado.
+    # Not zmq.auth.thread.ThreadAuthenticator: it logs refused peers only at a hidden level and passes no address to its
+    # callback; if its thread dies, it reports nothing and new clients wait forever; and it needs an event loop, which
+    # on
+    # Windows requires tornado.
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], curve_keys: CurveKeys | None, health: Health) -> None:
         self._curve_keys = curve_keys
@@ -118,15 +120,15 @@ class ZapAuthenticator:
         self._thread.start()
 
     def protect(self, socket: zmq.Socket[bytes]) -> None:
-        """Make a socket of the context speak CURVE, if there are keys; before it is bound."""
+        """Enable CURVE on a socket of the context, if there are keys. Call before binding it."""
         if self._curve_keys is not None:
             self._curve_keys.protect(socket)
 
     def close(self) -> None:
-        """End the thread and its sockets, before the context is terminated. Idempotent."""
+        """Stop the thread and close its sockets. Call before terminating the context. Idempotent."""
         thread, self._thread = self._thread, None
         if thread is not None:
-            with contextlib.suppress(zmq.ZMQError):  # it died
+            with contextlib.suppress(zmq.ZMQError):  # the thread died
                 self._stopper.send(b"", zmq.NOBLOCK)
             thread.join()
             self._stopper.close()
@@ -149,10 +151,10 @@ def _answer(curve_keys: CurveKeys, questions: zmq.Socket[bytes], stop: zmq.Socke
             status = (b"200", b"OK") if welcome else (b"400", b"this key is not welcome")
             questions.send_multipart([version, number, *status, b"", b""])
             refused += not welcome
-            if not welcome and refused & (refused - 1) == 0:  # whoever is refused tries again
+            if not welcome and refused & (refused - 1) == 0:  # a refused client tries again
                 logger.warning("a client at %s was refused: unknown key (%d so far)", address.decode(), refused)
 
 
 def is_loopback(address: str) -> bool:
-    """Whether an IP address is reached from this machine alone."""
+    """Whether an IP address can be reached only from this machine."""
     return ipaddress.ip_address(address.partition("%")[0]).is_loopback

@@ -1,6 +1,6 @@
-"""The request socket of a server: one ZeroMQ REP socket, served by one thread. Also what all its sockets need to bind.
+"""The request socket of a server: one ZeroMQ REP socket, served by one thread. Also helpers for binding sockets.
 
-For `SimulatedServer`. Knows frames, not their meaning: whoever opens it says how to answer one.
+For `SimulatedServer`. Handles frames without interpreting them; a callback answers each.
 """
 
 from __future__ import annotations
@@ -25,27 +25,28 @@ __all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host"
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 LINGER_MS: Final = 500
-"""How long a reply under way may keep the socket open after the end."""
+"""How long an unsent reply may keep the socket open after the end."""
 
 HEARTBEAT_MS: Final = 2000
 SILENCE_MS: Final = 10_000
-"""A peer that answers no heartbeat for so long is dropped. Its I/O thread answers, however busy its program is."""
+"""A peer that answers no heartbeat for this long is disconnected. Its I/O thread answers even if its program is
+busy."""
 
 HANDSHAKE_MS: Final = 5000
-"""A connection that has not become a ZeroMQ peer by then is closed."""
+"""Deadline for the ZeroMQ handshake of a connection, after which it is closed."""
 
 BACKLOG: Final = 128
-"""Connections that may wait to be accepted."""
+"""Length of the queue of connections to accept."""
 
 QUEUED_REQUESTS: Final = 16
-"""Requests of one peer that may wait; a peer that sends more is not read. Clients send one at a time. Each time half of
-so many have been taken, ZeroMQ wakes its I/O thread: with 4 a step takes a twentieth longer."""
+"""Requests of one peer that may wait; beyond that, ZeroMQ stops reading from the peer. Clients send one at a time.
+ZeroMQ wakes its I/O thread after half of this number of requests: with 4, a step takes 5 % longer."""
 
 _WAKE = "inproc://urlab-wake"
 
 
 class PortInUse(OSError):
-    """Another program, often another server, holds a port.
+    """Another program, often another server, uses the port.
 
     Attributes:
         host: Address of the interface.
@@ -56,7 +57,7 @@ class PortInUse(OSError):
     port: int
 
     def __init__(self, host: str, port: int, option: str = "port") -> None:
-        """Describe the conflict.
+        """Build the message.
 
         Args:
             host: Address of the interface.
@@ -65,7 +66,7 @@ class PortInUse(OSError):
         """
         super().__init__(
             errno.EADDRINUSE,
-            f"{tcp(host)}:{port} is in use: end the program that holds it, "
+            f"{tcp(host)}:{port} is in use: end the program that uses it, "
             f"or choose another {option} (0 picks a free one; on the command line --{option.replace('_', '-')} 0)",
         )
         self.host = host
@@ -80,7 +81,7 @@ def numeric_host(host: str) -> str:
     """Return the IP address to bind for `host`; empty or `*` means all IPv4 interfaces.
 
     Raises:
-        OSError: No such host.
+        OSError: The host does not exist.
     """
     if host in ("", "*"):
         return "0.0.0.0"  # noqa: S104 - asked for
@@ -88,18 +89,18 @@ def numeric_host(host: str) -> str:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
         raise OSError(error.errno, f"cannot bind to {host!r}: {error.strerror}") from error
-    # IPv4 first, as clients do: they look for `localhost` at 127.0.0.1.
+    # IPv4 first, like clients, which resolve `localhost` to 127.0.0.1.
     family_first = sorted(found, key=lambda entry: entry[0] != socket.AF_INET)
     return str(family_first[0][4][0])
 
 
 def connect_host(host: str) -> str:
-    """Return where a client on this machine reaches a server bound to the address `host`."""
+    """Return the host for clients on this machine of a server bound to the address `host`."""
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
 
 
 def tcp(host: str) -> str:
-    """Return the address of an IP address, without a port."""
+    """Return the ZeroMQ address of an IP address, without a port."""
     return f"tcp://[{host}]" if ":" in host else f"tcp://{host}"
 
 
@@ -107,27 +108,27 @@ def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> in
     """Bind a ZeroMQ socket and return its port.
 
     Args:
-        socket: The socket; options that count from the first connection are set.
+        socket: The socket; options for new connections must be set already.
         host: IP address of the interface.
         port: TCP port; 0 picks a free one.
         option: Name of the setting, for the error.
 
     Raises:
-        PortInUse: Somebody has the port.
-        OSError: The address is not one of this machine.
+        PortInUse: The port is in use.
+        OSError: The address does not belong to this machine.
     """
     socket.ipv6 = ":" in host
     try:
         socket.bind(f"{tcp(host)}:{port}")
     except zmq.ZMQError as error:
-        if error.errno == zmq.Errno.EADDRINUSE:  # which on Windows is another number than Python's
+        if error.errno == zmq.Errno.EADDRINUSE:  # on Windows a different number from Python's
             raise PortInUse(host, port, option) from error
         raise OSError(error.errno, f"cannot bind {tcp(host)}:{port}: {error.strerror}") from error
     return int(socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 
 def bound_peers(socket: zmq.Socket[bytes]) -> None:
-    """Drop peers that are gone, half-open or only pretend to speak ZeroMQ; before the socket is bound."""
+    """Disconnect peers that are gone, half-open or do not speak ZeroMQ. Call before binding the socket."""
     socket.heartbeat_ivl = HEARTBEAT_MS
     socket.heartbeat_timeout = SILENCE_MS
     socket.heartbeat_ttl = SILENCE_MS
@@ -163,16 +164,16 @@ class RpcEndpoint:
 
         Args:
             answer: Turns the frame of a request into the frame of its reply; must not raise.
-            refuse: Makes the frame of an error from its code and message, for when it raises all the same.
-            health: Told when requests cannot be served any more.
+            refuse: Builds the frame of an error from its code and message, in case `answer` raises nevertheless.
+            health: Notified when the thread dies.
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
-            curve_keys: Who may connect; None for anybody who reaches the interface.
-            request_bytes: Largest request that is answered with anything but its size.
+            curve_keys: Who may connect; None for anyone who can reach the interface.
+            request_bytes: Largest request that is processed; larger ones are refused.
 
         Raises:
-            PortInUse: Somebody has the port.
-            OSError: The address is not one of this machine.
+            PortInUse: The port is in use.
+            OSError: The address does not belong to this machine.
         """
         self._answer = answer
         self._refuse = refuse
@@ -183,7 +184,7 @@ class RpcEndpoint:
         self._socket = self._context.socket(self.kind)
         self._authenticator.protect(self._socket)
         bound_peers(self._socket)
-        # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
+        # A frame between the two limits is refused with the reason; for one beyond both, the connection is closed.
         self._socket.maxmsgsize = 2 * request_bytes
         self._socket.rcvhwm = QUEUED_REQUESTS
         try:
@@ -209,20 +210,20 @@ class RpcEndpoint:
         self.serving.start()
 
     def stop(self) -> None:
-        """Ask the thread to end after the request under way, without waiting. Call once."""
+        """Ask the thread to end after the current request, without waiting. Call once."""
         self._stopping = True
         with contextlib.suppress(zmq.ZMQError):  # the thread has ended already
             self._waker.send_multipart([b"", b""], zmq.NOBLOCK)
         self._waker.close()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end after `stop`.
+        """Wait for the thread to end after `stop`.
 
         Args:
             timeout: Seconds to wait.
 
         Returns:
-            False when the request under way took longer; the thread then closes the socket when it is done.
+            False if the current request took longer; the thread then closes the socket when it has finished.
         """
         if not self.serving.started:
             self._close()
@@ -242,7 +243,7 @@ class RpcEndpoint:
                 self._close()
 
     def _serve(self) -> bool:
-        """Answer one request, with the reason where that fails; return False when it is time to end."""
+        """Answer one request, with the error if that fails; return False when the thread must end."""
         try:
             return self._exchange()
         except zmq.ZMQError:
@@ -251,16 +252,16 @@ class RpcEndpoint:
             if not self.serving.finish():
                 return False
             reason = self._health.report(error)
-            with contextlib.suppress(zmq.ZMQError):  # nobody has asked
+            with contextlib.suppress(zmq.ZMQError):  # no request is pending
                 self._send_owed(self._refuse("internal_error", reason))
             return True
 
     def _send_owed(self, reply: bytes) -> None:
-        """Answer the request that was received last, if it is unanswered."""
+        """Answer the last received request if it is still unanswered."""
         self._socket.send(reply, zmq.NOBLOCK)
 
     def _exchange(self) -> bool:
-        """Answer one request; return False when it is time to end."""
+        """Answer one request; return False when the thread must end."""
         socket = self._socket
         frame = socket.recv()
         # A request of several frames is invalid: executing the first one would be a guess.

@@ -1,8 +1,8 @@
-"""The shared-memory regions of a server as files: where they lie, who may touch them, and what is left of the dead.
+"""The shared-memory regions of a server as files: location, permissions, and removal of leftovers.
 
-For `SharedMemory`. A program of the same user can damage the files at any moment, and touching a mapping beyond the end
-of its file kills the process. So the server maps nothing: it reads and writes its own descriptors, which costs a
-microsecond more.
+For `SharedMemoryServer`. Programs of the same user can damage the files at any moment, and accessing a mapping beyond
+the end of its file kills the process. The server therefore maps nothing; it reads and writes file descriptors, which
+takes a microsecond more.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ _LATEST_AT: Final = 24
 _COUNTERS: Final = Layout("<QI")
 _SIZE: Final = Layout("<I")
 _LOOKS: Final = 100
-_LOCKED_AT: Final = 1024  # beyond the text: Windows lets nobody read what is locked
+_LOCKED_AT: Final = 1024  # beyond the text: on Windows, locked bytes cannot be read
 _RAW: Final = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 class InstanceDirectory:
-    """The directory of one server's regions, which nobody but its user can enter.
+    """The directory of one server's regions, accessible only to its user.
 
-    It is `BASE/urlab-…/live`: clients look for most regions in a sibling `live` of the directory that the handshake
-    names, which so is that directory itself whatever other servers share the base. A lock that dies with the server
-    tells a directory in use from one that was left behind.
+    It is `BASE/urlab-…/live`. Clients look for most regions in a sibling `live` of the directory that the handshake
+    names; this way that is the directory itself, whatever other servers share the base. A lock that ends with the
+    server distinguishes a directory in use from a leftover.
 
     Attributes:
         path: The directory.
     """
 
     def __init__(self, base: Path) -> None:
-        """Make the directory, and remove those of servers that were killed.
+        """Create the directory, and remove those of killed servers.
 
         Raises:
-            OSError: The base cannot be made or written to.
+            OSError: The base cannot be created or written to.
         """
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
         _remove_left_behind(base)
@@ -72,7 +72,7 @@ class InstanceDirectory:
             made.callback(_remove, self._instance)
             self._lock = os.open(self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | _RAW, 0o600)
             made.callback(os.close, self._lock)
-            # Before the text: a server that starts at this moment takes a directory without it for somebody else's.
+            # Lock before writing the text: a server that starts now ignores directories without the text.
             _lock(self._lock)
             os.write(self._lock, LOCK_TEXT)
             self.path.mkdir(mode=0o700)
@@ -85,13 +85,13 @@ class InstanceDirectory:
 
 
 def _length(descriptor: int) -> int:
-    """Return the length of a file, which a server asks for many times a second: seeking takes a quarter of `fstat`."""
-    # Where there is no `pread`, reading needs the position.
+    """Return the length of a file. Called many times a second; seeking takes a quarter of the time of `fstat`."""
+    # Without `pread`, reading depends on the position.
     return os.lseek(descriptor, 0, os.SEEK_END) if hasattr(os, "pread") else os.fstat(descriptor).st_size
 
 
 def _lock(descriptor: int) -> bool:
-    """Take a lock that ends with the process; return False if somebody has it."""
+    """Acquire a lock that ends with the process; return False if another process holds it."""
     if sys.platform == "win32":
         os.lseek(descriptor, _LOCKED_AT, os.SEEK_SET)
         try:
@@ -116,7 +116,7 @@ def _remove_left_behind(base: Path) -> None:
             if directory.is_symlink() or not mine:
                 continue
             descriptor = os.open(directory / LOCK_FILE, os.O_RDWR | _RAW | getattr(os, "O_NOFOLLOW", 0))
-        except OSError:  # not one of ours
+        except OSError:  # not created by a server
             continue
         try:
             abandoned = _pread(descriptor, len(LOCK_TEXT) + 1, 0) == LOCK_TEXT and _lock(descriptor)
@@ -128,10 +128,10 @@ def _remove_left_behind(base: Path) -> None:
 
 
 def _remove(instance: Path) -> None:
-    """Remove what servers make; a directory with anything else in it stays."""
+    """Remove the files of servers; a directory that contains anything else is kept."""
     live = instance / LIVE_DIRECTORY
     files = [live / doorbell.FILE, instance / LOCK_FILE]
-    with contextlib.suppress(OSError):  # servers that start at once may remove the same one
+    with contextlib.suppress(OSError):  # servers that start concurrently may remove the same one
         files += [file for file in live.iterdir() if file.name.endswith(".shm")]
     for file in files:
         with contextlib.suppress(OSError):
@@ -142,17 +142,17 @@ def _remove(instance: Path) -> None:
 
 
 class RegionFile:
-    """A region of this server, in its place once it can be read. Written with `pwrite`, never through a mapping.
+    """A region of this server, moved into place once it is readable. Written with `pwrite`, never through a mapping.
 
     Attributes:
         path: The file.
     """
 
     def __init__(self, path: Path, stride: int) -> None:
-        """Make the file.
+        """Create the file.
 
         Raises:
-            OSError: There is no room.
+            OSError: The disk is full.
         """
         self.path = path
         self.stride = stride
@@ -174,10 +174,10 @@ class RegionFile:
         if sys.platform != "win32":
             new.replace(self.path)
             return
-        os.close(self._fd)  # Windows moves no file that is open
+        os.close(self._fd)  # Windows cannot move open files
         try:
             new.replace(self.path)
-        except PermissionError:  # nor does it replace one: who has it open finds it laid out anew
+        except PermissionError:  # nor replace them: initialise the existing file again
             new.unlink()
             self._fd = os.open(self.path, os.O_RDWR | _RAW)
             self._lay_out()
@@ -190,11 +190,11 @@ class RegionFile:
         return self.stride - SIZE_PREFIX
 
     def publish(self, payload: bytes) -> None:
-        """Make a payload the newest publication.
+        """Publish a payload.
 
         Raises:
-            ValueError: It does not fit.
-            OSError: There is no room to mend a file that somebody cut off.
+            ValueError: The payload does not fit.
+            OSError: The file was truncated, and the disk is too full to restore it.
         """
         if not 0 < len(payload) <= self.max_payload:
             raise ValueError(f"{len(payload)} bytes, {self.path.name} takes 1 to {self.max_payload}")
@@ -210,13 +210,13 @@ class RegionFile:
         _pwrite(self._fd, _SEQUENCE.pack(self._sequence), _SEQUENCE_AT)
 
     def close(self) -> None:
-        """Let go of the file and remove it. On Windows it stays while a client has it open."""
+        """Close the file and remove it. On Windows it remains while a client has it open."""
         os.close(self._fd)
         with contextlib.suppress(OSError):
             self.path.unlink()
 
     def _mend(self) -> None:
-        """Lay the region out anew if somebody cut the file off or wrote over the header's fixed part."""
+        """Initialise the region again if the file was truncated or the fixed part of its header overwritten."""
         intact = _length(self._fd) >= self._size
         if intact and _pread(self._fd, _FIXED.size, 0) == self._fixed():
             return
@@ -224,9 +224,9 @@ class RegionFile:
         self._lay_out()
 
     def _lay_out(self) -> None:
-        # Never made shorter: that would kill a client that looks into its mapping.
+        # Never truncated: that would kill a client that accesses its mapping.
         self._sequence = self._latest = 0
-        # With the memory, not only the length: a full disk is to show here.
+        # Allocates the blocks, not only the length, so that a full disk is detected here.
         if hasattr(os, "posix_fallocate"):
             try:
                 os.posix_fallocate(self._fd, 0, self._size)
@@ -241,19 +241,19 @@ class RegionFile:
 
 
 class RequestFile(RegionFile):
-    """The region in which clients leave requests. What they do to it cannot harm the server."""
+    """The region in which clients write requests. Nothing that they write can harm the server."""
 
     def sequence(self) -> int:
-        """Return how many requests were published; 0 after the file was cut off."""
+        """Return the number of published requests; 0 if the file was truncated."""
         if _length(self._fd) < self._size:
             self._mend()
         raw = _pread(self._fd, _SEQUENCE.size, _SEQUENCE_AT)
         return _SEQUENCE.unpack(raw)[0] if len(raw) == _SEQUENCE.size else 0
 
     def read(self) -> tuple[int, bytes | None]:
-        """Return the sequence and the newest request, or None instead of one that cannot be taken.
+        """Return the sequence and the newest request, or None instead of a request that cannot be read.
 
-        That is one that changed while it was copied, or whose slot or size lies outside the file.
+        It cannot be read if it changed during the copy, or if its slot or size lies outside the file.
         """
         self._mend()
         sequence, slot = self._settled_counters()
@@ -266,14 +266,14 @@ class RequestFile(RegionFile):
             return sequence, None
         payload = _pread(self._fd, size, start + SIZE_PREFIX)
         self._fence()
-        # With two slots, the writer begins to overwrite this one when it has counted once more.
+        # With two slots, the writer starts overwriting this one after the next count.
         return sequence, payload if self.sequence() == sequence and len(payload) == size else None
 
     def _settled_counters(self) -> tuple[int, int]:
-        """Return sequence and slot that belong together.
+        """Return a consistent pair of sequence and slot.
 
-        A writer stores the slot first and then counts. Between the two, its request would be taken under the number
-        of the one before, and then once more under its own.
+        A writer stores the slot before it increments the sequence. In between, its request would be read with the
+        previous number, and then again with its own.
         """
         sequence = slot = 0
         for _ in range(_LOOKS):

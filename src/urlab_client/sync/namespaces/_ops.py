@@ -46,7 +46,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
-            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
+            NotControlOwner: Another client controls the robot, or no client does; nothing was written.
         """
         self._portal.call(self._aio.set_control_source, source, articulation=articulation, timeout=timeout)
 
@@ -70,7 +70,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
-            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
+            NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
         """
         self._portal.call(self._aio.set_twist, articulation, linear=linear, angular=angular, timeout=timeout)
@@ -89,7 +89,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
-            UnknownBody: The compiled model has no body of that name.
+            UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
         return self._portal.call(self._aio.set_mocap_pose, body, pos=pos, quat=quat, timeout=timeout)
@@ -104,7 +104,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
-            UnknownBody: The compiled model has no body of that name.
+            UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
         return self._portal.call(self._aio.read_mocap_pose, body, timeout=timeout)
@@ -157,7 +157,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            CreateLevelFailed: The level exists already, a play session runs, or it could not be saved.
+            CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         self._portal.call(self._aio.create_level, name, force_overwrite=force_overwrite, timeout=timeout)
 
@@ -170,7 +170,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            LoadLevelFailed: The level does not exist, cannot be read, or a play session runs.
+            LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         self._portal.call(self._aio.load_level, name_or_path, timeout=timeout)
 
@@ -181,7 +181,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            SaveLevelFailed: The level has no path yet, a play session runs, or it could not be written.
+            SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
         """
         self._portal.call(self._aio.save_level, timeout=timeout)
 
@@ -247,7 +247,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            SetActorTransformFailed: No actor matches, or the rotation is not one.
+            SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         self._portal.call(
             self._aio.set_actor_transform,
@@ -638,7 +638,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            UnknownActor: No actor matches; the message is the key.
+            UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
         """
@@ -655,7 +655,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
-            Unsupported: Only a server without Unreal answers this: it cannot do what was asked.
+            Unsupported: The request is not supported without Unreal; only the simulated server answers this.
         """
         return self._portal.call(self._aio.set_mode, mode, timeout=timeout)
 
@@ -679,7 +679,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
 
         Raises:
             MissingField: A required field is absent, empty or malformed.
-            UnknownActor: No actor matches; the message is the key.
+            UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
         return self._portal.call(
@@ -714,7 +714,7 @@ class FarmOps(Facade, twin=aio.FarmOps):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            LeaseBusy: Somebody holds the server's driver lease.
+            LeaseBusy: Another client holds the server's driver lease.
         """
         return self._portal.call(self._aio.acquire_lease, owner, ttl_s=ttl_s, timeout=timeout)
 

@@ -11,10 +11,10 @@ __all__ = ["DebugNamespace"]
 
 
 class DebugNamespace(DebugOps, twin=aio.DebugNamespace):
-    """Debug drawing, in the editor and during play; the play world wins when it runs.
+    """Debug drawing in the editor and during play; during play it draws into the play world.
 
-    Positions are metres in MuJoCo's world frame, colours (r, g, b) in [0, 1]. `ttl` is seconds: 0 shows a single
-    frame, a negative value stays until `clear_markers`.
+    Positions are metres in MuJoCo's world frame, colours (r, g, b) in [0, 1]. `ttl` is in seconds: 0 shows a marker for
+    a single frame, a negative value until `clear_markers`.
     """
 
     __slots__ = ()

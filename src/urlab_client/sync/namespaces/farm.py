@@ -11,7 +11,7 @@ __all__ = ["FarmNamespace"]
 
 
 class FarmNamespace(FarmOps, twin=aio.FarmNamespace):
-    """Sharing servers among clients; servers of the alpha have none of it."""
+    """Sharing servers among clients. Servers of the alpha do not support it."""
 
     __slots__ = ()
     _aio: aio.FarmNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction

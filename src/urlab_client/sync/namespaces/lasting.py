@@ -14,7 +14,7 @@ __all__ = ["Playing", "SceneEdit"]
 
 
 class Playing(Facade, twin=aio.Playing):
-    """Play for as long as a block lasts; see `client.sim.playing()`."""
+    """Play for the duration of a block; see `client.sim.playing()`."""
 
     __slots__ = ()
     _aio: aio.Playing

@@ -13,7 +13,7 @@ __all__ = ["OutlinerNamespace"]
 
 
 class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):
-    """Looking at the world, and preparing plain meshes for physics."""
+    """Inspecting the world, and preparing plain meshes for physics."""
 
     __slots__ = ()
     _aio: aio.OutlinerNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
@@ -37,14 +37,14 @@ class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):
     ) -> list[ActorInfo]:
         """List the actors that pass every given filter.
 
-        The plugin does not send the kind of an actor here: it is derived from the class name, and
+        The plugin does not send the kind of an actor here. The client derives it from the class name, and
         `has_quick_convert` stays False.
 
         Args:
             class_filter: Class or parent class name, any letter case.
             tag: Whole tag, any letter case.
             name_prefix: Beginning of the engine actor name, any letter case.
-            in_pie: Search the play world when it runs.
+            in_pie: Search the play world if play is running.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:

@@ -16,29 +16,29 @@ __all__ = ["RecordingNamespace", "ReplayNamespace"]
 
 
 class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
-    """Recording joint states on the server. The properties follow this client's own calls."""
+    """Recording joint states on the server. The properties reflect this client's own calls."""
 
     __slots__ = ()
     _aio: aio.RecordingNamespace
 
     @property
     def is_active(self) -> bool:
-        """Whether a recording runs."""
+        """Whether a recording is running."""
         return self._aio.is_active
 
     @property
     def frame_count(self) -> int:
-        """Frames of the recording that was stopped last."""
+        """Number of frames in the recording that was stopped last."""
         return self._aio.frame_count
 
     @property
     def sim_duration(self) -> float:
-        """Seconds of simulation time of the recording that was stopped last."""
+        """Duration of the recording that was stopped last, seconds of simulation time."""
         return self._aio.sim_duration
 
     @property
     def last_saved_path(self) -> Path | None:
-        """Where the last recording was saved, on the server's machine."""
+        """Path of the recording that was saved last, on the server's machine."""
         return self._aio.last_saved_path
 
     def start(
@@ -47,12 +47,12 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         """Start recording.
 
         Args:
-            name: Accepted; servers name the session themselves.
-            max_duration_s: Keep only the newest seconds of simulation time.
+            name: Accepted but not used; the server names the session.
+            max_duration_s: Seconds of simulation time to keep; older frames are dropped. None for no limit.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            RecordingAlreadyActive: A recording runs.
+            RecordingAlreadyActive: A recording is already running.
         """
         return self._portal.call(self._aio.start, name, max_duration_s, timeout=timeout)
 
@@ -60,7 +60,7 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         """Stop recording.
 
         Raises:
-            RecordingNotActive: No recording runs.
+            RecordingNotActive: No recording is running.
         """
         return self._portal.call(self._aio.stop, timeout=timeout)
 
@@ -68,7 +68,7 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         """Write the active session to a JSON file on the server's machine and return its absolute path.
 
         Args:
-            path: File name, in the server's replay directory; default `recording.json`.
+            path: File name in the server's replay directory; default `recording.json`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -77,12 +77,12 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         return self._portal.call(self._aio.save, path, timeout=timeout)
 
     def clear(self, *, timeout: Timeout = DEFAULT) -> None:
-        """Forget the recorded frames."""
+        """Discard the recorded frames."""
         self._portal.call(self._aio.clear, timeout=timeout)
 
 
 class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
-    """Playing recordings back; needs step mode direct or puppet."""
+    """Playing recordings back. Requires step mode `direct` or `puppet`."""
 
     __slots__ = ()
     _aio: aio.ReplayNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
@@ -96,7 +96,7 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
         """Load a recording from the server's replay directory and make it active.
 
         Raises:
-            PathNotReadable: The recording is missing or is not one.
+            PathNotReadable: The file is missing or is not a recording.
         """
         return self._portal.call(self._aio.load, path, timeout=timeout)
 
@@ -124,12 +124,12 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
         """Play a loaded session by name, or load a recording and play it.
 
         Args:
-            path_or_name: Name of a loaded session, else a file of the server's replay directory.
-            loop: Accepted; servers play sessions in a loop until stopped.
+            path_or_name: Name of a loaded session, otherwise a file in the server's replay directory.
+            loop: Accepted but not used; servers play sessions in a loop until stopped.
             timeout: Seconds to wait for each op; None waits without limit.
 
         Raises:
-            PathNotReadable: It is neither a session nor a recording.
+            PathNotReadable: `path_or_name` is neither a session nor a recording.
             ReplayRequiresStepped: The step mode is live.
         """
         return self._portal.call(self._aio.play, path_or_name, loop=loop, timeout=timeout)

@@ -31,7 +31,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     _aio: aio.RuntimeNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
 
     def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
-        """Pause or resume physics and return the state in force.
+        """Pause or resume physics, and return the state in force.
 
         Args:
             paused: True to pause.
@@ -42,10 +42,10 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
 
-        Velocities and time stay.
+        Velocities and time do not change.
 
         Args:
-            target: Actor id, or the articulation key with `by_name`; any other of its names means it, too.
+            target: Actor id, or the articulation key with `by_name`; its other names are also accepted.
             qpos: All joint positions in joint order, or 7 values for a free base alone: xyz, quaternion (w, x, y, z).
             by_name: Look `target` up by the articulation key.
             timeout: Seconds to wait; None waits without limit.
@@ -53,8 +53,8 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         Raises:
             UnknownArticulation: No articulation has this key or actor id.
             DimMismatch: The number of values does not fit.
-            TypeError: Some are not numbers; nothing was sent.
-            ValueError: Some are NaN or infinite; nothing was sent.
+            TypeError: A value is not a number; nothing was sent.
+            ValueError: A value is NaN or infinite; nothing was sent.
         """
         self._portal.call(self._aio.set_qpos, target, qpos, by_name=by_name, timeout=timeout)
 
@@ -68,10 +68,10 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         max_contacts: int = 64,
         timeout: Timeout = DEFAULT,
     ) -> ContactsResult:
-        """Snapshot the active contacts.
+        """Return a snapshot of the active contacts.
 
-        Filters are combined with AND. Each is a compiled name, or one with the articulation's key, actor id or nothing
-        in front; what was filtered by comes back as it was written, all other names as they were compiled. The server
+        Filters are combined with AND. Each is a compiled name, or a short name with or without the articulation's key
+        or actor id as prefix. Contacts use the names as given in the filters, and compiled names otherwise. The server
         compares `body1` and `geom1` with the first geom of a contact and `body2` and `geom2` with the second; a swapped
         pair does not match.
 
@@ -80,7 +80,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             body2: Body of the second geom.
             geom1: First geom.
             geom2: Second geom.
-            max_contacts: Return at most so many.
+            max_contacts: Maximum number of contacts to return.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -97,15 +97,15 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         )
 
     def set_sim_options(self, *, timeout: Timeout = DEFAULT, **opts: Any) -> SimOptions:
-        """Change fields of `mjOption`, mirror them into `client.model.opt`, and return all that are in force.
+        """Change fields of `mjOption`, mirror them into `client.model.opt`, and return all options in force.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
             **opts: Fields of `SimOptions` by name, for example `timestep=0.001, gravity=(0, 0, -1.62)`.
 
         Raises:
-            TypeError: An unknown option, or one of the wrong type; nothing was sent.
-            ValueError: A number that the option cannot be, such as a timestep of 0 or NaN; nothing was sent.
+            TypeError: An option is unknown or has the wrong type; nothing was sent.
+            ValueError: A value is invalid for its option, such as a timestep of 0 or NaN; nothing was sent.
             BadValue: Unknown integrator, cone or solver.
         """
         return self._portal.call(self._aio.set_sim_options, timeout=timeout, **opts)
@@ -117,19 +117,19 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         scene: Mapping[str, Any] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, str]:
-        """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+        """Write user channels that the level declares for its robots or the scene; the state returns their values.
 
         Args:
-            arts: Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`.
+            arts: Articulation to channel to value: a bool, number, string, list of numbers, or map of `pos` and `quat`.
             scene: Channel of the scene to value.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            Why a value was not taken, by `<articulation>/<channel>` or `scene/<channel>`; empty when all were.
+            Reasons of rejected values, by `<articulation>/<channel>` or `scene/<channel>`; empty if all were accepted.
 
         Raises:
-            KeyError: Unknown articulation; nothing was sent.
-            UnknownOp: The server has no such channels.
+            KeyError: The articulation is unknown; nothing was sent.
+            UnknownOp: The server does not support user channels.
         """
         return self._portal.call(self._aio.set_user_channels, arts, scene=scene, timeout=timeout)
 
@@ -138,64 +138,64 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     ) -> dict[str, CameraStreaming]:
         """Switch the streams of cameras on or off, for all clients, until play ends.
 
-        Iterating over `frames()` does so automatically, for as long as somebody iterates. This setting takes
+        Iterating over `frames()` does so automatically, for the duration of the iteration. This setting takes
         precedence: a camera switched on here stays on when its streams end and when the client is closed. A camera
-        switched off here sends nothing more to its open streams, until another stream of it is opened.
+        switched off here no longer sends to its open streams, until another stream of it is opened.
 
         Args:
-            cameras: Camera, by its name or as `<articulation>/<camera>`, to on or off, or to the transports it is to
-                use. Transports that are not mentioned are switched off, unless none is mentioned.
+            cameras: Camera, as `<camera>` or `<articulation>/<camera>`, to on or off, or to the transports to use.
+                Transports that are not mentioned are switched off, unless none is mentioned.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            Where the cameras stream now, by the given names, without cameras that the server no longer has.
+            Streaming state of the cameras, by the given names, without cameras that the server no longer has.
 
         Raises:
-            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
-            UnknownOp: A camera is to be switched off by a server whose cameras always stream; nothing was sent.
-            GameThreadTimeout: The editor is busy; it may still do it later.
+            KeyError: The camera is unknown, or several articulations have it; nothing was sent.
+            UnknownOp: A camera cannot be switched off because the server's cameras always stream; nothing was sent.
+            GameThreadTimeout: The editor is busy; it may still execute the request later.
         """
         return self._portal.call(self._aio.set_camera_streaming, cameras, timeout=timeout)
 
     def set_camera_delay(
         self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraDelayInForce]:
-        """Delay the pictures of cameras, as slow cameras do, for all clients, until play ends.
+        """Delay the pictures of cameras, as real cameras do, for all clients, until play ends.
 
         The delay affects streams and `latest` pictures, but not `sync` pictures of a step.
 
         Args:
-            cameras: Camera, by its name or as `<articulation>/<camera>`, to seconds, or to a latency with jitter.
+            cameras: Camera, as `<camera>` or `<articulation>/<camera>`, to seconds, or to a latency with jitter.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            The latencies now, by the names given; without cameras that the server does not have any more.
+            The latencies in force, by the given names, without cameras that the server no longer has.
 
         Raises:
-            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
-            ValueError: A latency is negative, NaN or infinite, or goes by an unknown clock; nothing was sent.
-            UnknownOp: The server has no such latency.
-            GameThreadTimeout: The editor is busy; it may still do it later.
+            KeyError: The camera is unknown, or several articulations have it; nothing was sent.
+            ValueError: A latency is negative, NaN or infinite, or its clock is unknown; nothing was sent.
+            UnknownOp: The server does not support camera latency.
+            GameThreadTimeout: The editor is busy; it may still execute the request later.
         """
         return self._portal.call(self._aio.set_camera_delay, cameras, timeout=timeout)
 
     def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
-        """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
+        """Switch the step mode and return the mode in force. Every mode except live resumes paused physics.
 
         Args:
-            mode: `direct`, `puppet`, `live`; `auto` means live.
+            mode: `direct`, `puppet` or `live`; `auto` means live.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ValueError: Unknown mode; nothing was sent.
-            ModeLocked: The project pins another mode.
+            ValueError: The mode is unknown; nothing was sent.
+            ModeLocked: The project is locked to another mode.
         """
         return self._portal.call(self._aio.set_mode, mode, timeout=timeout)
 
     def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
-        """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
+        """Run `mj_forward` on the server and adopt the state: kinematics and dynamics, no integration.
 
-        In puppet mode `client.data` stays as it is: there it is yours, and what the server has was pushed from it.
+        In puppet mode `client.data` does not change: there the client owns it and pushes it to the server.
 
         Returns:
             The state; time and step counter are unchanged.

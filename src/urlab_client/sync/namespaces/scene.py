@@ -29,7 +29,7 @@ __all__ = ["SceneNamespace"]
 
 
 class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
-    """Editor-time authoring. Edits during play show after the next start of play."""
+    """Editor-time authoring. Edits during play take effect at the next start of play."""
 
     __slots__ = ()
     _aio: aio.SceneNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
@@ -37,17 +37,17 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     def edit(self, *, timeout_s: float = 30.0) -> SceneEdit:
         """Edit the level in a `with` block, and restart play once at its end, so that the simulation has the edits.
 
-        Where no play runs at the end, nothing is started. Of nested blocks the outermost one restarts. After the
-        restart the client's own step mode is in force again; in live mode physics starts paused.
+        If play is off at the end, it is not started. With nested blocks, only the outermost one restarts play. After
+        the restart the client's own step mode is in force again; in live mode physics starts paused.
 
-        If the block raises, play is not restarted: it goes on in the world as it was, and what was edited before stays
-        in the level, as the editor has no op to undo it. The exception carries a note that says so.
+        If the block raises, play is not restarted and continues without the edits. The edits made so far stay in the
+        level, because the editor has no op to undo them. A note on the exception reports this.
 
         Args:
             timeout_s: Seconds to wait for the compile.
 
         Raises:
-            URLabPIEError: On leaving: the level does not compile as it is now. The edits stay, and play is off.
+            URLabPIEError: On leaving, the edited level did not compile. The edits stay, and play is off.
 
         Example:
             with client.scene.edit():
@@ -64,12 +64,12 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         on_progress: Callable[[JobStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> URLabBlueprint:
-        """Turn an MJCF file on the server's machine into a blueprint for `spawn_actor`.
+        """Import an MJCF file on the server's machine as a blueprint for `spawn_actor`.
 
         Args:
             xml_path: Absolute path of the MJCF file.
             force_reimport: Replace an existing blueprint of the same file stem.
-            on_progress: Told again and again how far the import is, by servers that say so.
+            on_progress: Callback invoked repeatedly with the progress of the import, if the server reports it.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -90,13 +90,13 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         scale: Vector = (1.0, 1.0, 1.0),
         timeout: Timeout = DEFAULT,
     ) -> URLabSpawnHandle:
-        """Place an instance of a blueprint in the edited level, or move the one that carries the id.
+        """Place an instance of a blueprint in the edited level, or move the actor that has the id.
 
         Args:
-            blueprint: What `import_xml` returned, or a package or class path.
+            blueprint: Return value of `import_xml`, or a package or class path.
             actor_id: Stable id; empty always places a new actor.
             location: Position in the world frame, metres.
-            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; overrides `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
             timeout: Seconds to wait; None waits without limit.
@@ -133,12 +133,12 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             actor_id: Stable id; not checked for reuse.
             location: Position in the world frame, metres.
             rotation_euler: (roll, pitch, yaw) in degrees, Unreal's frame.
-            intensity: In Unreal's unit for that kind of light.
+            intensity: Intensity in Unreal's unit for that kind of light.
             color: Red, green, blue in [0, 1].
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            SpawnFailed: Unknown kind.
+            SpawnFailed: The kind is unknown.
         """
         return self._portal.call(
             self._aio.spawn_light,
@@ -165,7 +165,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         self._portal.call(self._aio.destroy_actor, target, by_name=by_name, timeout=timeout)
 
     def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
-        """Describe every visible actor, with articulation metadata; the play world when it runs.
+        """Describe every visible actor, with articulation metadata; during play, of the play world.
 
         Raises:
             SnapshotFailed: There is no world to describe.
@@ -183,11 +183,11 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     ) -> URLabSpawnHandle:
         """Spawn another instance of an actor's class with the same rotation and scale.
 
-        The plugin reports neither pose nor flags of the copy; they are read from the actor list.
+        The plugin reports neither pose nor flags of the copy; the client reads them from the actor list.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
-            new_actor_id: Id of the copy; one that exists moves that actor.
+            new_actor_id: Id of the copy; an existing id moves that actor.
             by_name: Look `target` up by the engine's actor name.
             location: Position of the copy in the world frame, metres; default 1 m along x from the source.
             timeout: Seconds to wait; None waits without limit.
@@ -216,24 +216,24 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     ) -> dict[str, URLabSpawnHandle]:
         """Place a grid of actors in one request and return their handles by actor id.
 
-        Cell (i, j) stands at origin + (i spacing[0], j spacing[1], 0) and has the id `<base>_<i>_<j>`.
+        Cell (i, j) is at origin + (i spacing[0], j spacing[1], 0) and has the id `<base>_<i>_<j>`.
 
         Args:
-            blueprint: What `import_xml` returned, or a package or class path.
-            base_actor_id: Beginning of the ids.
+            blueprint: Return value of `import_xml`, or a package or class path.
+            base_actor_id: Prefix of the ids.
             count_x: Cells along x.
-            count_y: Cells along y; at most 1024 cells together.
+            count_y: Cells along y; at most 1024 cells in total.
             spacing: Distance between cells, metres; the third number is ignored.
             origin: Position of cell (0, 0) in the world frame, metres.
-            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; overrides `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
-            on_progress: Told again and again how far it is, by servers that say so.
+            on_progress: Callback invoked repeatedly with the progress, if the server reports it.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            InvalidCount: A count is not above zero.
-            TooManyCells: More than 1024 cells.
+            InvalidCount: A count is not above 0.
+            TooManyCells: There are more than 1024 cells.
             SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
         """
         return self._portal.call(
@@ -258,22 +258,22 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         on_progress: Callable[[UploadProgress], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> URLabBlueprint:
-        """Bring a model of this machine to the server and turn it into a blueprint for `spawn_actor`.
+        """Upload a model from this machine to the server and import it as a blueprint for `spawn_actor`.
 
-        Files that the server has got before, from any client, are not sent again. Each upload replaces the blueprint of
-        the one before: to have two uploaded robots in one level, combine them in one MJCF.
+        Files that the server already has, from any client, are not sent again. Each upload replaces the blueprint of
+        the previous one; to have two uploaded robots in one level, combine them in one MJCF.
 
         Args:
-            model: An MJCF file, with whatever it includes, or a spec.
-            on_progress: Told after each piece that was sent.
+            model: An MJCF file, which may include others, or a spec.
+            on_progress: Callback invoked after each chunk that was sent.
             timeout: Seconds to wait for each request; None waits without limit. By default the import may take ten
                 minutes.
 
         Raises:
-            UnknownOp: The server takes no models over the wire; nothing was sent.
-            FileNotFoundError: There is no such file.
+            UnknownOp: The server does not accept uploads; nothing was sent.
+            FileNotFoundError: The file does not exist.
             ValueError: MuJoCo rejects the model, or it is larger than servers accept; nothing was sent.
-            ImportFailed: The server rejects it.
+            ImportFailed: The server rejects the model.
             OutcomeUnknown: The connection broke during the import.
         """
         return self._portal.call(self._aio.upload_model, model, on_progress=on_progress, timeout=timeout)
@@ -283,21 +283,21 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
-        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
-        one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Scene changes by other tasks wait until
+        this call has finished. At most one MJCF that exists only on this machine is uploaded, if the server accepts
+        uploads.
 
         Args:
             level_name: Short name or `/Game/` path.
-            assets: What to place.
+            assets: Actors to place.
             save: Save the level afterwards.
-            timeout: Seconds to wait for each of the ops; None waits without limit.
+            timeout: Seconds to wait for each op; None waits without limit.
 
         Returns:
             Handles by actor id.
 
         Raises:
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
-            URLabRPCError: From the op that failed; what was placed before it stays.
+            URLabRPCError: An op failed; actors placed before it stay.
         """
         return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)

@@ -30,20 +30,20 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         on_progress: Callable[[PIEStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> PIEStartResult:
-        """Start play, wait until the model is compiled, and take over the handshake of the new play world.
+        """Start play, wait until the model is compiled, and adopt the handshake of the new play world.
 
-        Without `level_path`, a healthy session continues and play does not restart. Afterwards the client's own step
+        Without `level_path`, a healthy play session continues and does not restart. Afterwards the client's own step
         mode is in force again; in live mode physics starts paused.
 
         Args:
             level_path: Level to open first, a full `/Game/` path: `/Game/Levels/lab` or `/Game/Levels/lab.lab`.
             timeout_s: Seconds to wait for the compile.
-            raise_on_failure: Raise unless play is ready; else return the result in any state.
-            on_progress: Called with the state about every quarter of a second while the model compiles.
-            timeout: Seconds to wait for each answer of the server; None waits without limit.
+            raise_on_failure: Raise unless play is ready; otherwise return the result in any state.
+            on_progress: Callback invoked with the state of play about every 0.25 s while the model compiles.
+            timeout: Seconds to wait for each reply of the server; None waits without limit.
 
         Raises:
-            URLabPIEError: Play did not become ready; its message carries the compile log.
+            URLabPIEError: Play did not become ready; the message contains the compile log.
         """
         return self._portal.call(
             self._aio.start,
@@ -55,28 +55,28 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         )
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:
-        """End play and wait until it has ended; without play, succeed at once. The session continues.
+        """Stop play and wait until it has ended; return immediately if play is off. The session continues.
 
         Args:
-            timeout: Seconds to wait for each answer of the server; None waits without limit.
+            timeout: Seconds to wait for each reply of the server; None waits without limit.
 
         Raises:
-            GameThreadTimeout: The editor did not react; often a modal dialog is open.
-            URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
+            GameThreadTimeout: The editor did not react, often because a modal dialog is open.
+            URLabTimeoutError: The editor accepted the request, but play did not end within 10 s.
         """
         self._portal.call(self._aio.stop, timeout=timeout)
 
     def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
-        """Play while a `with` block lasts: start it on entering, and stop it on leaving, also after an exception.
+        """Play for the duration of a `with` block: start on entering, and stop on leaving, also after an exception.
 
-        Play that runs already is taken over as `start()` does, and goes on after the block.
+        If play is already running, the block joins it as `start()` does, and play continues after the block.
 
         Args:
             level_path: Level to open first, a full `/Game/` path; None for the open one.
             timeout_s: Seconds to wait for the compile.
 
         Raises:
-            URLabPIEError: On entering: play did not become ready. It is stopped again.
+            URLabPIEError: On entering, play did not become ready. It is stopped again.
 
         Example:
             with client.sim.playing():

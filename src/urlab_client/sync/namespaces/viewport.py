@@ -11,7 +11,7 @@ __all__ = ["ViewportNamespace"]
 
 
 class ViewportNamespace(ViewportOps, twin=aio.ViewportNamespace):
-    """The editor's perspective viewport; the play window has a camera of its own."""
+    """The editor's perspective viewport. The play window has its own camera."""
 
     __slots__ = ()
     _aio: aio.ViewportNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
