@@ -19,8 +19,8 @@ class AcquireLeaseOk(Reply, tag="acquire_lease_ok", kw_only=True):
 class AcquireLease(Request[AcquireLeaseOk], tag="acquire_lease", kw_only=True, omit_defaults=True):
     """Acquire the server's only driver lease and return its id.
 
-    The lease is advisory: it shows other clients that the server is in use, and the server does not enforce it. Every
-    request keeps it alive.
+    The lease is advisory: it shows other clients that the server is in use, and the server does not enforce it.
+    Every request keeps it alive.
     """
 
     owner: Annotated[str, doc("Human-readable name of the holder.")] = ""
