@@ -240,7 +240,7 @@ class RuntimeNamespace(RuntimeOps):
         states = (
             await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}
         )
-        return {name: states[topic] for name, topic in topics.items() if topic in told}
+        return {name: states[topic] for name, topic in topics.items() if topic in states}
 
     async def set_camera_delay(
         self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
@@ -267,7 +267,7 @@ class RuntimeNamespace(RuntimeOps):
         topics = {name: self._camera_topic("set_camera_delay", name) for name in wanted}
         request = SetCameraDelay(cameras={topics[name]: delay for name, delay in wanted.items()})
         delays = (await self._call(request, timeout)).cameras if wanted else {}
-        return {name: delays[topic] for name, topic in topics.items() if topic in told}
+        return {name: delays[topic] for name, topic in topics.items() if topic in delays}
 
     def _camera_topic(self, op: str, name: str) -> str:
         self._state.require_handshake(op)
