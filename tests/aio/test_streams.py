@@ -496,7 +496,7 @@ class TestFaults:
                 await frames.receive()
 
     async def test_a_malformed_endpoint_is_refused(self, subscriptions: Subscriptions) -> None:
-        with pytest.raises(ValueError, match="is not an address ZeroMQ can connect to"):
+        with pytest.raises(ValueError, match="is not an address that ZeroMQ can connect to"):
             await latest(StateSource(subscriptions, lambda: "tcp://nowhere")).receive()
 
 
