@@ -47,13 +47,13 @@ class RegionPoll:
         self.probe = probe
         self.notify = notify
         self.block = block
-        self.told: bool = False
+        self.notified: bool = False
         self._since = time.monotonic()
 
     def resume(self) -> None:
         """Poll again after the news has been consumed."""
         self._since = time.monotonic()
-        self.told = False
+        self.notified = False
 
     def pace(self, now: float) -> float:
         """Return the seconds to sleep before the next poll."""
@@ -142,8 +142,8 @@ class Poller:
         for watch in self._watches:
             pause = min(pause, watch.pace(now))
             block = block or watch.block
-            if not watch.told and watch.probe():
-                watch.told = True
+            if not watch.notified and watch.probe():
+                watch.notified = True
                 with contextlib.suppress(RuntimeError):  # the loop is closed, so there are no waiters
                     self._loop.call_soon_threadsafe(watch.notify)
         return pause, block

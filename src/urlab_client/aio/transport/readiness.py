@@ -209,9 +209,9 @@ class _Watcher:
             if self._bell.fileno() in ready:
                 self._bell.recv(_DRAIN_BYTES)
                 self._rung = False
-            told = [watched for fd in ready if (watched := self._armed.pop(fd, None)) is not None]
+            notified = [watched for fd in ready if (watched := self._armed.pop(fd, None)) is not None]
         try:
-            for watched in told:
+            for watched in notified:
                 self._loop.call_soon_threadsafe(watched.tell)
         except RuntimeError:  # the loop is closed
             return False

@@ -61,10 +61,10 @@ class SharedMemoryRegions:
             ProtocolError: The server names a file without an absolute path.
         """
         before = self.directory, self._told
-        told = hello.shm_rpc
-        paths = {} if told is None else {REQUEST_FILE: told.req_path, REPLY_FILE: told.rep_path}
+        reported = hello.shm_rpc
+        paths = {} if reported is None else {REQUEST_FILE: reported.req_path, REPLY_FILE: reported.rep_path}
         self._told = {file: _checked(path) for file, path in paths.items()}
-        self._events = ("", "") if told is None else (told.req_event, told.rep_event)
+        self._events = ("", "") if reported is None else (reported.req_event, reported.rep_event)
         if self._given is not None:
             self.directory = self._given
         elif hello.shm_session_dir is not None:

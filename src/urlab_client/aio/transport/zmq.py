@@ -491,7 +491,7 @@ class ZmqTransport:
         return URLabTimeoutError(
             f"{op.name}: the deadline passed before the request could be sent to {self._endpoint}. Nothing was sent.",
             op=op.name,
-            hint="Other work blocked the event loop, or the timeout is too short.",
+            hint="Other work kept the event loop busy, or the timeout is too short.",
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
