@@ -100,7 +100,7 @@ def test_a_copy_with_the_wrong_files_is_refused(robot: Path) -> None:
     copy = _mujoco.compiled_file(robot)
     (robot.parent / "meshes" / "other.obj").write_text(OBJ.format(0.9))
     robot.write_text(robot.read_text().replace("part.obj", "other.obj"))
-    with pytest.raises(ValueError, match="files in folders of their own"):
+    with pytest.raises(ValueError, match="files in separate folders"):
         _mujoco.check_copy(robot, copy)
 
 
@@ -109,7 +109,7 @@ def test_a_file_that_is_elsewhere_is_refused(robot: Path, tmp_path: Path) -> Non
     spec = mujoco.MjSpec.from_file(str(robot))
     spec.compile()
     spec.meshes[0].file = "nowhere.obj"
-    with pytest.raises(ValueError, match=r"nowhere|files in folders of their own"):
+    with pytest.raises(ValueError, match=r"nowhere|files in separate folders"):
         _mujoco.write_model(spec, tmp_path / "copy")
 
 

@@ -27,11 +27,11 @@ __all__ = [
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Announce the marker, and the fixture that needs pytest-asyncio where that is installed."""
+    """Register the marker, and the fixture that needs pytest-asyncio if that is installed."""
     config.addinivalue_line(
         "markers",
-        "urlab(*models, step_mode='auto', **options): the simulated server of a test, in play, with models and options "
-        "of SimulatedServer, and the step mode of the clients. Files may be given relative to the test's folder.",
+        "urlab(*models, step_mode='auto', **options): run the test with a simulated server in play. Models and options "
+        "are those of SimulatedServer; step_mode is that of the clients. Files may be relative to the test's folder.",
     )
     if config.pluginmanager.hasplugin("asyncio"):
         from pytest_urlab import asyncio_fixtures  # noqa: PLC0415
@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def urlab_default() -> pytest.MarkDecorator:
-    """The `urlab` mark of tests that have none; override this fixture to choose another."""
+    """The default `urlab` mark, for tests without one; override this fixture to choose another."""
     return pytest.mark.urlab("arm")
 
 
@@ -62,12 +62,12 @@ def _urlab_mark(request: pytest.FixtureRequest, urlab_default: pytest.MarkDecora
 def urlab_server(
     request: pytest.FixtureRequest, _urlab_pool: ServerPool, _urlab_mark: pytest.Mark
 ) -> Iterator[SimulatedServer]:
-    """A simulated server in play, as the test's `urlab` mark describes it, in its initial state."""
+    """A simulated server in play, in its initial state, as described by the test's `urlab` mark."""
     options = {name: value for name, value in _urlab_mark.kwargs.items() if name != "step_mode"}
     try:
         server = _urlab_pool.acquire(_urlab_mark.args, options, request.path.parent)
     except (TypeError, ValueError, OSError) as error:
-        message = f"the server of @pytest.mark.urlab does not start: {error}"
+        message = f"the server of @pytest.mark.urlab did not start: {error}"
         raise pytest.fail.Exception(message, pytrace=False) from None
     yield server
     _urlab_pool.release(server)
@@ -75,10 +75,10 @@ def urlab_server(
 
 @pytest.fixture
 def urlab_faults(urlab_server: SimulatedServer) -> Faults:
-    """What goes wrong with the server's replies: nothing, until the test adds something."""
+    """The faults injected into the server's replies; none until the test adds some."""
     faults = urlab_server.faults
     if faults is None:
-        pytest.fail("the test's mark says faults=None", pytrace=False)
+        pytest.fail("the test's mark has faults=None", pytrace=False)
     return faults
 
 
@@ -105,19 +105,19 @@ def urlab_client(_urlab_client_options: dict[str, Any]) -> Iterator[URLabClient]
 def urlab_aio_client(request: pytest.FixtureRequest) -> AsyncURLabClient:
     """An async client of the server, after `discover()`, on the test's event loop.
 
-    For tests that pytest-asyncio or anyio's plugin runs.
+    For tests run by pytest-asyncio or by anyio's plugin.
     """
     config = request.config
     marked_anyio = "anyio_backend" in request.fixturenames
     asyncio_fixtures: Any = config.pluginmanager.get_plugin("urlab_asyncio_fixtures")
     if asyncio_fixtures is not None and (asyncio_fixtures.runs(request.node) or not marked_anyio):
-        # In its auto mode pytest-asyncio runs what is marked with anyio, too, but not the fixtures of that.
+        # In auto mode pytest-asyncio also runs tests marked with anyio, but not anyio's fixtures.
         runner = "beside_anyio" if marked_anyio else asyncio_fixtures.loop_scope(request)
     elif marked_anyio:
         runner = "anyio"
     else:
         pytest.fail(
-            "urlab_aio_client needs somebody who runs async tests: install pytest-asyncio, or mark the test with anyio",
+            "urlab_aio_client needs a plugin for async tests: install pytest-asyncio, or mark the test with anyio",
             pytrace=False,
         )
     return request.getfixturevalue(f"_urlab_aio_client_{runner}")
@@ -130,7 +130,7 @@ async def _urlab_aio_client_anyio(
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
     if anyio_backend_name != "asyncio":
-        pytest.fail(f"the async client runs on asyncio, not on {anyio_backend_name}: say so in anyio_backend")
+        pytest.fail(f"the async client runs on asyncio, not on {anyio_backend_name}: set anyio_backend to asyncio")
     async with URLabClient(**_urlab_client_options) as client:
         await client.discover()
         yield client

@@ -1,4 +1,4 @@
-"""The async client on pytest-asyncio's event loops, of which it has one for each scope."""
+"""The async client on pytest-asyncio's event loops, one for each scope."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 def runs(item: pytest.Item) -> bool:
-    """Whether pytest-asyncio runs a test."""
+    """Return whether pytest-asyncio runs a test."""
     return pytest_asyncio.is_async_test(item)
 
 
 def loop_scope(request: pytest.FixtureRequest) -> str:
-    """Return whose loop a test runs on: that of the function, the class, ..."""
+    """Return the scope of the loop that a test runs on: `function`, `class`, …"""
     mark = request.node.get_closest_marker("asyncio")
     chosen = None if mark is None else mark.kwargs.get("loop_scope")
     return chosen or request.config.getini("asyncio_default_test_loop_scope") or "function"
@@ -48,7 +48,7 @@ session_client = _on_loop_of("session")
 def _urlab_aio_client_beside_anyio(
     request: pytest.FixtureRequest, _urlab_client_options: dict[str, Any]
 ) -> Iterator[URLabClient]:
-    """The client on the loop of the test, where an async fixture would be run by anyio's plugin, on another one."""
+    """The client on the loop of the test. An async fixture would be run by anyio's plugin, on another loop."""
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
     runner: asyncio.Runner = request.getfixturevalue(f"_{loop_scope(request)}_scoped_runner")

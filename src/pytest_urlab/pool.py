@@ -1,4 +1,4 @@
-"""The servers of a test run: one for each set of models and options, started when first asked for."""
+"""The servers of a test run: one for each set of models and options, started on first use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["ServerPool"]
 logger = logging.getLogger("urlab_client.testing")
 
 MAX_OPEN: Final = 8
-"""Servers kept open; beyond it the one that has been idle for longest is closed."""
+"""Maximum number of open servers; beyond it the one that has been idle longest is closed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class _Entry:
 
 
 class ServerPool:
-    """Lends servers to tests, each of which finds its server in the initial state."""
+    """Lends servers to tests. Each test finds its server in the initial state."""
 
     def __init__(self) -> None:
         self._idle: list[_Entry] = []
@@ -49,15 +49,15 @@ class ServerPool:
     def acquire(
         self, models: Sequence[str | os.PathLike[str]], options: Mapping[str, Any], folder: Path
     ) -> SimulatedServer:
-        """Return an open server, all of whose threads run.
+        """Return an open server, all of whose threads are running.
 
         Args:
-            models: As of `SimulatedServer`; files are looked for in `folder` first.
-            options: As of `SimulatedServer`, where `play` is True unless said otherwise.
-            folder: Where the test is.
+            models: Models of `SimulatedServer`; files are searched for in `folder` first.
+            options: Options of `SimulatedServer`; `play` defaults to True.
+            folder: Folder of the test.
 
         Raises:
-            TypeError, ValueError: `SimulatedServer` takes no such models or options.
+            TypeError, ValueError: `SimulatedServer` rejects the models or options.
             OSError: A port or folder cannot be used.
         """
         paths = tuple(_located(os.fspath(model), folder) for model in models)
@@ -74,13 +74,13 @@ class ServerPool:
             entry.server.start()
         self._lent.append(entry)
         if failure is not None:
-            _report(f"the simulated server failed after the test before this one and was started again: {failure}")
+            _report(f"the simulated server failed after the previous test and was restarted: {failure}")
         return entry.server
 
     def release(self, server: SimulatedServer) -> None:
-        """Take a server back and bring it to its initial state; one that cannot be brought there is closed.
+        """Take a server back and restore its initial state; close it if that fails.
 
-        One that has failed is started again, with a warning.
+        Warns if the server has failed; it is restarted for the next test.
         """
         entry = next(lent for lent in self._lent if lent.server is server)
         self._lent.remove(entry)
@@ -94,7 +94,7 @@ class ServerPool:
         if len(self._idle) > MAX_OPEN:
             self._idle.pop(0).server.close()
         if failure is not None:
-            _report(f"the simulated server failed during this test and is started again for the next: {failure}")
+            _report(f"the simulated server failed during this test and is restarted for the next one: {failure}")
 
 
 def _report(problem: str) -> None:

@@ -1,4 +1,4 @@
-"""How this package starts processes that belong to it."""
+"""Options for child processes of this package."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ APART: Final[_Options] = {
     "start_new_session": True,  # without effect on Windows
     "creationflags": subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0,
 }
-"""Options of `subprocess.Popen` for a child that ends with its input, and not with what a terminal or a notebook sends
-to the whole process group of its parent: Ctrl-C is for the program, which may go on with the child after it."""
+"""Options of `subprocess.Popen` for a child that exits when its input closes, not on signals that a terminal or a
+notebook sends to the process group of its parent. Ctrl-C is for the parent, which may continue to use the child."""

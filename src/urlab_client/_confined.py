@@ -1,4 +1,4 @@
-"""What a process that compiles a foreign model may use. For client and server."""
+"""Limits for a process that compiles an untrusted model. For client and server."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ __all__ = ["forbid_opening", "limit_process"]
 
 
 def limit_process(memory_bytes: int, cpu_s: int) -> None:
-    """Limit this process for good, as far as the system can: memory besides what it has, and processor time.
+    """Limit additional memory and processor time of this process permanently, as far as the system supports it.
 
-    Beyond the time it is ended by SIGXCPU; beyond the memory, allocations fail.
+    SIGXCPU terminates the process beyond the time limit; allocations fail beyond the memory limit.
     """
     if sys.platform == "win32":
         return
@@ -21,7 +21,7 @@ def limit_process(memory_bytes: int, cpu_s: int) -> None:
     present = 0
     with contextlib.suppress(OSError):
         present = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
-    # A hard limit above the soft one: the signal at the soft one tells why it ended.
+    # The hard limit is above the soft one, whose signal shows why the process ended.
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 5))
     memory = present + memory_bytes
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
@@ -30,10 +30,10 @@ def limit_process(memory_bytes: int, cpu_s: int) -> None:
 
 
 def forbid_opening() -> bool:
-    """Keep this process from opening files, sockets and pipes, for good. What is open stays usable.
+    """Permanently keep this process from opening files, sockets and pipes. Open ones stay usable.
 
     Returns:
-        False, and nothing was done, on Windows, which has no such limit.
+        False on Windows, which has no such limit; nothing was done.
     """
     if sys.platform == "win32":
         return False

@@ -1,4 +1,4 @@
-"""A clear word when an extra is not installed."""
+"""A clear error for a missing extra."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ __all__ = ["MissingExtra", "need"]
 
 
 class MissingExtra(ImportError):
-    """An optional library is not installed; the text names the extra that brings it."""
+    """An optional library is not installed; the message gives the command that installs its extra."""
 
 
 def need(*modules: str, extra: str) -> None:
     """Check that modules can be imported.
 
     Raises:
-        MissingExtra: One is missing.
+        MissingExtra: A module is missing.
     """
     for name in modules:
         if importlib.util.find_spec(name) is None:

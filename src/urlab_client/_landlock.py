@@ -1,7 +1,7 @@
-"""Taking files away from a process for good, by Landlock, the Linux kernel's means for it.
+"""Permanently restricting the file access of a process, with the Linux kernel's Landlock.
 
-Called by its system calls, which are part of the kernel's stable interface: the bindings there are on the package index
-are either pre-releases or bring far more, and protection that is an extra would be missing where it is needed.
+This module uses the system calls directly, which are part of the kernel's stable interface. The bindings on the package
+index are either pre-releases or far larger, and as an extra the protection would be missing where it is needed.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ _NO_NEW_PRIVILEGES: Final = 38
 _READ: Final = 1 << 2 | 1 << 3  # files and directories
 _EXECUTE: Final = 1 << 0
 _RIGHTS: Final = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""What the kernel can forbid about files, by the version that began to."""
+"""File operations that the kernel can forbid, by the first version that supports them."""
 
 _NETWORK: Final = 4, 0b11
 _SCOPES: Final = 6, 0b11
-"""Likewise connections over TCP; abstract sockets and signals to other processes."""
+"""Likewise for TCP connections, and for abstract sockets and signals to other processes."""
 
 
 @cache
 def is_available() -> bool:
-    """Whether this system has Landlock."""
+    """Return whether this system has Landlock."""
     return _version() > 0
 
 
 def confine_files(readable: Iterable[Path], writable: Iterable[Path]) -> bool:
-    """Keep this thread, and threads and processes that it starts, from opening files and sockets elsewhere, for good.
+    """Permanently keep this thread, and threads and processes that it starts, from opening other files and sockets.
 
-    Files that are open stay usable, and the existence and size of others can still be found out.
+    Open files stay usable, and the existence and size of other files can still be queried.
 
     Args:
-        readable: Folders below which files may be read. One that does not exist is left out.
-        writable: Folders below which anything may be done with files but executing them.
+        readable: Folders below which files may be read. Missing folders are skipped.
+        writable: Folders below which files may be used in any way except executing them.
 
     Returns:
-        False, and nothing was done, where the system has no Landlock.
+        False if the system has no Landlock; nothing was done.
 
     Raises:
-        OSError: The system has it and refuses.
+        OSError: The system has Landlock but refuses the request.
     """
     version = _version()
     if version <= 0:
@@ -98,7 +98,7 @@ def _version() -> int:
         return 0
     try:
         return _call(_CREATE_RULESET, None, ctypes.c_size_t(0), ctypes.c_uint32(_VERSION))
-    except OSError:  # not built in, not switched on, or forbidden to containers
+    except OSError:  # not built in, not enabled, or forbidden in containers
         return 0
 
 

@@ -1,4 +1,4 @@
-"""Which files the text of an MJCF makes MuJoCo open. For client and server, before they compile a foreign model."""
+"""The files that the text of an MJCF makes MuJoCo open. For client and server, before compiling an untrusted model."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Final, Self
 
 __all__ = ["NamedFiles", "named_files"]
 
-# The grammar is that of MuJoCo's parser, which is laxer than XML: text may stand before and after the root, blanks are
-# those of C, comments hold anything. Quantifiers are possessive, so that no text takes more than linear time.
+# The grammar is that of MuJoCo's parser, which is laxer than XML: text may precede and follow the root, blanks are
+# those of C, comments may contain anything. Quantifiers are possessive, so that parsing takes linear time.
 _BLANKS: Final = rb"[ \t\n\v\f\r]*+"
 _NAME: Final = rb"[A-Za-z_:\x80-\xff][\w.:\-\x80-\xff]*+"
 _ATTRIBUTE: Final = _BLANKS + _NAME + _BLANKS + b"=" + _BLANKS + rb"""(?:"[^"]*+"|'[^']*+')"""
@@ -33,7 +33,7 @@ _ENTITY: Final = re.compile(rb"&(?:#(\d{1,7})|#x([0-9a-fA-F]{1,6})|(quot|amp|apo
 _CHARACTERS: Final = {b"quot": b'"', b"amp": b"&", b"apos": b"'", b"lt": b"<", b"gt": b">"}
 
 _ASSETS: Final = frozenset({"mesh", "hfield", "texture", "skin", "flex", "flexcomp"})
-"""Elements whose files are data. Whatever else names a file could mean a document, which names more files."""
+"""Elements whose files are data. A file named by any other element could be a document, which names more files."""
 
 _DOCUMENT_SUFFIXES: Final = (".xml", ".mjcf", ".urdf")
 _ARCHIVE_SUFFIXES: Final = (".mjz", ".zip")
@@ -42,12 +42,12 @@ _DATA_TYPES: Final = ("image/", "model/obj", "model/stl", "model/vnd.mujoco.", "
 
 @dataclass
 class NamedFiles:
-    """What a document names, with forward slashes. It may be too much, never too little.
+    """The files that a document names, with forward slashes. It may contain too many, never too few.
 
     Attributes:
         documents: Files that MuJoCo may parse as further documents.
         data: Other files: meshes, textures, height fields, skins.
-        folders: Folders that it may look for files in.
+        folders: Folders that MuJoCo may search for files.
     """
 
     documents: set[str] = field(default_factory=set[str])
@@ -62,10 +62,10 @@ class NamedFiles:
 
 
 def named_files(text: bytes) -> NamedFiles:
-    """Read a document as MuJoCo does, and return the files it names.
+    """Parse a document as MuJoCo does, and return the files that it names.
 
     Raises:
-        ValueError: It is not XML, or could name files in a way that is not understood here.
+        ValueError: The text is not XML, or could name files in a way that this module does not understand.
     """
     found = NamedFiles()
     end, elements = 0, 0
@@ -107,7 +107,7 @@ def _read(element: bytes, attributes: bytes, found: NamedFiles) -> None:
 
 
 def _decoded(value: bytes) -> str:
-    """Return the value of an attribute that names a file."""
+    """Return the decoded value of an attribute that names a file."""
 
     def replaced(match: re.Match[bytes]) -> bytes:
         decimal, hexadecimal, named = match.groups()

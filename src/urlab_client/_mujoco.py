@@ -1,9 +1,9 @@
-"""What differs between the MuJoCo releases that this package runs on: 3.8 and later. Nothing else asks for that.
+"""All differences between the MuJoCo releases that this package supports: 3.8 and later.
 
-Each difference is found out where it shows, by asking MuJoCo for what it has; nothing compares version numbers. What an
-older release lacks is done in another way where there is one; otherwise the error says so.
+Each difference is detected by checking which attributes MuJoCo has; nothing compares version numbers. If an older
+release lacks a feature, this module works around it if possible; otherwise an error reports it.
 
-The client's import of this module must not import MuJoCo: that takes longer than the rest of the client.
+Importing this module must not import MuJoCo, which takes longer than the rest of the client.
 """
 
 from __future__ import annotations
@@ -57,35 +57,35 @@ T = TypeVar("T")
 Indices = NDArray[np.int32]
 
 MODEL_FILE = "model.xml"
-_ARCHIVE = "model.mjz"  # whose stem names the model in it
-_MARK_BYTES = 64  # more than a placeholder has
+_ARCHIVE = "model.mjz"  # its stem is the name of the model inside
+_MARK_BYTES = 64  # larger than any placeholder
 
 
-# Actuators have had several controls and forces each since 3.11; before, `nu` counted both them and their controls.
+# Since 3.11 an actuator may have several controls and forces; before, `nu` counted both actuators and controls.
 
 
 def actuator_count(model: mujoco.MjModel) -> int:
-    """Return how many actuators there are."""
+    """Return the number of actuators."""
     return int(getattr(model, "nactuator", model.nu))
 
 
 def control_starts(model: mujoco.MjModel) -> Indices:
-    """Return where each actuator's controls begin in `ctrl`, shape (actuators,)."""
+    """Return the index of each actuator's first control in `ctrl`, shape (actuators,)."""
     return _per_actuator(model, "actuator_ctrladr")
 
 
 def control_counts(model: mujoco.MjModel) -> Indices:
-    """Return how many controls each actuator has, shape (actuators,)."""
+    """Return the number of controls of each actuator, shape (actuators,)."""
     return _per_actuator(model, "actuator_ctrlnum")
 
 
 def force_starts(model: mujoco.MjModel) -> Indices:
-    """Return where each actuator's forces begin in `actuator_force`, shape (actuators,)."""
+    """Return the index of each actuator's first force in `actuator_force`, shape (actuators,)."""
     return _per_actuator(model, "actuator_outadr")
 
 
 def force_counts(model: mujoco.MjModel) -> Indices:
-    """Return how many forces each actuator has, shape (actuators,)."""
+    """Return the number of forces of each actuator, shape (actuators,)."""
     return _per_actuator(model, "actuator_outnum")
 
 
@@ -95,7 +95,7 @@ def _per_actuator(model: mujoco.MjModel, field: str) -> Indices:
 
 
 def reset_controls(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Set controls to what asks for nothing: zero, but for inputs that are a quaternion, which came with 3.11."""
+    """Set controls to neutral values: zero, except for quaternion inputs, which exist since 3.11."""
     import mujoco  # noqa: PLC0415
 
     if hasattr(mujoco, "mj_resetCtrl"):
@@ -107,7 +107,7 @@ def reset_controls(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 def actuator_kind(actuator: Any) -> str:
     """Return the MJCF element that an actuator of an `MjSpec` was written as: `motor`, `position`, `general`, ….
 
-    Until 3.15 MuJoCo forgets that: there a `general` counts as the shortcut with the same kinds of gain and bias.
+    Up to 3.15 MuJoCo does not keep it: a `general` then counts as the shortcut with the same kinds of gain and bias.
     """
     if hasattr(actuator, "type"):
         return _constant(actuator.type).lower()
@@ -115,8 +115,9 @@ def actuator_kind(actuator: Any) -> str:
 
 
 def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
-    """Return the MJCF element that has the gain and bias of a compiled actuator: a `general` with those of a servo is
-    one, which is how `MjSpec.to_xml()` writes servos.
+    """Return the MJCF element that has the gain and bias of a compiled actuator.
+
+    A `general` with those of a servo counts as a servo, because `MjSpec.to_xml()` writes servos that way.
     """
     import mujoco  # noqa: PLC0415
 
@@ -131,7 +132,7 @@ def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def servo_damping(model: mujoco.MjModel, actuator: int) -> float:
-    """Return the gain of an actuator on the velocity: of an affine bias, else of its gain."""
+    """Return the velocity gain of an actuator: from an affine bias, otherwise from its gain."""
     import mujoco  # noqa: PLC0415
 
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
@@ -160,14 +161,14 @@ def _constant(value: Any) -> str:
 
 
 def thread_limit(processors: int) -> int:
-    """Return how many threads one simulation can have: none before 3.10, whose bindings have no thread pool."""
+    """Return the number of threads that one simulation can use: 0 before 3.10, whose bindings have no thread pool."""
     import mujoco  # noqa: PLC0415
 
     return processors if hasattr(mujoco, "mju_threadpool") else 0
 
 
 def set_threads(data: mujoco.MjData, threads: int) -> None:
-    """Let one simulation use so many threads, at most `thread_limit`."""
+    """Let one simulation use `threads` threads, at most `thread_limit`."""
     import mujoco  # noqa: PLC0415
 
     if hasattr(mujoco, "mju_threadpool"):
@@ -178,7 +179,7 @@ def compiled_file(path: Path) -> mujoco.MjModel:
     """Compile an MJCF file.
 
     Raises:
-        ValueError, mujoco.FatalError: MuJoCo rejects it.
+        ValueError, mujoco.FatalError: MuJoCo rejects the model.
     """
     import mujoco  # noqa: PLC0415
 
@@ -188,8 +189,9 @@ def compiled_file(path: Path) -> mujoco.MjModel:
 
 
 def forget_last_document() -> None:
-    """Free what `MjModel.from_xml_path` and its like keep of the last model for `mj_saveLastXML`: it is larger than
-    the model.
+    """Free the data that `MjModel.from_xml_path` and similar functions keep of the last model for `mj_saveLastXML`.
+
+    It is larger than the model.
     """
     import mujoco  # noqa: PLC0415
 
@@ -197,24 +199,24 @@ def forget_last_document() -> None:
 
 
 def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Write a spec and every file it needs to a folder, as `model.xml` and what is beside it.
+    """Write a spec and every file that it needs to a folder, as `model.xml` and files beside it.
 
-    The numbers are those it was read with, before 3.16 those it was compiled to, rounded to six digits.
+    The numbers are those of the source; before 3.16 they are those of the compiled model, rounded to six digits.
 
     Raises:
-        mujoco.FatalError: It must be compiled first: before 3.16 always.
-        ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
-        OSError: There is no room.
+        mujoco.FatalError: The spec must be compiled first; before 3.16 always.
+        ValueError: One of its files is not where this MuJoCo searches for it; see `check_copy`.
+        OSError: The disk is full.
     """
     compiler: Any = spec.compiler
     if _writes_archives(spec):
         compiler.savecompiled = False
         if not _write_without_packing(spec, folder):
-            # Beside the folder: a confined process can write nowhere else.
+            # Beside the folder, because a confined process cannot write elsewhere.
             with _archive(spec, folder.with_name(_ARCHIVE)) as content:
                 content.extractall(folder)
         return
-    spec.to_xml()  # says whether it can be written, before anything is changed
+    spec.to_xml()  # raises if it cannot be written, before anything is changed
     text, files = _written_by_hand(spec)
     folder.mkdir(parents=True)
     for name, data in files.items():
@@ -223,7 +225,7 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
 
 
 def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Return a compiled spec as MJCF, and the content of the files that it names, by their names there."""
+    """Return a compiled spec as MJCF, and the contents of the files that it names, by those names."""
     if not _writes_archives(spec):
         return _written_by_hand(spec.copy())
     with tempfile.TemporaryDirectory() as folder, _archive(spec, Path(folder, _ARCHIVE)) as content:
@@ -232,10 +234,10 @@ def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
 
 
 def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Return a compiled spec as MJCF whose files all have bare names, and their contents by these names.
+    """Return a compiled spec as MJCF whose files all have bare names, and their contents by those names.
 
     Raises:
-        ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
+        ValueError: One of its files is not where this MuJoCo searches for it; see `check_copy`.
     """
     copied = spec.copy()
     compiler: Any = copied.compiler
@@ -245,18 +247,18 @@ def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
 
 
 def _writes_archives(spec: mujoco.MjSpec) -> bool:
-    """Whether MuJoCo writes a spec with its files: before 3.16 it names those in folders of their own wrongly."""
+    """Return whether MuJoCo can write a spec with its files. Before 3.16 it misnames files in separate folders."""
     return hasattr(spec.compiler, "savecompiled")
 
 
 def _write_without_packing(spec: mujoco.MjSpec, folder: Path) -> bool:
-    """Do what extracting the archive of a spec does, without packing its files, which takes as long as compiling them.
+    """Write the content of a spec's archive without packing its files, which takes as long as compiling them.
 
-    Each file is marked by a placeholder in MuJoCo's virtual file system, and copied to where that is found in the
-    archive.
+    A placeholder in MuJoCo's virtual file system marks each file, which is copied to the place of the placeholder in
+    the archive.
 
     Returns:
-        False if it is not clear which file is meant, or anything fails; then nothing is written.
+        False if a file is ambiguous or anything fails; then nothing is written.
     """
     import mujoco  # noqa: PLC0415
 
@@ -285,14 +287,14 @@ def _write_without_packing(spec: mujoco.MjSpec, folder: Path) -> bool:
 
 
 def _plain_files(spec: mujoco.MjSpec) -> dict[str, Path]:
-    """Return what a spec calls its files, and where they lie, of those of which both are beyond doubt."""
+    """Return the names and paths of a spec's files, except those that are ambiguous."""
     if spec.strippath or spec.assets:
         return {}
     elements = [(asset.file, asset.compiler.meshdir) for asset in (*spec.meshes, *spec.hfields, *spec.skins)]
     for texture in spec.textures:
         directory = texture.compiler.texturedir
         elements += [(texture.file, directory), *((file, directory) for file in texture.cubefiles)]
-    # Placeholders are found by the last part of the path, too.
+    # MuJoCo also finds placeholders by the last part of the path.
     places: dict[str, set[tuple[str, str]]] = {}
     for file, directory in elements:
         if file:
@@ -311,15 +313,15 @@ def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
     spec.encode(str(path))
     try:
         content = zipfile.ZipFile(path)
-    except zipfile.BadZipFile:  # MuJoCo does not notice when it cannot write all of it
-        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(path)) from None
+    except zipfile.BadZipFile:  # MuJoCo does not notice an incomplete write
+        raise OSError(errno.ENOSPC, "MuJoCo could not write the whole file; is the disk full?", str(path)) from None
     with content:
         yield content
     path.unlink()
 
 
 def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Give a spec's files names that no other file has, and return what the archive would hold."""
+    """Give a spec's files unique names, and return the contents that the archive would have."""
     files: dict[str, bytes] = {}
     compilers: list[Any] = [spec.compiler]  # and those of attached models
 
@@ -350,8 +352,8 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
         compiler.meshdir = compiler.texturedir = ""
     spec.assets = {**spec.assets, **files}
     if not _writes_archives(spec):
-        # The compiler notes the content type of what its cache does not have. Assigning what was given undoes that:
-        # a model is written in the same way each time, so that a server knows it by its digest.
+        # The compiler records the content type of files that its cache does not have. Assigning the given type undoes
+        # that: a model is then always written in the same way, so that a server recognises it by its digest.
         spec.compile()
         for asset in (*spec.meshes, *spec.hfields, *spec.textures):
             asset.content_type = str(asset.content_type)
@@ -359,14 +361,14 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
 
 
 def check_copy(original: Path, copy: mujoco.MjModel) -> None:
-    """Refuse what `write_model` writes wrongly: before 3.16 an attached model with files in a folder of its own.
+    """Refuse a wrong result of `write_model`: before 3.16, an attached model with files in a separate folder.
 
     Args:
-        original: The file that the model was made from.
-        copy: What was written of it, compiled.
+        original: Source file of the model.
+        copy: Compiled model of the written file.
 
     Raises:
-        ValueError: It has other meshes, textures or height fields than the model it was made from.
+        ValueError: Meshes, textures or height fields differ from those of the original.
     """
     import mujoco  # noqa: PLC0415
 
@@ -381,7 +383,7 @@ def check_copy(original: Path, copy: mujoco.MjModel) -> None:
 
 def _unwritable() -> ValueError:
     return ValueError(
-        f"MuJoCo {mujoco_version()} cannot write a model whose attached parts have files in folders of their own. "
+        f"MuJoCo {mujoco_version()} cannot write a model whose attached parts have files in separate folders. "
         "Put the files beside the model, or use MuJoCo 3.16 or later."
     )
 
@@ -389,17 +391,17 @@ def _unwritable() -> ValueError:
 def without_newer_attributes(
     xml: str, assets: Mapping[str, bytes], compiled: Callable[[str, Mapping[str, bytes]], T]
 ) -> tuple[T, list[str]]:
-    """Compile an MJCF that a newer MuJoCo has written; return the result and which attributes were left out for that.
+    """Compile an MJCF written by a newer MuJoCo; return the result and the attributes that had to be omitted.
 
-    An attribute is left out when this MuJoCo does not know it, or does not know its value, a keyword.
+    An attribute is omitted if this MuJoCo does not know it or its keyword value.
 
     Args:
         xml: The model.
-        assets: Its files by name; among them documents, `.xml`, that it attaches.
+        assets: Its files by name, including attached documents (`.xml`).
         compiled: Compiles a model with its files.
 
     Raises:
-        ValueError: It cannot be compiled, for any other reason.
+        ValueError: The model cannot be compiled for another reason.
     """
     left_out: list[str] = []
     untried: list[tuple[str, list[str]]] = []
@@ -417,7 +419,7 @@ def without_newer_attributes(
             if found is None:
                 raise
             if untried and found.groups() == complaint:
-                left_out.pop()  # another attribute has the value that was meant
+                left_out.pop()  # the complaint is about another attribute with the same value
             else:
                 untried = _without_one_attribute(texts, *found.groups())
                 complaint = found.groups()
@@ -431,7 +433,7 @@ _UNKNOWN = re.compile(r"(unrecognized attribute|invalid keyword): '([^'\"]+)'\s+
 
 
 def _without_one_attribute(texts: list[str], problem: str, word: str, element: str) -> list[tuple[str, list[str]]]:
-    """Return what may be the attribute that MuJoCo complains of, and the texts without it, for each that may be it."""
+    """Return each attribute that MuJoCo may complain about, with the texts without it."""
     attributes = [word]
     if problem == "invalid keyword":
         tags = " ".join(tag for text in texts for tag in re.findall(rf"<{element}\b[^<>]*", text))
@@ -445,14 +447,14 @@ def _without_one_attribute(texts: list[str], problem: str, word: str, element: s
 
 
 def mujoco_version() -> str:
-    """Return the release in use."""
+    """Return the version of the installed MuJoCo."""
     import mujoco  # noqa: PLC0415
 
     return mujoco.mj_versionString()
 
 
 def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
-    """Give a model all options of another one; before 3.10 they are copied one by one."""
+    """Copy all options of another model; before 3.10 they must be copied one by one."""
     for name in dir(options):
         value = getattr(options, name)
         if not name.startswith("_") and not callable(value):
@@ -460,7 +462,7 @@ def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
 
 
 def batch_class() -> Any:
-    """Return `mujoco.batch.Batch`, None before 3.17."""
+    """Return `mujoco.batch.Batch`; None before 3.17."""
     try:
         return importlib.import_module("mujoco.batch").Batch
     except ImportError:
@@ -468,7 +470,7 @@ def batch_class() -> Any:
 
 
 def asset_bytes(model: mujoco.MjModel) -> int:
-    """Return how many bytes of a model are meshes and textures, which `merge_assets` shares.
+    """Return the size of a model's meshes and textures, which `merge_assets` shares, in bytes.
 
     Before 3.17 nothing is shared, and this is 0.
     """
@@ -480,11 +482,11 @@ def asset_bytes(model: mujoco.MjModel) -> int:
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:
-    """Let instances of one robot share its meshes and textures; before 3.17 each has its own, at the cost of memory.
+    """Let instances of one robot share its meshes and textures; before 3.17 each has its own, which takes more memory.
 
     Args:
-        spec: What the robots were attached to.
-        folders: What `write_model` wrote of them.
+        spec: Spec that the robots are attached to.
+        folders: Folders that `write_model` wrote for them.
     """
     if hasattr(spec, "dedup_assets"):
         spec.dedup_assets()

@@ -1,4 +1,4 @@
-"""Whether processors are idle: where they are, waiting awake is quicker than sleeping and waking up."""
+"""Whether processors are idle: if they are, busy polling is faster than sleeping and waking up."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import time
 
 __all__ = ["crowded"]
 
-# Where more than so many wait for each processor, the time spent awake is somebody else's.
-_CROWD = 1.5
+# With a higher load per processor, busy polling would take time from other programs.
+_CROWDED_LOAD = 1.5
 _KNOWN_S = 1.0
 
 _known_until = 0.0
@@ -16,8 +16,8 @@ _answer = False
 
 
 def crowded() -> bool:
-    """Whether programs wait for processors; asks the system once a second."""
-    global _answer, _known_until  # noqa: PLW0603  # about the machine
+    """Return whether programs wait for processors. Queries the system once a second at most."""
+    global _answer, _known_until  # noqa: PLW0603  # a property of the machine
     now = time.monotonic()
     if now >= _known_until:
         _known_until = now + _KNOWN_S
@@ -29,4 +29,4 @@ def _ask() -> bool:
     if not hasattr(os, "getloadavg"):
         return False
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return os.getloadavg()[0] > _CROWD * processors
+    return os.getloadavg()[0] > _CROWDED_LOAD * processors

@@ -1,4 +1,4 @@
-"""System calls that must not be interrupted by signals, because nobody repeats them."""
+"""System calls that signals must not interrupt, because their callers do not repeat them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ __all__ = ["uninterrupted"]
 
 @contextmanager
 def uninterrupted() -> Generator[None]:
-    """Let other threads, or the end of the block, have the signals that come meanwhile.
+    """Block signals in this thread; other threads receive them, or this thread after the block.
 
-    `zmq.Context.term` needs it: where a signal interrupts it, PyZMQ takes the context for closed, and its threads and
-    descriptors are never released.
+    `zmq.Context.term` needs it: if a signal interrupts that call, PyZMQ considers the context closed, and its threads
+    and descriptors are never released.
     """
     if sys.platform == "win32":
         yield

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic replacement of files."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["replaced"]
 
 @contextlib.contextmanager
 def replaced(path: Path) -> Generator[Path]:
-    """Give a temporary file beside `path` to write to, and move it there when the block ends well.
+    """Yield a temporary file beside `path`, and move it to `path` if the block succeeds.
 
-    A reader, or a crash, sees the old file or the whole new one.
+    A reader sees the old file or the complete new one, even after a crash.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)

@@ -1,7 +1,7 @@
-"""What has to be asked of Windows itself: named events and locks, with which shared memory saves itself from polling,
-and input that does not hold up the rest of the process.
+"""Windows functions that Python lacks: named events and locks, with which shared memory avoids polling, and input that
+does not block the rest of the process.
 
-Only what clients and servers need. Other systems have no such events and locks: everything works without, only slower.
+Other systems have no such events and locks; everything works without them, only more slowly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _EVENT_MODIFY_STATE = 0x0002
 _ALREADY_EXISTS = 183
 _SIGNALLED = 0
 _PIPE = 3
-_LOOK_S = 0.05
+_POLL_S = 0.05
 
 
 def _kernel() -> Any:
@@ -39,14 +39,14 @@ def _kernel() -> Any:
 
 
 class NamedEvent:
-    """An auto-reset event. Without one of that name, as on other systems, it does nothing.
+    """An auto-reset event. Does nothing if no event of that name exists, as on other systems.
 
     Args:
-        name: Its name.
-        create: Make it, as servers do.
+        name: Name of the event.
+        create: Create the event, as servers do.
 
     Attributes:
-        exists: Whether the server made it.
+        exists: Whether the event exists.
     """
 
     def __init__(self, name: str, *, create: bool = False) -> None:
@@ -60,18 +60,18 @@ class NamedEvent:
         self.exists: bool = bool(self._handle)
 
     def set(self) -> None:
-        """Wake who waits for it."""
+        """Wake a waiting thread."""
         if self._handle:
             self._kernel.SetEvent(self._handle)
 
     def wait(self, seconds: float) -> bool:
-        """Wait until it is set, at most so long; other threads go on. Return whether it was."""
+        """Wait at most `seconds` until the event is set; return whether it was. Other threads keep running."""
         if not self._handle:
             return False
         return self._kernel.WaitForSingleObject(self._handle, max(1, int(seconds * 1000))) == _SIGNALLED
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the handle."""
         if self._handle:
             self._kernel.CloseHandle(self._handle)
             self._handle = None
@@ -80,7 +80,7 @@ class NamedEvent:
 class NamedLock:
     """A lock among the processes of one machine, which the system releases when its owner dies.
 
-    It is held by whoever made the object of that name: a mutex proper would let one thread take it twice.
+    The process that created the object of that name holds it; an acquired mutex could be taken twice by one thread.
     """
 
     def __init__(self, name: str) -> None:
@@ -92,17 +92,17 @@ class NamedLock:
             self.held = ctypes.get_last_error() != _ALREADY_EXISTS
 
     def close(self) -> None:
-        """Release it."""
+        """Release the lock."""
         if self._handle:
             self._kernel.CloseHandle(self._handle)
             self._handle = None
 
 
 def read_aside(descriptor: int, size: int) -> bytes:
-    """`os.read` in a thread beside others that load libraries.
+    """`os.read` for a thread that runs beside others that load libraries.
 
-    Windows locks a pipe while somebody waits to read from it, and every C runtime that is loaded asks what standard
-    input is: importing NumPy would wait until input comes.
+    Windows locks a pipe while a thread waits to read from it, and every C runtime queries standard input when it is
+    loaded: importing NumPy would wait until input arrives.
     """
     if sys.platform == "win32":
         kernel, handle = _kernel(), msvcrt.get_osfhandle(descriptor)
@@ -111,5 +111,5 @@ def read_aside(descriptor: int, size: int) -> bytes:
             if not kernel.PeekNamedPipe(handle, None, 0, None, ctypes.byref(waiting), None):
                 return b""  # the other end is closed
             if not waiting.value:
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
     return os.read(descriptor, size)

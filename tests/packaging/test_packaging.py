@@ -174,7 +174,7 @@ def rival(venv: Path) -> Iterator[Path]:
 
 def test_the_doctor_names_a_package_in_the_way(venv: Path, rival: Path, tmp_path: Path) -> None:
     done = run([venv / PROGRAMS / "urlab", "doctor", "sim://ball"], tmp_path)
-    assert "other-bridge installs a package urlab_client, too" in done.stderr
+    assert "other-bridge also installs a package urlab_client" in done.stderr
     assert "pip uninstall -y other-bridge urlab-client" in done.stderr
     assert "Traceback" not in done.stderr
 
@@ -186,7 +186,7 @@ def test_a_broken_import_names_the_package_in_the_way(venv: Path, rival: Path, t
     try:
         file.write_text("", encoding="utf-8")
         done = run(command, tmp_path)
-        assert "cannot load urlab_client.URLabClient: other-bridge installs a package urlab_client, too" in done.stderr
+        assert "cannot load urlab_client.URLabClient: other-bridge also installs a package urlab_client" in done.stderr
         (rival / "other_bridge-1.0.dist-info" / "RECORD").unlink()
         done = run(command, tmp_path)
         assert done.stderr.splitlines()[-1].startswith("ImportError: cannot import name")

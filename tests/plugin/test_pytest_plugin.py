@@ -147,7 +147,7 @@ def test_a_server_with_a_dead_thread_is_replaced_and_told_of(pytester: pytest.Py
     result.stdout.fnmatch_lines(
         [
             "*the simulated server failed during this test*'urlab-physics' died of SystemExit*",
-            "*the simulated server failed after the test before this one*'urlab-physics' died of SystemExit*",
+            "*the simulated server failed after the previous test*'urlab-physics' died of SystemExit*",
         ]
     )
 
@@ -190,9 +190,9 @@ def test_a_mark_that_cannot_work_says_why(pytester: pytest.Pytester) -> None:
     result.assert_outcomes(errors=3)
     result.stdout.fnmatch_lines(
         [
-            "*@pytest.mark.urlab does not start: no_such_robot is neither a file nor a bundled robot*",
-            "*@pytest.mark.urlab does not start: *unexpected keyword argument 'colour'",
-            "*@pytest.mark.urlab does not start: step_port must be a number from 0 to 65535, not -1",
+            "*@pytest.mark.urlab did not start: no_such_robot is neither a file nor a bundled robot*",
+            "*@pytest.mark.urlab did not start: *unexpected keyword argument 'colour'",
+            "*@pytest.mark.urlab did not start: step_port must be a number from 0 to 65535, not -1",
         ]
     )
 

@@ -662,7 +662,7 @@ class TestInterrupt:
         interrupt_when_ready(process)
         assert outcome(process) == (
             0,
-            ["closing", "The client was closed during this call. Make a new one."],
+            ["closing", "The client was closed during this call. Create a new one."],
             "",
         )
 

@@ -1,7 +1,7 @@
-"""An event loop that costs little to run for the time of one call.
+"""An event loop that is cheap to run for the duration of one call.
 
-`run_forever` looks at all sockets before every round of callbacks. A call consists of one callback that sends, one
-wait, and one callback that takes the reply: the other looks find nothing, and take as long as the call's own code.
+`run_forever` polls all sockets before every round of callbacks. A call consists of one callback that sends, one wait,
+and one callback that takes the reply. The other polls find nothing, and take as long as the call's own code.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ __all__ = ["CallerLoop"]
 
 Ts = TypeVarTuple("Ts")
 
-# Rounds of callbacks in a row after which sockets are looked at, though there are more callbacks to run.
+# Consecutive rounds of callbacks after which sockets are polled even if more callbacks are ready.
 _ROUNDS = 4
 
 _READABLE = getattr(select, "EPOLLIN", None)
 
-# Of asyncio's own loop, not all of it public: unchanged from Python 3.11 to 3.14. Where one is missing, `run_forever`
-# does the work.
+# Attributes of asyncio's own loop, some of them private, unchanged from Python 3.11 to 3.14. If one is missing,
+# `run_forever` is used.
 _NEEDED = (
     "_asyncgen_finalizer_hook",
     "_asyncgen_firstiter_hook",
@@ -44,7 +44,7 @@ _NEEDED = (
 
 
 class CallerLoop(asyncio.SelectorEventLoop):
-    """A selector loop with a quicker way to run until `stop`. Everything else is asyncio's own."""
+    """A selector loop with a faster way to run until `stop`. Everything else is asyncio's own."""
 
     _asyncgen_finalizer_hook: Any
     _asyncgen_firstiter_hook: Any
@@ -59,7 +59,7 @@ class CallerLoop(asyncio.SelectorEventLoop):
     _thread_id: int | None
 
     def __init__(self) -> None:
-        self._as_known = False  # while asyncio's own loop is being made
+        self._as_known = False  # during the constructor of asyncio's own loop
         super().__init__()
         self._as_known = all(hasattr(self, name) for name in _NEEDED)
         nothing: Mapping[int, Any] = {}
@@ -69,14 +69,14 @@ class CallerLoop(asyncio.SelectorEventLoop):
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
         """See `asyncio.AbstractEventLoop.call_soon`."""
-        if not self._as_known or self._closed or self._debug:  # there is more to be done, or to be refused
+        if not self._as_known or self._closed or self._debug:  # asyncio's own method then does more, or raises
             return super().call_soon(callback, *args, context=context)
         handle = asyncio.Handle(callback, args, self, context)
         self._ready.append(handle)
         return handle
 
     def run_until_stopped(self) -> None:
-        """Do what `run_forever` does. For whoever stops it soon."""
+        """Do the same as `run_forever`, for a caller that stops the loop soon."""
         if not self._as_known or self.get_debug():  # debug mode times callbacks
             self.run_forever()
             return
@@ -107,12 +107,12 @@ class CallerLoop(asyncio.SelectorEventLoop):
             scheduled = self._scheduled
             left = scheduled[0]._when - time.monotonic() if scheduled else None  # noqa: SLF001  # the loop's own clock
             if ready or (left is not None and left <= 0):
-                self._run_once()  # which knows about timers
+                self._run_once()  # handles timers
             else:
                 self._wait(left)
 
     def _wait(self, left: float | None) -> None:
-        """Wait for sockets, at most so many seconds, and run what one of them calls or queue what several call."""
+        """Wait for sockets, at most `left` seconds; run the callback of a single event, or queue those of several."""
         poll = self._poll
         if poll is None:
             self._process_events(self._selector.select(left))
@@ -126,14 +126,14 @@ class CallerLoop(asyncio.SelectorEventLoop):
                 if handle is not None and not handle._cancelled:  # noqa: SLF001
                     handle._run()  # noqa: SLF001  # nothing else is ready, so nothing is overtaken
                     return
-        if events:  # they stay so until somebody has dealt with them
+        if events:  # they stay ready until they are handled
             self._process_events(self._selector.select(0))
 
 
 def _parts(selector: Any) -> tuple[Callable[[float | None], list[tuple[int, int]]] | None, Mapping[int, Any]]:
-    """Return what an epoll selector asks the system with, and what it knows by descriptor: its own code takes longer.
+    """Return the poll function and the keys by descriptor of an epoll selector, whose own `select` is slower.
 
-    None where it is another selector, or has other parts than from Python 3.11 to 3.14.
+    The function is None for another selector, or one without the attributes of Python 3.11 to 3.14.
     """
     poll, keys = getattr(selector, "_selector", None), getattr(selector, "_fd_to_key", None)
     if not isinstance(selector, getattr(selectors, "EpollSelector", ())) or poll is None or keys is None:

@@ -1,20 +1,20 @@
-"""The event loop of one client, run by whoever waits for something in it.
+"""The event loop of one client, run by the thread that waits for a result from it.
 
-Handing a call to another thread costs more than a round trip to the server, so the thread that makes a blocking call
-runs the loop itself until its call is done; a daemon thread `urlab-io` runs it the rest of the time, for streams and
-heartbeats. The rules:
+Handing a call to another thread costs more than a round trip to the server. The thread that makes a blocking call
+therefore runs the loop itself until its call is done. A daemon thread `urlab-io` runs it the rest of the time, for
+streams and heartbeats. The rules:
 
 1. Only the holder of `_turn` runs the loop, steps its tasks or closes it.
-2. A call that finds no other one under way takes the turn. If the thread has it, the thread is asked to yield, and
-   does between two callbacks. Any other call is queued in the loop, and whoever runs that completes it.
-3. Who leaves gives the turn back first and then looks for calls still under way; who queues a call does that first
-   and then looks whether anybody has the turn. Either of them rings the thread's bell if nobody would run the loop.
-4. The thread takes the turn when the bell rings, or when no call has left for `_IDLE`: consecutive calls of a script
-   cost no hand-over. While they last it looks more and more rarely. It alone sees the loop to its end.
-5. Signals are deferred for as long as the main thread is in this module. One that arrives makes the call leave the
-   loop; its handler runs then, and if it raises, the call is broken off.
+2. A call that finds no other call in progress takes the turn. If the thread holds it, the call asks the thread to
+   yield, which it does between two callbacks. Any other call is queued in the loop, and completed by its runner.
+3. A leaving call first returns the turn and then checks for calls in progress. A queued call is first added and then
+   checks whether the turn is held. Either of them wakes the thread if otherwise nothing would run the loop.
+4. The thread takes the turn when it is woken, or when no call has left for `_IDLE` seconds, so that consecutive calls
+   of a script need no hand-over. During such calls it checks less and less often. Only the thread ends the loop.
+5. Signals are deferred while the main thread is in this module. An arriving signal makes the call leave the loop; then
+   its handler runs, and if the handler raises, the call is cancelled.
 
-A thread with a running loop of its own, as in a notebook, cannot run a second one: its calls are always queued.
+A thread with its own running loop, as in a notebook, cannot run a second one: its calls are always queued.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ __all__ = ["GRACE", "CallerDrivenLoop", "Job", "client_closed"]
 T = TypeVar("T")
 
 GRACE = 1.0
-"""Seconds given to clean-up: to an interrupted call, and to each phase of stopping a loop."""
+"""Seconds allowed for clean-up, of an interrupted call and in each phase of stopping a loop."""
 
-# A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
+# On Windows, Ctrl-C does not interrupt a lock wait, so the wait is sliced there.
 _WAIT_SLICE = 0.1 if sys.platform == "win32" else threading.TIMEOUT_MAX
 
-# Nor does select() see it there: the main thread must not run the loop.
+# Nor does it interrupt select() there: the main thread must not run the loop.
 _MAIN_THREAD_DRIVES = sys.platform != "win32"
 
-# Seconds after a call until the thread runs the loop again. A hand-over then costs a hundredth of the pause.
+# Seconds after a call until the thread runs the loop again. A hand-over costs about a hundredth of this pause.
 _IDLE = 0.005
 
-# The longest time between two looks whether calls still follow each other. A thread that wakes up wants the interpreter
-# lock, and for the up to five milliseconds until it gets it, every release of the lock costs the caller a system call.
+# Longest time between two checks whether calls still follow each other. A thread that wakes up requests the interpreter
+# lock. Until it gets the lock, up to five milliseconds later, every release of it costs the caller a system call.
 _LONGEST_PAUSE = 0.08
 
 # Seconds after which the thread is asked again for the turn.
 _CLAIM_SLICE = 0.05
 
-# Seconds between two looks whether there still is a portal. A signal handler that raises in the collector's callback,
-# before that defers signals, takes the portal's end away from it.
+# Seconds between two checks whether the portal still exists. Its finalizer does not run if a signal handler raises in
+# the garbage collector's callback before signals are deferred there.
 _ORPHAN_S = 5.0
 
 _log = logging.getLogger("urlab_client.sync")
@@ -65,17 +65,17 @@ _log = logging.getLogger("urlab_client.sync")
 
 def client_closed(when: str = "before this call") -> ClientClosed:
     """Return the error of a call to a client that was closed."""
-    return ClientClosed(f"The client was closed {when}.", hint="Make a new one.")
+    return ClientClosed(f"The client was closed {when}.", hint="Create a new one.")
 
 
 class Job(Generic[T]):
-    """A coroutine on its way through the loop: made by the calling thread, finished by who runs the loop.
+    """A coroutine to run on the loop, created by the calling thread and finished by the thread that runs the loop.
 
     Attributes:
-        error: What it raised; else `value` is its result.
+        error: The exception that it raised; otherwise `value` is its result.
         finished: Whether it has ended.
-        leave: Whether its caller has reason to stop waiting for that.
-        started: Whether the coroutine has run at all: one that has not must be closed, cancelling would do nothing.
+        leave: Whether its caller should stop waiting for it.
+        started: Whether the coroutine has started. One that has not must be closed, because cancelling has no effect.
     """
 
     __slots__ = ("_waiter", "coro", "error", "finished", "leave", "started", "task", "value")
@@ -101,27 +101,27 @@ class Job(Generic[T]):
             timeout -= piece
 
     def wake(self) -> None:
-        """Let the caller look what there is."""
+        """Wake the caller, which checks the job's state."""
         if self._waiter is not None:
             with contextlib.suppress(RuntimeError):  # it has been woken already
                 self._waiter.release()
 
 
 class CallerDrivenLoop:
-    """The loop, the daemon thread that runs it when nobody else does, and the right to run it.
+    """The loop, the daemon thread that runs it when no caller does, and the right to run it.
 
     Refers to no portal and no façade object, so that dropping these ends the thread.
 
     Args:
-        at_stop: Makes the coroutine that releases what lives on the loop; None if there is nothing.
-        owner: Refers to the portal: the loop ends when that is gone.
+        at_stop: Returns the coroutine that releases the resources on the loop; None if there are none.
+        owner: Weak reference to the portal; the loop ends when the portal is gone.
     """
 
     def __init__(
         self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None, owner: Callable[[], object | None]
     ) -> None:
         self._owner = owner
-        # Not new_event_loop(): the user's loop policy is about the user's loop, and pyzmq needs a selector on Windows.
+        # Not new_event_loop(): the user's loop policy is for the user's loop, and pyzmq needs a selector on Windows.
         self._loop = CallerLoop()
         self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
         self._pid = os.getpid()
@@ -132,11 +132,11 @@ class CallerDrivenLoop:
         self._thread_drives = True
         self._driven: Job[Any] | None = None
         self._left = 0.0
-        # A lock and not an event, which a finalizer could find half set.
-        self._bell = threading.Lock()
-        self._bell.acquire()
+        # A lock and not an event, which a finalizer could interrupt while it is being set.
+        self._wake_up = threading.Lock()
+        self._wake_up.acquire()
         self._jobs: set[Job[Any]] = set()
-        # Guards `_stopping`, `_jobs` and the loop's end: a job is either refused or finished, never left waiting.
+        # Guards `_stopping`, `_jobs` and the end of the loop: a job is either refused or finished, never left waiting.
         # Reentrant, because a finalizer may stop the loop in the middle of `run`.
         self._lock = threading.RLock()
         self._stopping = False
@@ -164,11 +164,11 @@ class CallerDrivenLoop:
         return self._stopping
 
     def run(self, job: Job[Any], signals: DeferredSignals) -> None:
-        """Run `job` until it is finished, and let signals in that arrive meanwhile.
+        """Run `job` until it is finished, and run the handlers of signals that arrive in the meantime.
 
         Raises:
-            ClientClosed: The loop is on its way out.
-            BaseException: A signal handler raised it. The job was cancelled, and had `GRACE` seconds to clean up.
+            ClientClosed: The loop is stopping.
+            BaseException: A signal handler raised it. The job was cancelled and had `GRACE` seconds to clean up.
         """
         try:
             drives = self._may_drive() and self._enlist(job)
@@ -176,7 +176,7 @@ class CallerDrivenLoop:
                 self._submit(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
-                job.leave = False  # before looking why it was set
+                job.leave = False  # before checking why it was set
                 if signals.arrived:
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
@@ -191,9 +191,9 @@ class CallerDrivenLoop:
         signals.on_arrival = None  # which refers to the job
 
     def stop(self) -> None:
-        """Wind the loop down and join the thread, in bounded time, from any thread."""
+        """Stop the loop and join the thread, in bounded time. May be called from any thread."""
         if os.getpid() != self._pid:
-            return  # A forked child shares the parent's epoll set: closing the loop would deafen the parent's.
+            return  # A forked child shares the parent's epoll set: closing the loop would break the parent's.
         with DeferredSignals():
             self._request_stop()
             # The garbage collector may call from any thread, also from inside the loop.
@@ -208,7 +208,7 @@ class CallerDrivenLoop:
         return _MAIN_THREAD_DRIVES or threading.current_thread() is not threading.main_thread()
 
     def _enlist(self, job: Job[Any]) -> bool:
-        """Register `job` unless others are under way; return whether it was registered."""
+        """Register `job` unless others are in progress; return whether it was registered."""
         with self._lock:
             if self._stopping:
                 raise client_closed()
@@ -223,17 +223,17 @@ class CallerDrivenLoop:
                 raise client_closed()
             self._jobs.add(job)
             self._loop.call_soon_threadsafe(self._start_job, job)
-        self._see_to_driver()
+        self._ensure_driver()
 
     def _call_away(self, job: Job[Any]) -> None:
-        """Make the caller of `job` look whether it should go on waiting."""
+        """Make the caller of `job` check whether it should continue waiting."""
         job.leave = True
         job.wake()
         if self._driven is job:
             self._poke(self._loop.stop)
 
     def _abandon(self, job: Job[Any]) -> None:
-        """Cancel `job`, whose caller was interrupted anywhere in `run`; wait for its clean-up."""
+        """Cancel `job`, whose caller was interrupted at any point of `run`, and wait for its clean-up."""
         with self._lock:
             if job.finished:
                 return
@@ -243,7 +243,7 @@ class CallerDrivenLoop:
             self._loop.call_soon_threadsafe(self._cancel_job, job)
         drives = self._may_drive()
         if not drives:
-            self._see_to_driver()
+            self._ensure_driver()
         deadline = time.monotonic() + GRACE
         while not job.finished and (left := deadline - time.monotonic()) > 0:
             job.leave = False
@@ -257,7 +257,7 @@ class CallerDrivenLoop:
             )
 
     def _drive(self, job: Job[Any], deadline: float | None = None) -> None:
-        """Run the loop on this thread until `job` is finished, its caller called away or the deadline has passed."""
+        """Run the loop on this thread until `job` is finished, its caller must leave or the deadline has passed."""
         if self._ended:
             job.wait(_CLAIM_SLICE)
             return
@@ -279,7 +279,7 @@ class CallerDrivenLoop:
             self._give_back()
 
     def _claim(self, job: Job[Any], deadline: float | None) -> bool:
-        """Get the turn; return False if `job` was finished, its caller called away or the deadline past before."""
+        """Get the turn; return False if first `job` is finished, its caller must leave or the deadline has passed."""
         while not self._turn.acquire(blocking=False):
             if job.finished or job.leave or (deadline is not None and time.monotonic() >= deadline):
                 return False
@@ -289,7 +289,7 @@ class CallerDrivenLoop:
         return True
 
     def _run_loop(self) -> None:
-        # A task that raises one of these breaks out of the loop. If it is a job, its caller gets it through that.
+        # These exceptions leave the loop when a task raises them. If the task is a job, its caller gets them from it.
         try:
             self._loop.run_until_stopped()
         except (KeyboardInterrupt, SystemExit) as error:
@@ -299,16 +299,16 @@ class CallerDrivenLoop:
         self._left = time.monotonic()
         self._turn.release()
         if self._jobs or self._stopping:
-            self._see_to_driver()
+            self._ensure_driver()
 
-    def _see_to_driver(self) -> None:
-        """Wake the thread if nobody runs the loop."""
+    def _ensure_driver(self) -> None:
+        """Wake the thread if no thread runs the loop."""
         if not self._turn.locked():
-            self._ring()
+            self._wake_thread()
 
-    def _ring(self) -> None:
-        with contextlib.suppress(RuntimeError):  # It has been rung already.
-            self._bell.release()
+    def _wake_thread(self) -> None:
+        with contextlib.suppress(RuntimeError):  # It has already been woken.
+            self._wake_up.release()
 
     def _poke(self, callback: Callable[[], object]) -> None:
         with contextlib.suppress(RuntimeError):  # The loop has just been closed.
@@ -319,7 +319,7 @@ class CallerDrivenLoop:
             if not self._stopping:
                 self._stopping = True
                 self._loop.call_soon_threadsafe(self._stop_requested.set)
-        self._ring()
+        self._wake_thread()
 
     # In the loop
 
@@ -338,17 +338,17 @@ class CallerDrivenLoop:
             self._break_off(job)
 
     async def _perform(self, job: Job[Any]) -> None:
-        # Rather than a callback of the task: that would take one more turn of the loop.
+        # Not a callback of the task, which would take one more iteration of the loop.
         if job.finished:
             return
         job.started = True
         try:
             job.value = await job.coro
         except GeneratorExit:
-            raise  # The loop ended first, and the job with it.
+            raise  # The loop ended before the job.
         except asyncio.CancelledError as error:
             job.error = client_closed("during this call") if self._stopping else error.with_traceback(None)
-        except BaseException as error:  # noqa: BLE001  # what it is, is the caller's business
+        except BaseException as error:  # noqa: BLE001  # raised by the caller
             trace = error.__traceback__
             job.error = error.with_traceback(None if trace is None else trace.tb_next)  # without this frame
             del trace
@@ -362,7 +362,7 @@ class CallerDrivenLoop:
 
     def _finish_job(self, job: Job[Any]) -> None:
         self._jobs.discard(job)
-        # Not left to the caller to drop: a signal handler that raises amid weak reference callbacks gets printed.
+        # Dropped here, not by the caller: Python prints what a signal handler raises during weak-reference callbacks.
         job.task = None
         job.finished = True
         job.wake()
@@ -381,7 +381,7 @@ class CallerDrivenLoop:
                 self._turn.release()
                 self._await_turn()
                 self._thread_drives = True
-        # Between two runs of the loop: while it runs, Python 3.14 tells only of those tasks that this thread has made.
+        # Between two runs of the loop: while it runs, Python 3.14 lists only the tasks that this thread has created.
         end = self._loop.create_task(self._end(asyncio.all_tasks(self._loop)))
         end.add_done_callback(lambda _: self._loop.stop())
         while not end.done():
@@ -393,17 +393,17 @@ class CallerDrivenLoop:
         self._turn.release()
 
     def _await_turn(self) -> None:
-        """Sleep until the turn is the thread's again."""
+        """Sleep until the thread has the turn again."""
         pause = _IDLE
         while True:
-            if self._bell.acquire(timeout=pause):
+            if self._wake_up.acquire(timeout=pause):
                 self._turn.acquire()
                 break
             if time.monotonic() - self._left >= _IDLE and self._turn.acquire(blocking=False):
                 break
             pause = min(2 * pause, _LONGEST_PAUSE)
-        # Whatever it rang for until now is in the loop. Left ringing, it would take the turn from the next caller.
-        self._bell.acquire(blocking=False)
+        # All work announced so far is in the loop. A wake-up left set would take the turn from the next caller.
+        self._wake_up.acquire(blocking=False)
 
     def _note_end(self, main: asyncio.Task[None]) -> None:
         self._ended = True

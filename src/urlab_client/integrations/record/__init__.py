@@ -1,6 +1,6 @@
-"""Recording a run into an MCAP file that Foxglove opens, reading it back, and converting it.
+"""Recording runs as MCAP files that Foxglove opens, reading them, and converting them.
 
-Needs the extra `mcap`; `video` and `dataset` for some conversions.
+Requires the extra `mcap`; some conversions require `video` or `dataset`.
 """
 
 from urlab_client._extras import need

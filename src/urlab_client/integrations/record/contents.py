@@ -1,4 +1,4 @@
-"""What is read from a recording: its summary, a table of its states, one state, one picture."""
+"""The contents of a recording: its summary, a table of its states, single states and pictures."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Topic:
     Attributes:
         name: Topic.
         schema: Name of its messages' schema.
-        messages: How many there are.
-        rate_hz: Messages per second of the recording's clock, by the median distance; 0 with fewer than two.
-        gaps: Distances of more than three times the median.
-        longest_gap_s: The longest distance, seconds.
+        messages: Number of messages.
+        rate_hz: Messages per second of the recording's clock, from the median interval; 0 with fewer than two.
+        gaps: Number of intervals longer than three times the median.
+        longest_gap_s: The longest interval, seconds.
     """
 
     name: str
@@ -53,21 +53,21 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What is in a recording.
+    """Summary of a recording.
 
     Attributes:
         path: The file.
-        complete: Whether it was finished; False after a crash.
-        damage: Why reading ended early, empty for a complete file.
-        about: What was noted at its start: versions, address, step mode, time.
-        duration_s: Seconds of the recording's clock between the first message and the last.
-        wall_s: Seconds of the server's clock between them.
-        episodes: Resets, plus one; 0 without states.
-        dropped_states: States that could not be written fast enough.
-        dropped_frames: Likewise pictures.
-        topics: By name.
-        varied: What the server varied, by episode.
-        outcomes: What became of the episodes that were marked.
+        complete: Whether the recording was finished; False after a crash.
+        damage: Why reading ended early; empty for a complete file.
+        about: Metadata from its start: versions, address, step mode, time.
+        duration_s: Time between the first and the last message on the recording's clock, seconds.
+        wall_s: The same on the server's clock.
+        episodes: Number of episodes: resets plus one; 0 without states.
+        dropped_states: Number of states that could not be written fast enough.
+        dropped_frames: Number of pictures that could not be written fast enough.
+        topics: Topics by name.
+        varied: The server's randomisation, by episode.
+        outcomes: Outcomes of the marked episodes.
     """
 
     path: Path
@@ -86,13 +86,13 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Values that belong together, such as all positions of an articulation.
+    """A group of values, such as all positions of an articulation.
 
     Attributes:
         names: Name of each value.
-        values: Shape (samples, values); NaN where a sample has none.
-        quantities: What each value measures, with its unit: `angle (rad)`, `linear acceleration (m/s²)`.
-        labels: Names for people: as `names`, but `imu.x` where that has `imu.0`.
+        values: Shape (samples, values); NaN for missing values.
+        quantities: Quantity and unit of each value: `angle (rad)`, `linear acceleration (m/s²)`.
+        labels: Display names: like `names`, but `imu.x` instead of `imu.0`.
     """
 
     names: list[str]
@@ -106,13 +106,13 @@ class Table:
     """The states of a recording, one row per sample.
 
     Attributes:
-        time: The recording's clock, seconds, shape (n,): simulation time that goes on where a reset sets it back.
+        time: Time on the recording's clock, seconds, shape (n,): simulation time that continues across resets.
         sim_time: `mjData.time`, seconds.
         wall_ns: The server's UTC clock, nanoseconds.
         step: Step counter.
-        episode: Number of resets before.
-        columns: By `ARTICULATION/FIELD`, fields as in `client.articulations`: `qpos`, `qvel`, `ctrl`, `set_points`,
-            `act`, `sensors`; plain entities have `pose` and `qvel`.
+        episode: Number of preceding resets.
+        columns: Columns by `ARTICULATION/FIELD`, with fields as in `client.articulations`: `qpos`, `qvel`, `ctrl`,
+            `set_points`, `act`, `sensors`; plain entities have `pose` and `qvel`.
     """
 
     time: Floats
@@ -137,7 +137,7 @@ class Table:
         }
 
     def flat(self) -> dict[str, NDArray[Any]]:
-        """Return every value as a column of its own: `time`, …, then `ARTICULATION/FIELD/NAME`."""
+        """Return every value as a separate column: `time`, …, then `ARTICULATION/FIELD/NAME`."""
         flat: dict[str, NDArray[Any]] = {}
         for key, values in self.arrays().items():
             column = self.columns.get(key)
@@ -148,7 +148,7 @@ class Table:
         return flat
 
     def with_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> Table:
-        """Return a table with the same columns and other rows, from what `arrays` of it returns."""
+        """Return a table with the same columns and other rows, given in the form of `arrays`."""
         columns = {key: replace(column, values=arrays[key]) for key, column in self.columns.items()}
         return Table(
             arrays["time"], arrays["sim_time"], arrays["wall_ns"], arrays["step"], arrays["episode"], columns=columns
@@ -160,8 +160,8 @@ class Camera:
     """One picture of a recording.
 
     Attributes:
-        time: The recording's clock, seconds.
-        pixels: uint8 (H, W, 3) RGB, of semantic and instance cameras (H, W, 4) RGBA; depth float32 (H, W), metres.
+        time: Time on the recording's clock, seconds.
+        pixels: uint8 (H, W, 3) RGB, or (H, W, 4) RGBA for semantic and instance cameras; depth float32 (H, W), metres.
     """
 
     time: float
@@ -170,12 +170,12 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class RecordedArticulation:
-    """One articulation at one moment: arrays as in `client.articulations`, empty where nothing was recorded.
+    """One articulation at one moment: arrays as in `client.articulations`, empty if not recorded.
 
     Attributes:
         qpos: Joint positions, radians or metres.
         qvel: Joint velocities, per second.
-        set_points: What the client had set, before any controller.
+        set_points: Set-points of the client, before any controller.
         ctrl: `mjData.ctrl`, as applied.
         act: Activations.
         sensors: Readings by name.
@@ -194,9 +194,9 @@ class RecordedEntity:
     """One plain entity at one moment.
 
     Attributes:
-        position: In the world, metres, shape (3,).
+        position: Position in the world frame, metres, shape (3,).
         orientation: Quaternion (w, x, y, z).
-        qvel: Velocity of a free one's joint, linear and angular, shape (6,); else empty.
+        qvel: Linear and angular velocity of the free joint, shape (6,); empty without one.
     """
 
     position: Floats
@@ -209,12 +209,12 @@ class RecordedState:
     """The state at one moment.
 
     Attributes:
-        time: The recording's clock, seconds.
+        time: Time on the recording's clock, seconds.
         sim_time: `mjData.time`, seconds.
         wall_ns: The server's UTC clock, nanoseconds.
         step: Step counter.
-        episode: Number of resets before.
-        articulations: By key.
+        episode: Number of preceding resets.
+        articulations: Articulations by key.
         entities: Plain entities by name.
     """
 

@@ -1,8 +1,8 @@
-"""Recordings as files of other kinds: tables, arrays, videos, LeRobot datasets. Each appears whole or not at all.
+"""Conversion of recordings to tables, arrays, videos and LeRobot datasets. Output files appear only when complete.
 
-Tables are pairs of an observation and the action taken at it, see `transitions`; arrays are the states as recorded.
-Memory holds a piece of the recording, however long that is; a temporary file beside the output has the others while
-they are needed, 8 bytes for each value of each state. What `progress` raises breaks a conversion off.
+Tables contain pairs of an observation and the action taken at it, see `transitions`; arrays contain the states as
+recorded. Memory holds only a piece of the recording; a temporary file beside the output holds the others, with 8 bytes
+for each value of each state. An exception from `progress` aborts a conversion.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parque
 
 _ROWS = 1_000
 _CODECS = {"libx264": 90_000, "mpeg4": 60_000}
-"""By codec: ticks per second of MP4 time stamps, of which MPEG-4 takes at most 65,535."""
+"""Ticks per second of MP4 timestamps by codec; MPEG-4 allows at most 65,535."""
 
 
 def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
-    Numbers read back to the same bits. See `transitions` for what is a row, and `transitions_of` for `episodes`.
+    Numbers are written without loss of precision. See `transitions` for the rows, and `transitions_of` for `episodes`.
     """
     count = 0
     with (
@@ -54,7 +54,8 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
             flat = piece.flat()
             if not number:
                 writer.writerow(flat)
-            # Python floats: those of NumPy would be written with their type. They take more room, so some at a time.
+            # Converted to Python floats, because NumPy's would be written with their type; in blocks, because they
+            # take more memory.
             for start in range(0, len(piece), _ROWS):
                 rows = slice(start, start + _ROWS)
                 writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
@@ -64,15 +65,15 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
 
 
 def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progress | None = None) -> int:
-    """Write all states, as they were recorded, and return their number.
+    """Write all states as recorded, and return their number.
 
-    Arrays are called `ARTICULATION/FIELD`, and the names of their values are in `ARTICULATION/FIELD.names`.
-    Pictures of the cameras that are named come as `camera/NAME`, shape (n, H, W, channels) or of depth (n, H, W), with
+    Arrays are called `ARTICULATION/FIELD`, and the names of their values `ARTICULATION/FIELD.names`. Pictures of the
+    given cameras are `camera/NAME`, shape (n, H, W, channels), or (n, H, W) for depth, with their times in
     `camera/NAME.time`.
 
     Raises:
-        KeyError: There are no pictures of a camera.
-        RecordingError: The pictures of a camera are not all of one size.
+        KeyError: The recording has no pictures of a camera.
+        RecordingError: The pictures of a camera differ in size.
     """
     size = run.path.stat().st_size
     steps = iter(phases(size, progress, 2 + 2 * len(cameras)))
@@ -97,7 +98,7 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
 def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
-    See `transitions` for what is a row, and `transitions_of` for `episodes`.
+    See `transitions` for the rows, and `transitions_of` for `episodes`.
 
     Raises:
         ImportError: The extra `dataset` is not installed.
@@ -116,7 +117,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
         for piece in pieces:
             group = pa.table(piece.flat())
             if writer is None:
-                # Without dictionaries: hardly a number comes twice, and in a group of this size all would get one.
+                # Without dictionaries, because numbers hardly repeat.
                 options = {"compression": "zstd", "use_dictionary": False}
                 writer = stack.enter_context(parquet.ParquetWriter(temporary, group.schema, **options))
             if len(piece):
@@ -129,12 +130,12 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
 def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = None) -> int:
     """Write the pictures of a camera as H.264, each shown at its simulation time; return their number.
 
-    Depth is shown in grey, near bright, black at the farthest depth of the first picture.
+    Depth is shown in grey, from bright (near) to black (the largest depth of the first picture).
 
     Raises:
         ImportError: The extra `video` is not installed.
-        KeyError: There are no pictures of it.
-        RecordingError: This PyAV can write no video.
+        KeyError: The recording has no pictures of the camera.
+        RecordingError: The installed PyAV cannot write video.
     """
     need("av", extra="video")
     av: Any = importlib.import_module("av")
@@ -162,7 +163,7 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
 
 
 class _Transitions(NamedTuple):
-    """The pairs of a recording in pieces, and what is told how many rows have been written."""
+    """The pairs of a recording in pieces, and a callback for the number of written rows."""
 
     pieces: Iterator[Table]
     told: Progress
@@ -199,10 +200,10 @@ def _save(
     count: int,
     told: Callable[[], None] = lambda: None,
 ) -> None:
-    """Add an array of `count` rows to an archive, as `numpy.savez` does, with no more than a part of it in memory.
+    """Add an array of `count` rows to an archive like `numpy.savez`, with only a part of it in memory.
 
     Raises:
-        ValueError: The parts do not fit together, or are fewer rows.
+        ValueError: The parts do not match, or have fewer rows.
     """
     rows, form = 0, None
     with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:

@@ -1,4 +1,4 @@
-"""Recordings as LeRobot datasets, written by LeRobot itself in an interpreter that has it."""
+"""Conversion of recordings to LeRobot datasets, by LeRobot itself in an interpreter that has it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from urlab_client.protocol.base import Floats
 __all__ = ["write_lerobot"]
 
 _PROBE_S = 120.0
-_TOGETHER = 64  # frames that are handed over at a time
-_SLACK = 1.01  # of times that were rounded on their way
+_TOGETHER = 64  # frames per batch
+_SLACK = 1.01  # tolerance for rounded times
 _SLACK_S = 1e-6
 
 
@@ -47,28 +47,28 @@ def write_lerobot(
     """Write a LeRobot dataset with LeRobot itself, in an interpreter that has it; return the number of frames.
 
     A frame is a state and the action taken at it: `observation.state` holds the positions of all articulations,
-    `action` the set-points that were in force from then on, and `observation.images.NAME` the pictures, with dots for
-    slashes. An episode ends at each reset; its last state, at which nothing was done any more, is no frame. At every
-    1/fps seconds of an episode the newest state and picture are taken, beginning with its first picture.
+    `action` the set-points applied from then on, and `observation.images.NAME` the pictures, with dots instead of
+    slashes. An episode ends at each reset; its last state, which no action follows, is not a frame. Every 1/fps
+    seconds of an episode, starting with its first picture, the newest state and picture become a frame.
 
     Args:
         run: The recording.
-        folder: The dataset, which must not exist.
+        folder: Folder of the dataset, which must not exist.
         python: Interpreter that can import `lerobot` 0.6.
-        task: What the robot does, in words.
-        fps: Frames per second; by default the rate of the pictures, without any that of the states.
+        task: Description of the task.
+        fps: Frames per second; by default the rate of the pictures, or of the states if there are none.
         robot_type: Kind of robot; the names of the articulations, joined by `+`, by default.
-        cameras: Cameras; all that were recorded by default.
-        video: Store pictures as video, which loses some detail, rather than as PNG files.
-        max_picture_age: Largest age of a picture beside its state, seconds; one frame by default.
-        episodes: Which episodes; see `transitions_of`. What they are about is in `observation.environment_state`.
-        progress: Told now and then how many bytes have been read.
+        cameras: Cameras; by default all recorded ones.
+        video: Store pictures as lossy video instead of PNG files.
+        max_picture_age: Largest age of a picture relative to its state, seconds; one frame by default.
+        episodes: Selection of episodes; see `transitions_of`. Goals are in `observation.environment_state`.
+        progress: Called occasionally with the number of bytes read so far.
 
     Raises:
         FileExistsError: The folder exists.
         RecordingError: The interpreter has no LeRobot, there is nothing to write, pictures are missing so that a frame
-            would show an older state, the rate is not a whole number, or LeRobot failed.
-        KeyError: There are no pictures of a camera.
+            would show an older state, the rate is not an integer, or LeRobot failed.
+        KeyError: The recording has no pictures of a camera.
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: LeRobot makes the folder itself")
@@ -79,7 +79,7 @@ def write_lerobot(
     times = {name: run.picture_times(name, next(steps)) for name in names}
     with (
         run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as stored,
-        # Beside the dataset, which may be too large for where the system keeps temporary files.
+        # Beside the dataset, which may be too large for the system's temporary folder.
         tempfile.TemporaryDirectory(prefix=".urlab-", dir=folder.parent, ignore_cleanup_errors=True) as temporary,
     ):
         work, outcomes = Path(temporary), run.outcomes()
@@ -123,7 +123,7 @@ def write_lerobot(
 
 
 class _Timeline(NamedTuple):
-    """When states were, seconds, and in which episode; each of shape (n,)."""
+    """Time, seconds, and episode of states, each of shape (n,)."""
 
     time: Floats
     episode: NDArray[np.int64]
@@ -144,7 +144,7 @@ def _timeline(pieces: Iterable[Table]) -> _Timeline:
 
 
 def _frames(pieces: Iterable[Table], rows: NDArray[np.intp], episode: NDArray[np.int64]) -> Iterator[_Frames]:
-    """Yield the frames at some rows of a table, as many at a time as fit in memory with their pictures."""
+    """Yield the frames at some rows of a table, in batches that fit into memory with their pictures."""
     ends = {*(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(rows)}
     first = start = 0
     for piece in pieces:
@@ -160,7 +160,7 @@ def _frames(pieces: Iterable[Table], rows: NDArray[np.intp], episode: NDArray[np
 
 
 class _Pictures:
-    """The pictures of one camera, read in their order as frames need them."""
+    """The pictures of one camera, read in order as frames need them."""
 
     def __init__(self, run: Run, camera: str, video: bool, progress: Progress) -> None:
         self._run, self._camera, self._video = run, camera, video

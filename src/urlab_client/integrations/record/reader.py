@@ -1,7 +1,6 @@
-"""Reading a recording: what is in it, its states, its pictures. Also what a killed process left behind.
+"""Reading recordings: summary, states and pictures, also from the incomplete file of a killed process.
 
-The file's index says where everything is, so that opening an overnight recording, or going to a moment of it, reads
-next to nothing of it.
+Opening a recording and seeking read only the file's index and a few blocks, so both are fast for overnight recordings.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ _CAMERA, _ARTICULATION, _ENTITY = "/camera/", "/state/", "/entity/"
 
 
 class _State(msgspec.Struct):
-    """An articulation's message as it is read: numbers that JSON lacks are text."""
+    """An articulation's message as decoded; numbers that JSON cannot represent are text."""
 
     sim_time: Number
     sample: int
@@ -89,12 +88,12 @@ _raw = msgspec.json.Decoder(RawImage).decode
 
 
 class RecordedPicture(msgspec.Struct, frozen=True):
-    """One picture as it is in the file.
+    """One encoded picture of the file.
 
     Attributes:
-        time: The recording's clock, seconds.
-        mode: Of the camera: `real`, `depth` and so on.
-        message: The picture.
+        time: Time on the recording's clock, seconds.
+        mode: Mode of the camera: `real`, `depth` and so on.
+        message: The encoded picture.
     """
 
     time: float
@@ -102,7 +101,7 @@ class RecordedPicture(msgspec.Struct, frozen=True):
     message: CompressedImage | RawImage
 
     def pixels(self) -> Pixels:
-        """Return it as an array, as `Camera.pixels` is."""
+        """Return it as an array like `Camera.pixels`."""
         message = self.message
         if isinstance(message, RawImage):
             return np.frombuffer(message.data, "<f4").astype(np.float32).reshape(message.height, message.width)
@@ -110,11 +109,11 @@ class RecordedPicture(msgspec.Struct, frozen=True):
 
 
 class Run:
-    """A recording on disk. Opening it reads its index alone, however long it is; several threads may read.
+    """A recording on disk. Opening it reads only its index. Several threads may read.
 
     Attributes:
         path: The file.
-        damage: Why what was read last ended early; empty otherwise.
+        damage: Why the last read ended early; empty if it did not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,11 +123,11 @@ class Run:
         self._lock = threading.Lock()
 
     def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
-        """Say what is in it.
+        """Return a summary of the contents.
 
         Args:
-            progress: Told now and then how many bytes have been read.
-            verify: Read everything and compare checksums, to find damage in the middle of a finished file.
+            progress: Called occasionally with the number of bytes read so far.
+            verify: Read everything and compare checksums, to detect damage in the middle of a finished file.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -162,14 +161,14 @@ class Run:
         )
 
     def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
-        """Return all states. They must fit in memory: 8 bytes for each value of each state.
+        """Return all states. They must fit into memory, at 8 bytes for each value of each state.
 
         Args:
-            progress: Told now and then how many bytes have been read.
+            progress: Called occasionally with the number of bytes read so far.
             fields: Fields to return, such as `qpos`; None returns all.
 
         Raises:
-            RecordingError: The file is not a recording, or holds two scenes, whose values do not fit one table.
+            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
         builder = TableBuilder(fields)
         self._read_states(builder, progress)
@@ -179,16 +178,16 @@ class Run:
     def stored_table(
         self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
     ) -> Generator[StoredTable]:
-        """Yield all states in pieces, however many there are: memory holds one piece, a temporary file the others.
+        """Yield all states in pieces: memory holds one piece, a temporary file the others.
 
         Args:
-            folder: Where the temporary file is: 8 bytes for each value of each state.
-            progress: Told now and then how many bytes have been read.
+            folder: Folder of the temporary file, which has 8 bytes for each value of each state.
+            progress: Called occasionally with the number of bytes read so far.
             fields: Fields to return, such as `qpos`; None returns all.
 
         Raises:
             OSError: The temporary file cannot be written.
-            RecordingError: The file is not a recording, or holds two scenes, whose values do not fit one table.
+            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
         with StoredTable(folder) as stored:
             builder = TableBuilder(fields, take=stored.keep)
@@ -198,7 +197,7 @@ class Run:
             yield stored
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
-        """Return what became of the episodes that were marked; of several marks of one episode the last.
+        """Return the marked outcomes of episodes; if an episode has several marks, the last one.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -207,7 +206,7 @@ class Run:
         return tuple({outcome.episode: outcome for outcome in outcomes}.values())
 
     def time_range(self) -> tuple[float, float]:
-        """Return the times of the first and of the last state, seconds of the recording's clock; 0, 0 without states.
+        """Return the times of the first and the last state, seconds on the recording's clock; 0, 0 without states.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -219,10 +218,10 @@ class Run:
         return min(first, default=0) / _NS, max(last, default=0) / _NS
 
     def state_at(self, time: float) -> RecordedState | None:
-        """Return the newest state that is not after a time, None if there is none yet.
+        """Return the newest state at or before a time; None if there is none.
 
         Args:
-            time: The recording's clock, seconds.
+            time: Time on the recording's clock, seconds.
 
         Raises:
             RecordingError: The file is not a recording, or is damaged there.
@@ -246,7 +245,7 @@ class Run:
             wall_ns=message.publish_time,
             step=newest.step,
             episode=newest.episode,
-            # What is of an earlier sample had left the scene by then.
+            # Elements from an earlier sample had left the scene by then.
             articulations={key: _articulation(one) for key, (_, one) in states.items() if one.sample == newest.sample},
             entities={
                 name: RecordedEntity(_floats(one.position), _floats(one.orientation), _floats(one.qvel))
@@ -256,7 +255,7 @@ class Run:
         )
 
     def positions(self) -> dict[str, list[str]]:
-        """Return the name of each value of `qpos` by articulation, as it was when that was first recorded.
+        """Return the names of the values of `qpos` by articulation, from its first state.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -272,16 +271,16 @@ class Run:
         return found
 
     def cameras(self) -> list[str]:
-        """Return the names of the cameras that have pictures here."""
+        """Return the names of the cameras with pictures in the file."""
         index = self._index()
         cameras = [channel for channel in index.having(*_PICTURES) if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
     def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
-        """Return the times of the pictures that `frames` would return, seconds of the recording's clock, in its order.
+        """Return the times of the pictures of `frames`, in its order, seconds on the recording's clock.
 
         Raises:
-            KeyError: There are no pictures of it.
+            KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
@@ -292,31 +291,31 @@ class Run:
         """Iterate over the pictures of a camera, `ARTICULATION/CAMERA` or a scene-level name.
 
         Raises:
-            KeyError: There are no pictures of it.
+            KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording.
         """
         for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
 
     def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
-        """Iterate over the pictures of a camera as they are in the file.
+        """Iterate over the encoded pictures of a camera.
 
         Raises:
-            KeyError: There are no pictures of it.
+            KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
         yield from map(_picture, self._messages(self._index(progress), channels, progress))
 
     def picture_at(self, camera: str, time: float) -> Camera | None:
-        """Return the newest picture of a camera that is not after a time, None if there is none yet.
+        """Return the newest picture of a camera at or before a time; None if there is none.
 
         Args:
             camera: `ARTICULATION/CAMERA` or a scene-level name.
-            time: The recording's clock, seconds.
+            time: Time on the recording's clock, seconds.
 
         Raises:
-            KeyError: There are no pictures of it.
+            KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording, or is damaged there.
         """
         found = _newest(self._index(), self._camera(camera), time)
@@ -326,10 +325,10 @@ class Run:
         return Camera(picture.time, picture.pixels())
 
     def encoded_picture_at(self, camera: str, time: float) -> RecordedPicture:
-        """Return the picture as it is in the file; before the first one of the camera that one.
+        """Return the encoded picture at a time; before the camera's first picture, the first one.
 
         Raises:
-            KeyError: There are no pictures of it.
+            KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording, or is damaged there.
         """
         index, channels = self._index(), self._camera(camera)
@@ -348,7 +347,8 @@ class Run:
         return channels
 
     def _index(self, progress: Callable[[int], None] | None = None) -> RecordingIndex:
-        """Return the file's index, which is read again once the file is another, as while it is being written."""
+        """Return the file's index, which is read again if the file has changed, for example while it is being
+        written."""
         status = self.path.stat()
         now = status.st_size, status.st_mtime_ns
         with self._lock:
@@ -361,7 +361,7 @@ class Run:
     def _messages(
         self, index: RecordingIndex, channels: Collection[int], progress: Callable[[int], None] | None = None
     ) -> Iterator[RecordedMessage]:
-        """Iterate over the messages of channels, up to where the file is damaged; `damage` says why."""
+        """Iterate over the messages of channels, up to the first damage, which is then stored in `damage`."""
         yield from index.messages(channels, progress)
         self.damage = index.damage
 
@@ -405,11 +405,11 @@ class Run:
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """Open a recording, finished or not: an MCAP file, or the JSON file of joint states that a server saves.
+    """Open a recording, complete or not: an MCAP file, or a JSON file of joint states saved by a server.
 
     Raises:
         OSError: The file cannot be read.
-        RecordingError: It is neither.
+        RecordingError: The file is neither.
     """
     from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""`record()`: what a client goes through, written to one file while it goes on."""
+"""`record()`: write the states and pictures of a client to one file during a run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _NS = 1_000_000_000
 
 
 class AsyncRecorder:
-    """A recording that is under way between `async with` and its end. Made by `record`."""
+    """A recording in progress, for the duration of an `async with` block. Created by `record`."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class AsyncRecorder:
 
     @property
     def stats(self) -> RecorderStats:
-        """Counters up to now, from any thread."""
+        """Current counters. Thread-safe."""
         if self._writer is None:
             return RecorderStats(states=0, frames=0, dropped_states=0, dropped_frames=0, waiting_bytes=0, file_bytes=0)
         return self._writer.stats
@@ -79,23 +79,23 @@ class AsyncRecorder:
 
     @property
     def without_pictures(self) -> list[str]:
-        """Cameras to record that have no picture in the file up to now."""
+        """Cameras to record without a picture in the file so far."""
         there = frozenset[str]() if self._writer is None else self._writer.cameras
         return [name for name in self._follower.cameras if name not in there]
 
     async def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
-        """Note what became of the present episode: the one since the last reset, up to the next one.
+        """Mark the outcome of the current episode, from the last reset to the next one.
 
-        Conversions leave out episodes that are discarded, and in a recording with marks those without one, too. Marked
-        again, the last mark of an episode counts.
+        Conversions omit discarded episodes and, if any episode is marked, those without a mark. If an episode is marked
+        several times, the last mark counts.
 
         Args:
             outcome: `success`, `failure` or `discarded`.
-            goal: What the episode was about, numbers or arrays by name, which becomes part of observations.
+            goal: Goal of the episode, numbers or arrays by name, which becomes part of observations.
 
         Raises:
-            ValueError: There is no such outcome, or the goal holds NaN or infinity.
-            URLabError: The recording has not begun, or has ended.
+            ValueError: The outcome is unknown, or the goal contains NaN or infinity.
+            URLabError: The recording has not started, or has ended.
         """
         if outcome not in get_args(EpisodeOutcome):
             raise ValueError(f"outcome must be one of {', '.join(get_args(EpisodeOutcome))}, not {outcome!r}")
@@ -122,7 +122,7 @@ class AsyncRecorder:
         self._ended = True
         writer = self._writer
         if writer is not None:
-            writer.end()  # from here on it finishes the file, whatever becomes of the caller
+            writer.end()  # from here on it finishes the file, even if the caller is cancelled
         await self._follower.ended()
         if writer is None:
             return
@@ -130,7 +130,7 @@ class AsyncRecorder:
             await anyio.to_thread.run_sync(writer.close, abandon_on_cancel=True)
         except URLabError:
             if exc is None:
-                raise  # else it has been logged, and what ends the block matters more
+                raise  # otherwise it was logged, and the exception that ends the block takes precedence
             return
         stats = writer.stats
         if missing := self.without_pictures:
@@ -144,14 +144,14 @@ class AsyncRecorder:
             warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
 
     def finish(self) -> None:
-        """Finish the file when the client's loop is gone already. Blocks."""
+        """Finish the file if the client's loop has already ended. Blocks."""
         self._follower.forget()
         if self._writer is not None:
             self._writer.close()
 
 
 class Recorder(BlockingTwin[AsyncRecorder]):
-    """A recording that is under way between `with` and its end. Made by `record`."""
+    """A recording in progress, for the duration of a `with` block. Created by `record`."""
 
     @property
     def path(self) -> Path:
@@ -160,7 +160,7 @@ class Recorder(BlockingTwin[AsyncRecorder]):
 
     @property
     def stats(self) -> RecorderStats:
-        """Counters up to now."""
+        """Current counters."""
         return self._aio.stats
 
     @property
@@ -170,11 +170,11 @@ class Recorder(BlockingTwin[AsyncRecorder]):
 
     @property
     def without_pictures(self) -> list[str]:
-        """Cameras to record that have no picture in the file up to now."""
+        """Cameras to record without a picture in the file so far."""
         return self._aio.without_pictures
 
     def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
-        """Note what became of the present episode; see `AsyncRecorder.mark`."""
+        """Mark the outcome of the current episode; see `AsyncRecorder.mark`."""
         self._portal.call(self._aio.mark, outcome, goal=goal)
 
 
@@ -222,33 +222,34 @@ def record(
     buffer_mib: float = 64.0,
     overwrite: bool = False,
 ) -> AsyncRecorder | Recorder:
-    """Record what a client goes through into an MCAP file: a context manager, of the client's own flavour.
+    """Record the states and pictures of a client into an MCAP file; a context manager of the client's flavour.
 
-    In `direct` and `puppet` mode every reply of `step`, `reset` and `forward` is one state, whoever made the call; in
-    `live` mode every snapshot that the server publishes is, unless time stands still. A thread encodes and writes. When
-    it falls behind by half of `buffer_mib`, a step in `direct` or `puppet` mode waits before it is sent, and nothing is
-    lost. In `live` mode, which cannot wait, and with `lossless=False` pictures are dropped then, and states when all of
-    `buffer_mib` waits. What was lost is counted in `stats` and in the file, and leaving the block warns of it.
+    In `direct` and `puppet` mode, every reply to `step`, `reset` and `forward` is one state, for calls from any task.
+    In `live` mode, every published snapshot is one state, unless time stands still. A thread encodes and writes. When
+    it falls behind by half of `buffer_mib`, steps in `direct` and `puppet` mode wait before they are sent, so nothing
+    is lost. In `live` mode, which cannot wait, and with `lossless=False`, pictures are dropped at that point, and
+    states when `buffer_mib` is full. Losses are counted in `stats` and in the file, and leaving the block warns about
+    them.
 
     Args:
         client: A client after `discover()`, during play.
-        path: The file. A chunk is written at least each second, so a killed process loses no more than that.
-        cameras: Cameras whose pictures to keep, `ARTICULATION/CAMERA` or a scene-level name; `all` for each of them.
-            In `direct` and `puppet` mode they are drawn with the step in which they are due, which takes longer then.
-        camera_hz: Pictures per second of simulation time, at most.
-        image_format: How colour pictures are stored; others are always stored without loss.
+        path: The file. A chunk is written at least every second, so a killed process loses at most that.
+        cameras: Cameras to record, `ARTICULATION/CAMERA` or a scene-level name; `all` for all of them.
+            In `direct` and `puppet` mode they are drawn with the step in which they are due, which then takes longer.
+        camera_hz: Maximum number of pictures per second of simulation time.
+        image_format: Format of colour pictures; other pictures are always stored losslessly.
         jpeg_quality: 1 to 95.
-        pose_hz: Sets of poses and joint states per second of simulation time, for 3D views; 0 for none.
-        contacts: Keep contacts with each set of poses, computed from the state with the client's own model.
-        lossless: Let steps wait rather than drop anything, where nothing is live.
-        buffer_mib: MiB that may wait to be written.
-        overwrite: Replace a file that exists.
+        pose_hz: Sets of poses and joint states per second of simulation time, for 3-D views; 0 for none.
+        contacts: Record contacts with each set of poses, computed from the state with the client's local model.
+        lossless: Make steps wait instead of dropping data, except in `live` mode.
+        buffer_mib: Size of the write buffer, MiB.
+        overwrite: Replace an existing file.
 
     Raises:
         ValueError: An option is out of range.
 
-    Entering the block raises `FileExistsError` or another `OSError` when the file cannot be made, `KeyError` for an
-    unknown camera, and `URLabError` before `discover()`; leaving it raises `RecordingError` when writing failed, for
+    Entering the block raises `FileExistsError` or another `OSError` if the file cannot be created, `KeyError` for an
+    unknown camera, and `URLabError` before `discover()`. Leaving it raises `RecordingError` if writing failed, for
     example because the disk is full.
     """
     _check(camera_hz=camera_hz, pose_hz=pose_hz, jpeg_quality=jpeg_quality, buffer_mib=buffer_mib)
@@ -285,7 +286,7 @@ def record(
 
 
 def _varied(client: AsyncClient) -> dict[str, str]:
-    """Return what varies, by the server or by an environment over the wire, as an entry of a recording's metadata."""
+    """Return the randomisation of the server or of an environment as an entry of a recording's metadata."""
     declared = None if client.model is None else declared_in(client.model)
     if declared is None and client in OVER_WIRE:
         declared = OVER_WIRE[client].declaration
