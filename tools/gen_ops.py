@@ -8,6 +8,7 @@ arguments to write, with `--check` to fail when the file is stale.
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import sys
 import textwrap
@@ -131,7 +132,7 @@ def description(annotation: Any) -> str:
 def docstring(op: Any, docs: list[tuple[str, str]]) -> str:
     from urlab_client.protocol import errors
 
-    text = textwrap.dedent(op.request.__doc__).strip()
+    text = inspect.cleandoc(op.request.__doc__)
     arguments = "\n".join(wrapped(f"{name}: {text}") for name, text in docs)
     sections = [text, f"Args:\n{arguments}"]
     if op.errors:

@@ -277,11 +277,11 @@ def test_a_server_that_cannot_be_given_the_model(
         assert demo_on(server, crab, "--output", tmp_path / "output") == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert "takes no models over the wire" in err
+    assert "does not accept uploads" in err
     assert str(crab) in err
 
 
 def test_an_address_that_would_start_a_server(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["demo", "--address", "sim://arm"])
-    assert "runs already" in capsys.readouterr().err
+    assert "give the address of a running one" in capsys.readouterr().err

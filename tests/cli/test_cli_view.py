@@ -45,9 +45,9 @@ def test_without_a_display_the_window_is_refused_and_others_are_named(tmp_path: 
 
 
 def test_options_of_another_view_are_refused(tmp_path: Path) -> None:
-    assert "go with --rerun" in refusal(urlab("view", "--foxglove", "--save", "a.rrd", cwd=tmp_path))
+    assert "require --rerun" in refusal(urlab("view", "--foxglove", "--save", "a.rrd", cwd=tmp_path))
     assert "give one of" in refusal(urlab("view", "--rerun", "--page", "--save", "a.rrd", cwd=tmp_path))
-    assert "--web shows everything" in refusal(urlab("view", "--web", "--seconds", "1", cwd=tmp_path))
+    assert "do not apply to --web" in refusal(urlab("view", "--web", "--seconds", "1", cwd=tmp_path))
 
 
 def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from waiting import eventually, until
 from urlab_client.aio import URLabClient
 from urlab_client.cli import _watching
 from urlab_client.cli._failure import CommandError
-from urlab_client.cli._watching import go_on
+from urlab_client.cli._watching import run_session
 from urlab_client.integrations.record import read_run
 from urlab_client.server import SimulatedServer
 
@@ -36,7 +36,7 @@ async def test_a_connection_that_breaks_between_step_and_reply_is_no_end(server:
         URLabClient(**(options | {"step_port": relay.port}), step_mode="direct") as client,
     ):
         await client.discover()
-        going = asyncio.create_task(go_on(client, 0.5, over=lambda: False))
+        going = asyncio.create_task(run_session(client, 0.5, over=lambda: False))
         relay.hold_replies()
         await relay.until_held(HEARTBEATS)
         relay.cut()
@@ -55,7 +55,7 @@ async def test_another_client_that_takes_over_meanwhile_is_an_end(server: Simula
         URLabClient(**options) as thief,
     ):
         await client.discover()
-        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        going = asyncio.create_task(run_session(client, None, over=lambda: False))
         relay.hold_replies()
         await relay.until_held(HEARTBEATS)
         await thief.discover()
@@ -72,7 +72,7 @@ async def test_what_a_server_simulated_before_does_not_count(server: SimulatedSe
     passed: list[float] = []
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()
-        await go_on(client, 0.2, over=lambda: False, progress=passed.append)
+        await run_session(client, 0.2, over=lambda: False, progress=passed.append)
         assert client.sim_time >= 0.4 + 0.2 - 1e-9
     assert passed[0] < 0.2 <= passed[-1] + 1e-9
 
@@ -80,7 +80,7 @@ async def test_what_a_server_simulated_before_does_not_count(server: SimulatedSe
 async def test_live_mode_ends_when_play_does(server: SimulatedServer) -> None:
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()
-        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        going = asyncio.create_task(run_session(client, None, over=lambda: False))
         await until(lambda: client.sim_time > 0)
         await client.sim.stop()
         with pytest.raises(CommandError, match="play has ended"):
@@ -93,10 +93,10 @@ async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.Mon
     await asyncio.to_thread(server.start)
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()
-        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        going = asyncio.create_task(run_session(client, None, over=lambda: False))
         await until(lambda: client.sim_time > 0)
         await asyncio.to_thread(server.close)
-        with pytest.raises(CommandError, match=r"away for 0\.2 s|play has ended"):
+        with pytest.raises(CommandError, match=r"unreachable for 0\.2 s|play has ended"):
             await going
 
 

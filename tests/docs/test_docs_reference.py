@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from pages import ROOT
 
 import gen_cli
 import gen_docs
+from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.cli import _parser
 from urlab_client.protocol.errors import RPC_ERRORS
+from urlab_client.protocol.messages.scene import EnsureManager
 from urlab_client.protocol.registry import OPS
 
 REFERENCE = ROOT / "docs" / "reference" / "ops.md"
@@ -130,3 +133,8 @@ def test_the_reference_of_the_commands_is_current(tmp_path: Path, monkeypatch: p
     assert gen_cli.main(["--check"]) == 1
     assert gen_cli.main([]) == 0
     assert gen_cli.main(["--check"]) == 0
+
+
+def test_help_shows_a_methods_text_as_its_op_declares_it() -> None:
+    text = inspect.getdoc(SceneNamespace.ensure_manager) or ""
+    assert text.startswith(f"{inspect.getdoc(EnsureManager)}\n\nArgs:\n")

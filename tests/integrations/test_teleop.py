@@ -232,7 +232,7 @@ def test_the_command_records_what_is_typed(tmp_path: Path, server: SimulatedServ
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, said in (
         (["sim://arm", "--record", "x.csv"], ".mcap"),
-        (["sim://arm", "--camera", "arm/wrist"], "--camera and --overwrite go with --record"),
+        (["sim://arm", "--camera", "arm/wrist"], "--camera and --overwrite require --record"),
         (["--task", "urlab/Reech-v0"], "'urlab/Reech-v0' is not a task. Did you mean 'urlab/Reach-v0'"),
         (["sim://arm"], "keys are read from a terminal"),
     ):

@@ -126,12 +126,12 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
     ("arguments", "words"),
     [
         (["sim://arm", "--host", "0.0.0.0"], "--allow-host NAME"),
-        (["sim://arm", "--models", "nowhere"], "there is no such folder"),
+        (["sim://arm", "--models", "nowhere"], "no such folder"),
         (["sim://arm", "--handshake", "file"], "not for sim://MODEL"),
-        (["tcp://localhost"], "takes a server over from nobody. Pass --handshake FILE"),
+        (["tcp://localhost"], "does not take a server over from another client. Pass --handshake FILE"),
         (["tcp://localhost", "--handshake", "file", "--allow-drive"], "leave out"),
-        (["sim://arm", "--agents", "2"], "is for --http"),
-        (["tcp://localhost", "--handshake", "file", "--step-mode", "live"], "the driving client's to choose"),
+        (["sim://arm", "--agents", "2"], "requires --http"),
+        (["tcp://localhost", "--handshake", "file", "--step-mode", "live"], "the driving client chooses the mode"),
     ],
 )
 def test_what_cannot_be_honoured_is_said(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,7 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has a module of its own and imports what is heavy (MuJoCo, the server, the demo's libraries) when it
-runs. A failure that can be foreseen is one line on standard error and exit code 2.
+Each command has its own module and imports heavy dependencies (MuJoCo, the server, the demo's libraries) when it
+runs. An expected failure prints one line on standard error and exits with code 2.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code.
 
     Args:
-        argv: Arguments without the program's name; default those of this process.
+        argv: Arguments without the program's name. Defaults to those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
     if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
-        reconfigure(errors="backslashreplace")  # not every terminal has the characters of every file's name
+        reconfigure(errors="backslashreplace")  # not every terminal can encode every file name
     if not argv:
         print(_parser().format_help(), end="")
         return 0
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("urlab_client").addHandler(handler)
     try:
         with warnings.catch_warnings():
-            # What users are to know, as that there is another MuJoCo here, is a line like any other.
+            # A warning for users, such as about a different MuJoCo version, is logged like any other.
             warnings.simplefilter("default", UserWarning)
             warnings.showwarning = _log_warning
             return run(arguments)
@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
         if _is_broken_pipe(error):
-            # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
+            # The reader of the output has gone; discard what the interpreter would flush at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return _FAILED
         sys.stderr.write(f"{name}: {one_line(error)}\n")
@@ -89,14 +89,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _is_broken_pipe(error: Exception) -> bool:
-    """Whether nobody reads a pipe any more, of which Windows says that the argument is invalid."""
+    """Whether the reader of a pipe has gone, which Windows reports as an invalid argument."""
     if os.name == "nt":
         return isinstance(error, OSError) and error.errno in {errno.EPIPE, errno.EINVAL} and error.filename is None
     return isinstance(error, BrokenPipeError)
 
 
 def _parser(*commands: str) -> Parser:
-    """Return the parser of some commands, by default of all."""
+    """Return the parser of the given commands, by default of all."""
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
@@ -104,8 +104,8 @@ def _parser(*commands: str) -> Parser:
         "failure explained on standard error, 130 Ctrl-C.",
         examples=(
             ("urlab demo", "see a robot move; needs no Unreal"),
-            ("urlab robots", "the robots that are included"),
-            ("urlab COMMAND --help", "options and examples of a command"),
+            ("urlab robots", "list the bundled robots"),
+            ("urlab COMMAND --help", "show the options and examples of a command"),
         ),
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
@@ -119,14 +119,14 @@ def _log_warning(message: Warning | str, *_: object) -> None:
     logger.warning("%s", message)
 
 
-class _Version(argparse.Action):  # argparse's own needs the version in advance, and reading it takes a while
+class _Version(argparse.Action):  # argparse's own action needs the version up front, and reading it is slow
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         print(f"urlab_client {urlab_client.__version__}")
         parser.exit()
 
 
 class _StderrHandler(logging.Handler):
-    """Writes warnings as lines of the command that runs, above a progress bar if there is one."""
+    """Writes warnings as lines prefixed with the command, above its progress bar if there is one."""
 
     def __init__(self, name: str) -> None:
         super().__init__(logging.WARNING)

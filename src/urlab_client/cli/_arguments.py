@@ -54,14 +54,14 @@ _LARGEST_IMAGE = 16384
 
 
 class Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the arguments, and exits with code 2.
+    """Reports wrong arguments in one line and exits with code 2.
 
     Attributes:
         examples: Shown at the end of the help.
     """
 
     def __init__(self, *, examples: Sequence[Example] = (), **options: Any) -> None:
-        # An abbreviation that works today would be ambiguous, or another option, tomorrow.
+        # An abbreviation that works today could become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self.examples = examples
 
@@ -82,7 +82,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]  # the base class has overloads
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """See `argparse.ArgumentParser.parse_known_args`; the parser of a command refuses what it does not know."""
+        """See `argparse.ArgumentParser.parse_known_args`; a command's parser rejects unknown arguments."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             word = unknown[0]
@@ -130,7 +130,7 @@ class ServerArguments(argparse.Namespace):
 def make_client(flavour: Callable[..., C], address: str, arguments: ServerArguments, **options: Any) -> C:
     """Return a client of one of the two classes for the server that the arguments name.
 
-    Another MuJoCo than the server's is no reason to refuse work: the client warns and compiles the model here.
+    A MuJoCo version that differs from the server's is not an error: the client warns and compiles the model locally.
 
     Raises:
         CommandError: The address or an option is malformed.
@@ -138,7 +138,7 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
     if arguments.mjcf_options:
         if not address.startswith("sim://"):
             raise CommandError(
-                f"--mjcf-options is for sim://MODEL; a server that runs already, as {address}, takes it when it starts"
+                f"--mjcf-options is for sim://MODEL; {address} is already running, and takes the option at its start"
             )
         address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
     if arguments.handshake is not None:
@@ -159,12 +159,12 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
 
 
 def add_address(parser: argparse.ArgumentParser, default: str | None = "tcp://localhost", otherwise: str = "") -> None:
-    """Add the address of a server, and `--mjcf-options` for one that it starts.
+    """Add the server's address, and `--mjcf-options` for a server that the command starts.
 
     Args:
         parser: The command's parser.
         default: Address without the argument.
-        otherwise: What happens without the argument, where that is not the default address.
+        otherwise: What happens without the argument, if that is not the default address.
     """
     parser.add_argument(
         "address",
@@ -184,7 +184,7 @@ def add_dialect(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> No
         choices=("alpha", "beta"),
         default="alpha",
         metavar="NAME",
-        help="generation of the plugin to speak for: alpha (June 2026) or beta (August 2026) (default: alpha)",
+        help="plugin generation to simulate: alpha (June 2026) or beta (August 2026) (default: alpha)",
     )
 
 
@@ -193,7 +193,7 @@ def add_mjcf_options(parser: argparse.ArgumentParser, when: str) -> None:
 
     Args:
         parser: The command's parser.
-        when: When it may be given.
+        when: When the option applies.
     """
     parser.add_argument(
         "--mjcf-options",
@@ -209,7 +209,7 @@ def add_ports(parser: argparse.ArgumentParser, *, state: bool = True) -> None:
         parser: The command's parser.
         state: Whether the command uses the state stream.
     """
-    parser.set_defaults(handshake=None)  # which only some commands take
+    parser.set_defaults(handshake=None)  # only some commands have the option
     parser.add_argument(
         "--step-port",
         type=port,
@@ -241,11 +241,11 @@ def add_step_mode(parser: argparse.ArgumentParser) -> None:
 
 
 def add_cameras(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add `--camera`, which may be repeated; `cameras` reads what was given.
+    """Add `--camera`, which may be repeated; `cameras` interprets its values.
 
     Args:
         parser: The command's parser.
-        what: What becomes of the camera.
+        what: What the camera is used for.
     """
     parser.add_argument(
         "--camera",
@@ -267,18 +267,20 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
         "--server-key", metavar="FILE", help="public key of a server that uses keys (default: $URLAB_SERVER_KEY)"
     )
     parser.add_argument(
-        "--client-key", metavar="FILE", help="own secret key, if the server knows its clients ($URLAB_CLIENT_KEY)"
+        "--client-key",
+        metavar="FILE",
+        help="this client's secret key, if the server requires one (default: $URLAB_CLIENT_KEY)",
     )
 
 
 def add_handshake(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:  # pyright: ignore[reportPrivateUsage]
-    """Add the option of a command that can look on beside the client that drives; see `handshake`."""
+    """Add `--handshake` to a command that can watch alongside the driving client; see `handshake`."""
     parser.add_argument(
         "--handshake",
         type=Path,
         metavar="FILE",
-        help="look on beside the client that drives, and take nothing over: the file has what client.handshake() "
-        "returns there, or GET /api/handshake of its console",
+        help="watch alongside the driving client, without taking over its session: FILE holds what its "
+        "client.handshake() returns, or GET /api/handshake of its console",
     )
 
 
@@ -292,7 +294,7 @@ def handshake(arguments: ServerArguments) -> bytes | None:
 
 
 def address(text: str) -> str:
-    """Parse the address of a server; a host without a scheme is one that TCP leads to."""
+    """Parse the address of a server; a host without a scheme is reached over TCP."""
     if "://" in text:
         return text
     from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
@@ -303,18 +305,18 @@ def address(text: str) -> str:
 
 
 def running_address(text: str) -> str:
-    """Parse the address of a server that runs already."""
+    """Parse the address of a running server."""
     if text.startswith("sim://"):
-        raise argparse.ArgumentTypeError(f"{text!r} would start a server; give the address of one that runs already")
+        raise argparse.ArgumentTypeError(f"{text!r} would start a server; give the address of a running one")
     return address(text)
 
 
 def one_of(*allowed: E) -> Callable[[str], E]:
-    """Return what parses one of some members of an enumeration."""
+    """Return a function that parses one of the given members of an enumeration."""
 
     def parse(text: str) -> E:
         try:
-            found = type(allowed[0])(text)  # which may know other names of its members
+            found = type(allowed[0])(text)  # the enumeration may accept aliases
         except ValueError:
             found = None
         if found not in allowed:
@@ -335,7 +337,7 @@ def index(text: str) -> int:
 
 
 def count(text: str) -> int:
-    """Parse a number of times, 1 or more."""
+    """Parse a count, 1 or more."""
     return _whole(text, 1, 10**9, "give a whole number above 0")
 
 
@@ -345,7 +347,7 @@ def seconds(text: str) -> float:
 
 
 def hertz(text: str) -> float:
-    """Parse how often per second, above 0."""
+    """Parse a rate per second, above 0."""
     return _number(text, lambda value: 0 < value < 1e6, "give a number per second, above 0")
 
 

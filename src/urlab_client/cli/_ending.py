@@ -1,4 +1,4 @@
-"""How a command is told to end."""
+"""Ending a command by a signal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["sigterm_interrupts"]
 
 @contextlib.contextmanager
 def sigterm_interrupts() -> Generator[None]:
-    """Let SIGTERM end the body as SIGINT does, so that it clears up what it has begun."""
+    """Let SIGTERM end the block as SIGINT does, so that it cleans up."""
     before = signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
     try:
         yield

@@ -1,4 +1,4 @@
-"""How a command says that it cannot go on."""
+"""Failures of commands."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ __all__ = ["CommandError", "one_line"]
 
 
 class CommandError(Exception):
-    """A failure that could be foreseen; its text, one line, says what, where and what would be right."""
+    """An expected failure; its text is one line that says what failed, where, and what would be right."""
 
 
 def one_line(error: BaseException) -> str:
     """Return an exception's text on one line."""
     text = str(error)
     if isinstance(error, OSError) and error.strerror:
-        # Without the number, which tells nobody anything.
+        # Leave out the error number, which does not help users.
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return " ".join(text.split()) or type(error).__name__

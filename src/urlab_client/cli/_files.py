@@ -1,4 +1,4 @@
-"""Files that commands write: called what they are, and whole or not there at all."""
+"""Files that commands write: with the right ending, and complete or absent."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["check_ending", "replaced"]
 
 
 def check_ending(path: Path, *endings: str) -> None:
-    """Check that a file to write is called what it will be.
+    """Check the ending of an output file.
 
     Raises:
-        CommandError: Its name ends differently.
+        CommandError: The name has another ending.
     """
     if path.suffix.lower() not in endings:
         better = path.with_suffix(endings[0]).name if path.name else f"FILE{endings[0]}"

@@ -12,8 +12,8 @@ _VARIABLE = "MUJOCO_GL"
 def import_mujoco() -> None:
     """Import MuJoCo without OpenGL.
 
-    Importing it loads the OpenGL platform that `MUJOCO_GL` names, and fails where that is missing. Whoever has the
-    variable set for other programs can still serve and drive robots. Pictures are drawn in a process of their own.
+    Importing it loads the OpenGL platform that `MUJOCO_GL` names, and fails if that is missing. A user who sets the
+    variable for other programs can still serve and drive robots. Pictures are drawn in a separate process.
     """
     chosen = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = "disable"

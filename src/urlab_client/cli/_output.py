@@ -1,4 +1,4 @@
-"""What commands show: progress bars, tables, counts."""
+"""Output of commands: progress bars, tables, counts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLUMNS = 120  # where the output is not a terminal
 
 @contextlib.contextmanager
 def progress_bar(description: str, total: float) -> Generator[Callable[[float], None]]:
-    """Show a bar while the block runs, if standard error is a terminal; yields what is told how far it is."""
+    """Show a bar while the block runs, if standard error is a terminal; yields a callback that sets its position."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -31,7 +31,7 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
 
 
 def output() -> Console:
-    """Return what writes tables to standard output."""
+    """Return a console that writes tables to standard output."""
     from rich.console import Console  # noqa: PLC0415
 
     console = Console()
@@ -39,5 +39,5 @@ def output() -> Console:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number of things, as in `1 joint` and `2 joints`."""
+    """Return a number with its noun, as in `1 joint` and `2 joints`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

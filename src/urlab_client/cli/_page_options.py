@@ -14,7 +14,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 class PageArguments(ServerArguments):
-    """What the command line says of the page, and of the server that it shows."""
+    """The parsed command line: options of the page and of the server that it shows."""
 
     address: str
     host: str
@@ -32,7 +32,7 @@ def add_page(parser: argparse.ArgumentParser, default_port: int) -> None:
         type=Path,
         default=Path("recordings"),
         metavar="FOLDER",
-        help="where recordings are kept, made with the first one (default: %(default)s)",
+        help="folder for recordings, created with the first one (default: %(default)s)",
     )
     network = parser.add_argument_group("network")
     network.add_argument(
@@ -41,34 +41,34 @@ def add_page(parser: argparse.ArgumentParser, default_port: int) -> None:
     network.add_argument(
         "--host",
         default="127.0.0.1",
-        help="interface to bind (default: %(default)s); others need --allow-host. Nothing is encrypted: put it behind "
-        "a proxy that does, or an SSH tunnel",
+        help="interface to bind (default: %(default)s); others need --allow-host. Nothing is encrypted: use a TLS "
+        "proxy or an SSH tunnel",
     )
     network.add_argument(
         "--allow-host",
         action="append",
         default=[],
         metavar="NAME",
-        help="host name under which browsers and programs come, besides this machine's own; repeatable",
+        help="host name by which browsers and programs reach the page, besides localhost; repeatable",
     )
     network.add_argument("--open", action="store_true", help="open the page in the browser")
 
 
 def check_page(arguments: PageArguments) -> None:
-    """Refuse what nobody could reach.
+    """Refuse an interface that no host name reaches.
 
     Raises:
-        CommandError: An interface is to be bound under no name.
+        CommandError: The interface is not loopback, and `--allow-host` is missing.
     """
     if arguments.host not in _LOOPBACK and not arguments.allow_host:
-        raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which it is reached")
+        raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name by which browsers reach it")
 
 
 def host_names(arguments: PageArguments) -> list[str]:
-    """Return the names under which the page is reached."""
+    """Return the host names by which the page is reached."""
     return [*_LOOPBACK, *(name.lower() for name in arguments.allow_host)]
 
 
 def page_url(arguments: PageArguments, number: int) -> str:
-    """Return where people find the page that is served at a port."""
+    """Return the URL of the page that is served at a port."""
     return f"http://{arguments.allow_host[0] if arguments.allow_host else '127.0.0.1'}:{number}"

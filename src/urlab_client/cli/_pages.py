@@ -1,4 +1,4 @@
-"""Serving pages: a socket that is bound before anybody is told of it, and uvicorn until a signal ends it."""
+"""Serving pages: a socket that listens before its link is printed, and uvicorn until a signal."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from starlette.types import ASGIApp
 from urlab_client.cli._ending import sigterm_interrupts
 from urlab_client.cli._requests import RunningRequests
 
-__all__ = ["bound", "ending_well", "serve"]
+__all__ = ["bound", "graceful_exit", "serve"]
 
-_FINISHING_S = 0.2  # for what is nearly done, after which it is broken off
-_GRACE_S = 10.0  # for what was broken off to clear up
+_FINISHING_S = 0.2  # for requests to finish before they are cancelled
+_GRACE_S = 10.0  # for cancelled requests to clean up
 
 
 @contextlib.contextmanager
-def ending_well() -> Generator[None]:
-    """Let SIGTERM end the body as SIGINT does, and take that for its end."""
-    # KeyboardInterrupt comes in the moment before uvicorn listens for it.
+def graceful_exit() -> Generator[None]:
+    """Let SIGTERM end the block as SIGINT does, and suppress the KeyboardInterrupt."""
+    # A signal before uvicorn has installed its handlers raises KeyboardInterrupt.
     with contextlib.suppress(KeyboardInterrupt), sigterm_interrupts():
         yield
 
@@ -31,15 +31,15 @@ def bound(host: str, number: int) -> socket.socket:
     """Return a socket that listens.
 
     Raises:
-        OSError: The port is in use, or there is no such interface.
+        OSError: The port is in use, or the interface does not exist.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio sends small messages at once only on sockets that say they are TCP; others wait for the peer, up to 40 ms.
+    # asyncio sets TCP_NODELAY only on sockets that name IPPROTO_TCP; on others a small message waits up to 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, number))
-        listener.listen()  # before the link is printed: whoever is quick waits, and is not refused
+        listener.listen()  # before the link is printed, so that an early connection waits instead of being refused
     except OSError as error:
         listener.close()
         raise OSError(
@@ -56,14 +56,14 @@ async def serve(
     *,
     lifespan: bool = True,
 ) -> None:
-    """Serve until SIGINT or SIGTERM. What takes longer is broken off then, and a warning says what it was.
+    """Serve until SIGINT or SIGTERM. Requests that do not finish then are cancelled, and a warning names each.
 
     Args:
-        application: What to serve.
-        listener: Where.
-        started: Called when Ctrl-C ends it in good order.
-        ended: Ends it, too.
-        lifespan: Whether the application's lifespan is that of the server; else it is the caller's.
+        application: The application to serve.
+        listener: A listening socket.
+        started: Callback invoked once Ctrl-C ends the server cleanly.
+        ended: Event that ends the server, too.
+        lifespan: Whether the server runs the application's lifespan; otherwise the caller does.
     """
     requests = RunningRequests(application)
     config = uvicorn.Config(
@@ -85,13 +85,13 @@ async def serve(
                 started()
 
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-            breaking_off = asyncio.get_running_loop().call_later(
-                _FINISHING_S, requests.break_off, self.server_state.connections
+            cancelling = asyncio.get_running_loop().call_later(
+                _FINISHING_S, requests.cancel, self.server_state.connections
             )
             try:
                 await super().shutdown(sockets)
             finally:
-                breaking_off.cancel()
+                cancelling.cancel()
 
     server = Server(config)
 
@@ -104,7 +104,7 @@ async def serve(
         await server.serve(sockets=[listener])
         await asyncio.sleep(0)
     except asyncio.CancelledError:
-        # uvicorn repeats the signal that ended it, and what asyncio makes of it must not break off the closing.
+        # uvicorn raises the signal that ended it again, and asyncio's cancellation must not interrupt the clean-up.
         task = asyncio.current_task()
         if task is None or task.uncancel():
             raise

@@ -1,4 +1,4 @@
-"""Requests that are being answered when their server ends: each is broken off in good order, without a traceback."""
+"""Requests that are still running when their server ends: each is cancelled cleanly, without a traceback."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class _Request:
     task: asyncio.Task[Any]
     scope: Scope
     begun: bool = False
-    """Whether its answer has begun."""
+    """Whether its response has begun."""
     answered: bool = False
-    """Whether it has been sent whole."""
+    """Whether its response has been sent completely."""
 
 
 class RunningRequests:
-    """An ASGI application that passes everything on to another one, and knows what runs.
+    """ASGI middleware that tracks running requests.
 
     Args:
-        application: The other one.
+        application: The wrapped application.
     """
 
     def __init__(self, application: ASGIApp) -> None:
@@ -40,11 +40,11 @@ class RunningRequests:
         self._running: set[_Request] = set()
         self._connections: Iterable[Any] | None = None
 
-    def break_off(self, connections: Iterable[Any]) -> None:
-        """Break off what runs, and warn of it.
+    def cancel(self, connections: Iterable[Any]) -> None:
+        """Cancel the running requests, and log a warning for each.
 
         Args:
-            connections: Those of uvicorn, to cut the ones that wait for the rest of an answer.
+            connections: uvicorn's connections, of which those that wait for the rest of a response are aborted.
         """
         self._connections = list(connections)
         for request in self._running:
@@ -74,7 +74,7 @@ class RunningRequests:
         except asyncio.CancelledError:
             if self._connections is None:
                 raise
-            # The task has nothing left to do but what follows; what leaves it uvicorn would show as a failure.
+            # Nothing else is left to do in this task, and uvicorn would log an escaping error as a failure.
             task.uncancel()
             await self._end(request, receive, send)
         finally:
@@ -85,12 +85,12 @@ class RunningRequests:
         if request.answered:
             return
         if http and not request.begun:
-            said = {"code": "ended", "message": "The console ended before this was done.", "hint": ""}
-            await JSONResponse({"error": said}, 503)(request.scope, receive, send)
+            error = {"code": "ended", "message": "The console ended before the request was complete.", "hint": ""}
+            await JSONResponse({"error": error}, 503)(request.scope, receive, send)
             return
         for connection in self._connections or ():
             if connection.client == request.scope["client"]:
                 connection.transport.abort()
-        # Of an answer that has begun uvicorn says that it was not completed, unless its connection has gone by then.
+        # uvicorn logs a response that has begun as incomplete, unless its connection has closed by then.
         while http and (await receive())["type"] != "http.disconnect":
             pass

@@ -1,4 +1,4 @@
-"""What ends or fails a server that a command runs: its start, signals, and the end of standard input."""
+"""Events of a server that a command runs: its start, signals, and the end of standard input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Event", "Events", "Starter", "next_event", "stop_on_signals", "watch_input"]
 
-# A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
+# Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.
 _WAIT_S = 0.1 if sys.platform == "win32" else None
 
 
@@ -34,7 +34,7 @@ Events: TypeAlias = "queue.SimpleQueue[Event]"  # unlike a threading.Event, it m
 
 
 class Starter(threading.Thread):
-    """Opens the server off the main thread, which so sees a signal at once, whatever is being compiled.
+    """Starts the server off the main thread, which can thus handle a signal while a model compiles.
 
     Attributes:
         error: What went wrong, or None.
@@ -47,7 +47,7 @@ class Starter(threading.Thread):
         self._events = events
 
     def run(self) -> None:
-        """Start the server, and say that it is done."""
+        """Start the server, and queue `Event.STARTED`."""
         try:
             self._server.start()
         except Exception as error:  # noqa: BLE001 - raised again by the main thread
@@ -63,26 +63,26 @@ def next_event(events: Events) -> Event:
 
 
 def stop_on_signals(events: Events, *, ignore_interrupt: bool) -> None:
-    """Let SIGTERM, Ctrl-C and a closed terminal be events.
+    """Queue `Event.STOP` on SIGTERM, Ctrl-C and a closed terminal.
 
     Args:
-        events: Where they go.
-        ignore_interrupt: Whether Ctrl-C is for another process.
+        events: The queue.
+        ignore_interrupt: Whether to ignore Ctrl-C, because it is meant for another process.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
         events.put(Event.STOP)
 
-    # Ctrl-C reaches all processes of a terminal, but is meant for the one that a user runs and that holds our input.
+    # Ctrl-C reaches all processes of a terminal, but is meant for the one that started this server.
     signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else stop)
     signal.signal(signal.SIGTERM, stop)
     hangup = getattr(signal, "SIGHUP", None)
-    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored
+    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup ignores it
         signal.signal(hangup, stop)
 
 
 def watch_input(events: Events) -> None:
-    """Wait for the end of standard input, which is an event; in a thread of its own."""
+    """Wait for the end of standard input and queue `Event.STOP`; runs in its own thread."""
     # Not through sys.stdin, whose lock this thread would still hold when the interpreter ends.
     with contextlib.suppress(OSError):  # there is no standard input
         while read_aside(0, 4096):

@@ -1,4 +1,4 @@
-"""Single keys from the terminal, as they are pressed and without waiting for them."""
+"""Single keys from the terminal, read as they are pressed and without waiting."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOST = 1024
 
 @contextlib.contextmanager
 def terminal_keys() -> Generator[Callable[[], str]]:
-    """Yield what returns the characters that were typed since its last call; the terminal is as before afterwards.
+    """Yield a function that returns the characters typed since its last call; restore the terminal afterwards.
 
     Raises:
         CommandError: Standard input is not a terminal.

@@ -1,4 +1,4 @@
-"""A play session that goes on while a command watches, live or stepped by the command: for `record` and `view`."""
+"""Running a play session while a command watches, live or stepped by the command: for `record` and `view`."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from urlab_client.protocol.messages.streams import ClientEvent, PlayEnded, Serve
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
 
-__all__ = ["go_on", "interruptible"]
+__all__ = ["interruptible", "run_session"]
 
 _LOOK_S = 0.05
 _AWAY_S = 5.0
-"""How long a server may be away."""
+"""How long a server may be unreachable."""
 
 
 @contextlib.contextmanager
 def interruptible() -> Generator[asyncio.Event]:
-    """Give an event that Ctrl-C sets while the block runs, instead of interrupting it."""
+    """Yield an event that Ctrl-C sets while the block runs, instead of interrupting it."""
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    # Not the loop's own way, which Windows lacks.
+    # Event loops on Windows have no add_signal_handler.
     before = signal.signal(signal.SIGINT, lambda _number, _frame: loop.call_soon_threadsafe(stop.set))
     try:
         yield stop
@@ -35,7 +35,7 @@ def interruptible() -> Generator[asyncio.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-async def go_on(
+async def run_session(
     client: URLabClient,
     seconds: float | None,
     *,
@@ -47,12 +47,12 @@ async def go_on(
     Args:
         client: The client.
         seconds: Simulated seconds; None for no limit.
-        over: Whether to end before.
-        progress: Told how many seconds have passed.
+        over: Callback that returns whether to end early.
+        progress: Callback invoked with the number of simulated seconds that have passed.
 
     Raises:
-        CommandError: Play has ended, or the server is gone or another one.
-        URLabError: The server refused, or does not answer.
+        CommandError: Play has ended, or the server is gone or has restarted.
+        URLabError: The server refused a request, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
     clock = _Clock(client, known=direct)
@@ -75,14 +75,14 @@ async def go_on(
 async def _step(client: URLabClient) -> None:
     try:
         await client.step()
-    except (OutcomeUnknown, URLabTimeoutError):  # a connection that broke, a machine that was suspended
+    except (OutcomeUnknown, URLabTimeoutError):  # the connection broke, or the machine was suspended
         found = await client.resync()
         if not (found.session_held and found.playing):
             raise CommandError("the server restarted, or another client took the session over") from None
 
 
 class _Clock:
-    """How much simulation time has passed, from the first state on where the client knows no time yet."""
+    """Simulation time since the start, or since the first state if the client has none yet."""
 
     def __init__(self, client: URLabClient, *, known: bool) -> None:
         self._client = client
@@ -101,14 +101,14 @@ class _Clock:
 
 
 class _Watch:
-    """Looks out for what ends live mode for a client that only watches, and would otherwise wait for ever."""
+    """Detects events that end live mode, after which a client that only watches would wait forever."""
 
     def __init__(self, events: Stream[ClientEvent]) -> None:
         self._events = events
         self._lost_at: float | None = None
 
     def check(self) -> None:
-        """Raise why nothing more will come."""
+        """Raise an error if no further state will arrive."""
         now = asyncio.get_running_loop().time()
         while (event := self._events.receive_nowait()) is not None:
             match event:
@@ -123,4 +123,4 @@ class _Watch:
                 case _:
                     pass
         if self._lost_at is not None and now - self._lost_at > _AWAY_S:
-            raise CommandError(f"the server has been away for {_AWAY_S:g} s")
+            raise CommandError(f"the server has been unreachable for {_AWAY_S:g} s")

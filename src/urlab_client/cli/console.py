@@ -1,4 +1,4 @@
-"""`urlab console`: a page in the browser to see and touch a simulation."""
+"""`urlab console`: a page in the browser that shows a simulation and lets people interact with it."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def add_parser(commands: Commands) -> None:
         "console",
         help="show a simulation in the browser, and interact with it",
         description="Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
-        "print a link that admits one browser. The page can create more links. Ends with exit code 0 on SIGINT "
+        "print a link that admits one browser. The page can create more links. Exits with code 0 on SIGINT "
         "(Ctrl-C) and SIGTERM.",
         examples=(
             ("urlab console", "the server on this machine, at a link for your browser"),
             ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
             ("urlab console --port 0", "any free port for the page"),
-            ("urlab console --handshake robot.hello", "watch beside the client that drives"),
+            ("urlab console --handshake robot.hello", "watch alongside the driving client"),
         ),
     )
     add_address(parser)
@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: PageArguments) -> int:
-    """Serve the page until told to stop.
+    """Serve the page until stopped.
 
     Raises:
         CommandError: An option cannot be honoured, or the `web` extra is not installed.
@@ -60,9 +60,9 @@ def run(arguments: PageArguments) -> int:
         raise CommandError(f"{error.name or error} is not installed; run: {install_command('web')}") from None
     check_page(arguments)
     import_mujoco()
-    from urlab_client.cli._pages import ending_well  # noqa: PLC0415
+    from urlab_client.cli._pages import graceful_exit  # noqa: PLC0415
 
-    with ending_well():
+    with graceful_exit():
         asyncio.run(_serve(arguments))
     return 0
 
@@ -76,7 +76,7 @@ async def _serve(arguments: PageArguments) -> None:
     from urlab_client.web import Access, app  # noqa: PLC0415
 
     access = Access(hosts=host_names(arguments))
-    # Each camera is streamed while somebody watches it.
+    # Each camera is streamed while a browser shows it.
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with bound(arguments.host, arguments.port) as listener:

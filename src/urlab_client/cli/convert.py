@@ -1,4 +1,4 @@
-"""`urlab convert`: a recording as a table, arrays, a video or a LeRobot dataset."""
+"""`urlab convert`: convert a recording to a table, arrays, a video or a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
 
 
 class ConvertArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     recording: Path
     output: Path
@@ -43,9 +43,9 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "convert",
         help="turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
-        description="Convert a recording. CSV, Parquet and LeRobot hold states with "
-        "the actions taken at them; NumPy all states; MP4 the pictures of one camera. Needs the extra "
-        "'urlab-client[mcap]'; Parquet 'dataset', MP4 'video', besides.",
+        description="Convert a recording. CSV, Parquet and LeRobot files hold states with the actions taken at them, "
+        "NumPy files all states, and MP4 files the pictures of one camera. Needs the extra 'urlab-client[mcap]', for "
+        "Parquet also 'dataset', and for MP4 also 'video'.",
         examples=(
             ("urlab convert run.mcap run.csv", "states as a table"),
             ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
@@ -56,10 +56,10 @@ def add_parser(commands: Commands) -> None:
         "recording",
         type=Path,
         metavar="FILE",
-        help="a .mcap file, or a .json file of the server",
+        help="a .mcap file, or a server's .json recording",
     )
-    parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending says the format")
-    parser.add_argument("--format", choices=_FORMATS, help="the format, where the ending does not say it")
+    parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending selects the format")
+    parser.add_argument("--format", choices=_FORMATS, help="the format, if the ending does not select it")
     parser.add_argument(
         "--camera",
         action="append",
@@ -72,24 +72,24 @@ def add_parser(commands: Commands) -> None:
         "--episodes",
         choices=("kept", "success", "all"),
         default="kept",
-        help="of marked episodes in tables and LeRobot datasets those that were not discarded, successes, or all "
-        "(default: %(default)s)",
+        help="which marked episodes to write to tables and LeRobot datasets: those that were not discarded, successes, "
+        "or all (default: %(default)s)",
     )
     lerobot = parser.add_argument_group("LeRobot datasets")
     lerobot.add_argument(
-        "--fps", type=count, metavar="N", help="frames per second; the rate of the pictures or states by default"
+        "--fps", type=count, metavar="N", help="frames per second (default: the rate of the pictures or states)"
     )
     lerobot.add_argument("--task", default="", metavar="TEXT", help="what the robot does")
-    lerobot.add_argument("--robot-type", metavar="TEXT", help="kind of robot; the articulations' names by default")
+    lerobot.add_argument("--robot-type", metavar="TEXT", help="kind of robot (default: the articulations' names)")
     lerobot.add_argument("--images", action="store_true", help="store pictures as PNG files instead of video")
     lerobot.add_argument(
         "--max-picture-age",
         type=seconds,
         metavar="SECONDS",
-        help="how old a picture may be beside its state; one frame by default",
+        help="how much older than its state a picture may be (default: one frame)",
     )
     lerobot.add_argument(
-        "--python", metavar="PATH", help="an interpreter that has LeRobot; it is not needed in this one"
+        "--python", metavar="PATH", help="a Python interpreter that has LeRobot; this one does not need it"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUTPUT if it exists")
     parser.set_defaults(run=run)
@@ -120,7 +120,9 @@ def run(arguments: ConvertArguments) -> int:
         raise CommandError(str(error.args[0])) from None
     print(f"{arguments.output}  {written} {what}")
     if recording.damage:
-        print(f"{arguments.recording} was not finished, or is damaged: what comes before is in it ({recording.damage})")
+        print(
+            f"{arguments.recording} is unfinished or damaged; everything before that was written ({recording.damage})"
+        )
     return 0
 
 

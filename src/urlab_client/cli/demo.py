@@ -1,6 +1,6 @@
-"""`urlab demo`: a level authored, a robot driven through both clients, and what came of it on disk.
+"""`urlab demo`: author a level, drive a robot through both clients, and write the results to disk.
 
-Starts a simulated server of its own, so it needs nothing but this package, or drives one that runs already.
+The demo starts its own simulated server, so it needs only this package, or uses a running server.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _REPORT_EVERY = 20  # steps between two updates of the progress bar
 
 
 class DemoArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     model: str
     address: str | None
@@ -64,14 +64,14 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "demo",
         help="drive a robot end to end; keep a plot, a picture and the configuration",
-        description="Start a simulated server, or take one that runs already, author levels, drive a robot through "
-        "the blocking client and two of them through the async client, and write joints.png, last_state.png and "
-        "run.json. Needs the extra 'urlab-client[demo]'.",
+        description="Start a simulated server, or use a running one, author levels, drive one robot through the "
+        "blocking client and two robots through the async client, and write joints.png, last_state.png and run.json. "
+        "Needs the extra 'urlab-client[demo]'.",
         examples=(
             ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
             ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
             ("urlab demo arm --no-render", "without a picture of the last state"),
-            ("urlab demo robot.xml --address tcp://lab-7", "on a server that runs already, whose play session it ends"),
+            ("urlab demo robot.xml --address tcp://lab-7", "on a running server, whose play session it ends"),
         ),
     )
     parser.add_argument(
@@ -85,9 +85,9 @@ def add_parser(commands: Commands) -> None:
         "--address",
         type=running_address,
         metavar="ADDRESS",
-        help="HOST[:PORT], tcp://HOST[:PORT] or ipc://PATH of a server that runs already (default: start one). Play "
-        "ends there, and levels of the demo's own are opened; a model that is not on its disk is uploaded, if it "
-        "takes models",
+        help="HOST[:PORT], tcp://HOST[:PORT] or ipc://PATH of a running server (default: start one). The demo ends "
+        "play there and opens its own levels; it uploads a model that is not on the server's disk, if the server "
+        "accepts uploads",
     )
     add_ports(parser, state=False)
     add_keys(parser)
@@ -102,7 +102,7 @@ def add_parser(commands: Commands) -> None:
         metavar="N",
         help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
     )
-    parser.add_argument("--no-render", action="store_true", help="draw no picture of the last state")
+    parser.add_argument("--no-render", action="store_true", help="do not draw the picture of the last state")
     parser.set_defaults(run=run, mjcf_options=False)
 
 
@@ -110,9 +110,9 @@ def run(arguments: DemoArguments) -> int:
     """Run the demonstration.
 
     Raises:
-        CommandError: The model or the output folder cannot be used, or the server cannot be given the model.
+        CommandError: The model or the output folder cannot be used, or the server cannot load the model.
         MissingExtra: A library is missing.
-        URLabError: The server refused something.
+        URLabError: The server refused a request.
     """
     need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
@@ -142,7 +142,7 @@ def run(arguments: DemoArguments) -> int:
 
 @contextlib.contextmanager
 def _warnings_of(robot: RobotFile) -> Generator[None]:
-    """Keep quiet about bundled robots: their only warning is about the floor that each copy brings."""
+    """Hide the server's warnings about bundled robots: the only one is about the floor in each copy."""
     logger = logging.getLogger("urlab_client.server")
     before = logger.level
     if robot.bundled:
@@ -164,7 +164,7 @@ def _writable(folder: Path) -> Path:
 
 
 class _Probed(Exception):
-    """Takes a probe back."""
+    """Raised to discard the probe file."""
 
 
 def _progress(console: Console) -> Progress:
@@ -175,7 +175,7 @@ def _progress(console: Console) -> Progress:
 
 
 def _bar(progress: Progress, description: str, steps: int) -> Callable[[], None]:
-    """Return what to call after each step."""
+    """Return a callback to invoke after each step."""
     bar = progress.add_task(description, total=steps)
     done = 0
 

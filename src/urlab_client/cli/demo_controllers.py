@@ -1,4 +1,4 @@
-"""What moves the demo's robots: set-points from the simulation time and the robot's state."""
+"""Controllers of the demo's robots: set-points from the simulation time and the robot's state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOTHING_DRIVEN = "0 actuators: nothing is driven"
 
 
 class DemoRobot(Protocol):
-    """What a demo controller uses of an articulation of either flavour."""
+    """The part of an articulation, of either flavour, that a demo controller uses."""
 
     @property
     def joints(self) -> Mapping[str, Joint]:
@@ -63,7 +63,7 @@ class DemoController(Protocol):
 
     @property
     def settings(self) -> dict[str, object]:
-        """What it does, for the record."""
+        """The controller's settings, for `run.json`."""
         ...
 
     def act(self, time: float) -> None:
@@ -72,9 +72,9 @@ class DemoController(Protocol):
 
 
 def make_demo_controller(robot: RobotFile, articulation: DemoRobot, turn: float = 0.0) -> DemoController:
-    """Return a controller: a trot that `turn` bends for the bundled quadruped, a gentle swing for other robots.
+    """Return a controller: a trot that `turn` steers for the bundled quadruped, a gentle swing for other robots.
 
-    A robot without actuators gets one that does nothing and says so.
+    A robot without actuators gets a controller that does nothing.
     """
     if not articulation.actuators:
         return NoController()
@@ -96,7 +96,7 @@ class NoController:
 
 
 class TrotController:
-    """Lets the bundled quadruped trot: diagonal pairs of feet take turns, torques pull the joints after them.
+    """Makes the bundled quadruped trot: diagonal pairs of feet take turns, and torques move the joints.
 
     A foot moves straight back on the ground and in an arc forward through the air; the leg's two equal links give the
     joint angles in closed form.
@@ -122,11 +122,11 @@ class TrotController:
     SIDES = np.array([-1.0, 1.0, -1.0, 1.0])
 
     def __init__(self, robot: DemoRobot, turn: float = 0.0) -> None:
-        """Take a robot that stands.
+        """Control a standing robot.
 
         Args:
             robot: The bundled quadruped.
-            turn: How much longer the strides of the right legs are than average, as a share; bends the way left.
+            turn: How much longer the strides of the right legs are than average, as a share; positive turns left.
         """
         self._robot = robot
         self._turn = turn
@@ -173,7 +173,7 @@ class TrotController:
 
 
 class SineController:
-    """Moves each actuator gently to and fro, inside its control range and each at a phase of its own."""
+    """Moves each actuator gently back and forth within its control range, each with its own phase."""
 
     HERTZ = 0.5
     SHARE = 0.2
@@ -183,10 +183,10 @@ class SineController:
     RAMP_S = 1.0
     """Seconds until the full amplitude."""
     PHASE_STEP = math.pi * (3 - math.sqrt(5))
-    """Golden angle: no two actuators are ever in step."""
+    """Golden angle: no two actuators are ever in phase."""
 
     def __init__(self, robot: DemoRobot, centre: Mapping[str, float]) -> None:
-        """Take a robot at rest.
+        """Control a robot that starts at rest.
 
         Args:
             robot: The robot.

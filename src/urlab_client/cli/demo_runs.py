@@ -1,4 +1,4 @@
-"""The two runs of `urlab demo`: one robot through the blocking client, two at once through the async one."""
+"""The two runs of `urlab demo`: one robot through the blocking client, and two robots through the async client."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Client: TypeAlias = URLabClient | aio.URLabClient
 Advance = Callable[[], None]
 """Called after each step."""
 
-_PART_WAYS = (-0.4, 0.4)  # the robot on the right walks to the right
+_TURNS = (-0.4, 0.4)  # the robot on the right walks to the right
 _FREE = 0
 _UNITS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 
@@ -43,7 +43,7 @@ class Pose(Struct):
 
 
 class Outcome(Struct):
-    """How a run went; times in seconds."""
+    """Result of a run; times in seconds."""
 
     client: str
     level: str
@@ -57,11 +57,11 @@ class Outcome(Struct):
 
 
 class DemoRun:
-    """What a run leaves.
+    """A finished run.
 
     Attributes:
-        outcome: How it went.
-        controllers: What drove the robots.
+        outcome: The result.
+        controllers: The controllers that drove the robots.
         trace: Joint positions of the first robot.
         model: The model.
         data: The last state.
@@ -116,7 +116,7 @@ def drive_one(server: DemoServer, steps: int, advance: Advance) -> DemoRun:
 
 
 async def drive_two(server: DemoServer, steps: int, advance: Advance) -> DemoRun:
-    """Author a level with two robots and drive each from a task of its own, through one async client."""
+    """Author a level with two robots and drive each from its own task, through one async client."""
     robot = server.robot
     async with server.connect(aio.URLabClient) as client:
         await client.discover()
@@ -127,7 +127,7 @@ async def drive_two(server: DemoServer, steps: int, advance: Advance) -> DemoRun
 
         arts = [client.articulations_by_id[name] for name in _ids(robot, 2)]
         recorder = _Recorder(arts[0], steps)
-        controllers = [make_demo_controller(robot, art, turn) for art, turn in zip(arts, _PART_WAYS, strict=True)]
+        controllers = [make_demo_controller(robot, art, turn) for art, turn in zip(arts, _TURNS, strict=True)]
         both = asyncio.Barrier(len(controllers))
 
         async def drive(controller: DemoController) -> None:
@@ -154,7 +154,7 @@ async def drive_two(server: DemoServer, steps: int, advance: Advance) -> DemoRun
 
 
 class _Recorder:
-    """Notes the positions of a robot: hinges, slides, and where its base is."""
+    """Records a robot's positions: hinges, slides and base."""
 
     def __init__(self, robot: DemoRobot, steps: int) -> None:
         self._robot = robot
@@ -171,13 +171,13 @@ class _Recorder:
         self._count = 0
 
     def note(self, sim_time: float) -> None:
-        """Note the positions after a step."""
+        """Record the positions after a step."""
         self._times[self._count] = sim_time
         self._values[self._count] = self._robot.qpos_array[self._columns]
         self._count += 1
 
     def trace(self, title: str) -> Trace:
-        """Return what was noted."""
+        """Return the recorded positions."""
         return Trace(title, self._times[: self._count], self._values[: self._count], self._quantities)
 
     def _add(self, label: str, names: Sequence[str], offsets: Sequence[int]) -> None:

@@ -1,4 +1,4 @@
-"""Which server `urlab demo` drives, and making one that runs already ready for it."""
+"""The server that `urlab demo` drives: one that it starts, or a running one that it prepares."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class DemoServer:
 
     Attributes:
         connect: Makes a client for it.
-        robot: The robot as this server is to be given it.
+        robot: The robot, with a file that this server can load.
     """
 
     connect: Connect
@@ -60,11 +60,11 @@ def started_server(robot: RobotFile, dialect: DialectName) -> Generator[DemoServ
 
 @contextlib.contextmanager
 def running_server(robot: RobotFile, address: str, arguments: ServerArguments) -> Generator[DemoServer]:
-    """Make a server that runs already ready: end play, empty the demo's levels, see how it is given the model.
+    """Prepare a running server: end play, empty the demo's levels, and find a way to send it the model.
 
     Raises:
-        CommandError: It cannot author levels, or cannot be given the model.
-        URLabError: It refused something, or does not answer.
+        CommandError: The server cannot author levels, or cannot load the model.
+        URLabError: The server refused a request, or does not answer.
     """
 
     def connect(flavour: Callable[..., C]) -> C:
@@ -83,7 +83,7 @@ def running_server(robot: RobotFile, address: str, arguments: ServerArguments) -
 
 
 def _empty(client: URLabClient, level: str) -> None:
-    """Remove what an earlier demonstration, maybe of another robot, has left in one of its levels."""
+    """Remove what an earlier demo, perhaps of another robot, left in one of its levels."""
     try:
         client.scene.create_level(level)
     except CreateLevelFailed:
@@ -95,7 +95,7 @@ def _empty(client: URLabClient, level: str) -> None:
 
 
 def _placeable(client: URLabClient, robot: RobotFile, address: str, folder: Path) -> RobotFile:
-    """Return the robot by a file that `apply_scene` can bring to a server."""
+    """Return the robot with a file that `apply_scene` can send to the server."""
     files = [robot.path, *([bundled_models()["floor"]] if robot.needs_floor else [])]
     try:
         for file in files:
@@ -103,10 +103,10 @@ def _placeable(client: URLabClient, robot: RobotFile, address: str, folder: Path
     except ImportFailed as refusal:
         if not client.server.features.uploads:
             raise CommandError(
-                f"{address}: this server takes no models over the wire, so {' and '.join(map(str, files))} must be "
-                f"where it can read them: {one_line(refusal)}"
+                f"{address}: this server does not accept uploads, so {' and '.join(map(str, files))} must be where it "
+                f"can read them: {one_line(refusal)}"
             ) from None
-        # An uploaded model replaces the one before, so robot and floor go as one.
+        # An uploaded model replaces the previous one, so robot and floor are uploaded as one.
         return replace(robot, path=_with_floor(robot, folder), needs_floor=False) if robot.needs_floor else robot
     return robot
 

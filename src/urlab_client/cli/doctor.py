@@ -35,7 +35,7 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 
 class DoctorArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     address: str
     step_mode: StepMode
@@ -48,13 +48,13 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "doctor",
         help="find out why a robot does not move",
-        description="Check a server from its sockets to the set-points, and say what keeps robots from moving. This "
+        description="Check a server from its sockets to the set-points, and show what keeps robots from moving. This "
         "opens a session, which takes the server over from the client that drives it, unless you pass --handshake; in "
         "your own program, client.explain() does the same. Exit code 0 if nothing is wrong, 1 if something is.",
         examples=(
             ("urlab doctor", "the server on this machine"),
             ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
-            ("urlab doctor --step-mode direct --json", "as a program that steps would find it, as JSON"),
+            ("urlab doctor --step-mode direct --json", "for a program that steps; print JSON"),
         ),
     )
     add_address(parser)
@@ -91,11 +91,11 @@ async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
         arguments.address,
         arguments,
         step_mode=arguments.step_mode,
-        # Promoting the server would mend what is to be found.
+        # Promoting the server would repair a fault that the diagnosis has to find.
         auto_promote_step_mode=False,
         rcv_timeout_ms=round(arguments.timeout * 1000),
     )
     async with client:
-        with contextlib.suppress(URLabError):  # the diagnosis says it
+        with contextlib.suppress(URLabError):  # the diagnosis reports it
             await client.discover(handshake=handshake(arguments))
         return await client.explain()

@@ -1,4 +1,4 @@
-"""`urlab evaluate`: how good a policy is, over many seeded episodes."""
+"""`urlab evaluate`: measure a policy over many seeded episodes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MOST_COPIES: Final = 64
 
 
 class EvaluateArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     policy: Path
     task: str | None
@@ -53,32 +53,38 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "evaluate",
         help="measure how good a policy is, with confidence intervals",
-        description="Run a policy for many episodes, each with a seed of its own, and print its success rate with "
-        "Wilson's score interval, and its return with a bootstrap interval. With --task the network maps observations "
-        "of a registered task to actions, as learning libraries export it; of one that observes pictures, its inputs "
-        "have the names of what is observed, such as 'arm/qpos' or 'cameras/arm/overview'. Without, a TOML file beside "
-        "it declares what it sees, as for run-policy, and a success is an episode without a fall. Needs the extra "
-        "'urlab-client[onnx]', and with --task 'urlab-client[gym]'.",
+        description="Run a policy for many episodes, each with its own seed, and print its success rate with Wilson's "
+        "score interval, and its return with a bootstrap interval. With --task, the network maps observations of a "
+        "registered task to actions, as learning libraries export it; if the task observes pictures, the network's "
+        "inputs are named after the observations, such as 'arm/qpos' or 'cameras/arm/overview'. Without --task, a TOML "
+        "file beside the network declares what it observes, as for run-policy, and an episode without a fall is a "
+        "success. Needs the extra 'urlab-client[onnx]', and with --task also 'urlab-client[gym]'.",
         examples=(
             ("urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100", "on a task, in a batch"),
-            ("urlab evaluate walk.onnx --randomise", "walk.toml beside it; masses, friction and others vary a little"),
+            (
+                "urlab evaluate walk.onnx --randomise",
+                "on the robot of walk.toml, with small variations of masses, friction and more",
+            ),
             (
                 "urlab evaluate walk.onnx --randomise go.toml --json",
-                "as a file declares; all episodes as JSON",
+                "vary as a file declares; all episodes as JSON",
             ),
         ),
     )
     parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
     parser.add_argument("--task", metavar="ID", help="a registered task, such as urlab/Reach-v0")
     parser.add_argument(
-        "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
+        "--declaration",
+        type=Path,
+        metavar="FILE",
+        help="the .toml file (default: the one beside POLICY with the same name)",
     )
     parser.add_argument(
-        "--robot", metavar="ROBOT", help="an MJCF file or the name of a bundled robot (default: the declaration's)"
+        "--robot", metavar="ROBOT", help="an MJCF file or the name of a bundled robot (default: as declared)"
     )
     parser.add_argument("--episodes", type=count, default=100, metavar="N", help="default: %(default)s")
     parser.add_argument(
-        "--seconds", type=seconds, metavar="S", help="simulated seconds of an episode, without --task (default: 10)"
+        "--seconds", type=seconds, metavar="S", help="simulated seconds per episode, without --task (default: 10)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the evaluation (default: 0)")
     parser.add_argument(
@@ -86,8 +92,8 @@ def add_parser(commands: Commands) -> None:
         nargs="?",
         const=_MODEST,
         metavar="FILE",
-        help="vary the robot from episode to episode as a TOML file declares; without FILE friction by 30 %%, damping "
-        "by 20 %%, masses and strengths by 10 %%, joints at the start by 0.05",
+        help="vary the robot in each episode as a TOML file declares; without FILE, vary friction by 30 %%, damping "
+        "by 20 %%, masses and strengths by 10 %%, and initial joint positions by 0.05",
     )
     parser.add_argument(
         "--confidence", type=float, default=0.95, metavar="P", help="coverage of the intervals (default: %(default)s)"
@@ -102,7 +108,7 @@ def run(arguments: EvaluateArguments) -> int:
     Raises:
         CommandError: An option cannot be used.
         MissingExtra: A library is missing.
-        URLabError: A file is wrong, or the policy does not fit.
+        URLabError: A file is invalid, or the policy does not fit.
     """
     import_mujoco()
     if not 0 < arguments.confidence < 1:
@@ -145,7 +151,7 @@ def _in_task(
 ) -> Evaluation:
     for name in ("robot", "declaration", "seconds"):
         if getattr(arguments, name) is not None:
-            raise CommandError(f"--{name} does not go with --task, which settles it")
+            raise CommandError(f"--{name} cannot be combined with --task, which determines it")
     from gymnasium.vector import AutoresetMode  # noqa: PLC0415
 
     from urlab_client.integrations.gym import TASKS, URLabBatchEnv  # noqa: PLC0415

@@ -23,7 +23,7 @@ _PERIOD = 18.0  # of a dashed line, in line widths
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is drawn in panels of its own.
+    """Columns that share panels.
 
     Attributes:
         label: Axis label with the unit.
@@ -44,7 +44,7 @@ class Trace:
         title: Title of the plot.
         time: Simulation time, seconds, shape (samples,).
         values: Shape (samples, columns).
-        quantities: What the columns are.
+        quantities: Names and units of the columns.
     """
 
     title: str
@@ -95,7 +95,7 @@ def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
 
 
 def _style(place: int, count: int) -> dict[str, Any]:
-    """Return the line of one of several curves in one place: those drawn later leave gaps in which the others show."""
+    """Return the line style of one of several coinciding curves: later ones leave gaps that show the others."""
     if place == 0:
         return {"linewidth": 1.4}
     dash = _PERIOD / count

@@ -1,4 +1,4 @@
-"""`urlab info`: what is in a recording."""
+"""`urlab info`: show what is in a recording."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UNFINISHED = 1
 
 
 class InfoArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     recording: Path
     json: bool
@@ -34,29 +34,29 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "info",
         help="show what is in a recording",
-        description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 when the file was not "
-        "finished, is damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'.",
+        description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 if the file is unfinished "
+        "or damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'.",
         examples=(
             ("urlab info run.mcap", "duration, topics, rates and gaps"),
             ("urlab info run.mcap --json", "the same for programs"),
-            ("urlab info run.mcap --verify", "look for damage, too"),
+            ("urlab info run.mcap --verify", "also look for damage"),
         ),
     )
     parser.add_argument(
         "recording",
         type=Path,
         metavar="FILE",
-        help="a .mcap file, or a .json file of the server",
+        help="a .mcap file, or a server's .json recording",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
-        "--verify", action="store_true", help="read the whole file and compare checksums, not its index alone"
+        "--verify", action="store_true", help="read the whole file and compare checksums, not only its index"
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: InfoArguments) -> int:
-    """Print the summary; return 0 for a whole recording, else 1.
+    """Print the summary; return 0 for a complete recording, else 1.
 
     Raises:
         MissingExtra: A library is missing.
@@ -89,7 +89,7 @@ def _print(summary: Summary) -> None:
     if summary.dropped_states or summary.dropped_frames:
         print(
             f"dropped: {counted(summary.dropped_states, 'state')}, {counted(summary.dropped_frames, 'picture')}, "
-            "which came faster than the file could be written"
+            "which arrived faster than the file could be written"
         )
     if summary.outcomes:
         counts = Counter(mark.outcome for mark in summary.outcomes)
@@ -114,7 +114,7 @@ def _print(summary: Summary) -> None:
 
 
 def _print_varied(summary: Summary) -> None:
-    """Say what varied from episode to episode, and how far."""
+    """Print what varied between episodes, and how much."""
     spans: dict[tuple[str, str], list[float]] = {}
     elements: dict[tuple[str, str], set[str]] = {}
     for episode in summary.varied:

@@ -12,7 +12,7 @@ __all__ = ["add_parser", "run"]
 
 
 class KeysArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     action: str
     names: list[str]
@@ -25,8 +25,8 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "keys",
         help="make and show CURVE keys",
-        description="Make and show CURVE keys. A server that is open to a network needs a key, so that clients know "
-        "it, and one of each client, so that it knows them.",
+        description="Make and show CURVE keys. A server that is open to a network needs a key pair, by which clients "
+        "recognise it, and the public key of each client that it admits.",
         examples=(
             ("urlab keys new server ada", "make keys for a server and for a client called ada"),
             ("urlab keys show server.key", "print a public key"),
@@ -36,8 +36,8 @@ def add_parser(commands: Commands) -> None:
     new = actions.add_parser(
         "new",
         help="make key pairs",
-        description="Make key pairs: NAME.key, which may be given to anybody, and NAME.key_secret, which only its "
-        "owner can read (mode 0600) and which stays on this machine. Files that exist are never overwritten.",
+        description="Make key pairs: NAME.key, which you can give to anyone, and NAME.key_secret, which only its owner "
+        "can read (mode 0600) and which stays on this machine. Existing files are never overwritten.",
         examples=[("urlab keys new server", "server.key and server.key_secret in this folder")],
     )
     new.add_argument("names", nargs="+", metavar="NAME", help="for example server, or the name of a client")

@@ -29,7 +29,7 @@ _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
 
 class McpArguments(PageArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     allow_drive: bool
     allow_edit: bool
@@ -49,13 +49,13 @@ def add_parser(commands: Commands) -> None:
         "mcp",
         help="let an agent look at a simulation, and drive it if you allow that",
         description="Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
-        "--http, at an address on this machine. Without --allow-drive and --allow-edit an agent can only look, and "
-        "takes a running server over from nobody. The console shows what it does; whoever acts there takes the "
-        "controls from the agent. Messages for you, as the console's link, are on standard error. Ends with exit code "
-        "0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM.",
+        "--http, at an address on this machine. Without --allow-drive and --allow-edit, an agent can only look, and "
+        "does not take a running server over from another client. The console shows what the agent does; a person who "
+        "acts there takes the controls from the agent. Messages for you, such as the console's link, go to standard "
+        "error. Exits with code 0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM.",
         examples=(
             ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
-            ("urlab mcp tcp://localhost --handshake robot.hello", "look on beside the client that drives"),
+            ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),
             (
                 "urlab mcp tcp://localhost --allow-drive",
                 "drive a running server; another client's session ends",
@@ -72,80 +72,85 @@ def add_parser(commands: Commands) -> None:
     allowed.add_argument(
         "--take-over",
         action="store_true",
-        help="without those: look at a running server that no other client drives, or end that client's session",
+        help="without these two: open a session on a running server to look at it; ends another client's session",
     )
     allowed.add_argument(
-        "--max-seconds", type=seconds, default=10.0, metavar="S", help="simulation time per call (default: %(default)g)"
+        "--max-seconds",
+        type=seconds,
+        default=10.0,
+        metavar="S",
+        help="simulated seconds per call (default: %(default)g)",
     )
     allowed.add_argument(
-        "--max-wall", type=seconds, default=60.0, metavar="S", help="time on the wall per call (default: %(default)g)"
+        "--max-wall", type=seconds, default=60.0, metavar="S", help="wall-clock seconds per call (default: %(default)g)"
     )
     allowed.add_argument(
         "--step-mode",
         type=one_of(StepMode.LIVE, StepMode.DIRECT),
         metavar="MODE",
-        help="direct: time passes only while a tool lets it; live (default: direct with --allow-drive, else as it is)",
+        help="direct: time passes only while a tool steps; live: physics runs by itself (default: with --allow-drive "
+        "direct, otherwise unchanged)",
     )
     allowed.add_argument(
         "--models",
         type=Path,
         metavar="FOLDER",
-        help="folder of MJCF files that may be imported by name, besides the robots that are included",
+        help="folder of MJCF files that may be imported by name, besides the bundled robots",
     )
     add_page(parser, AGENT_PORT)
     parser.add_argument(
         "--http",
         action="store_true",
-        help="serve streamable HTTP at /mcp, for whoever brings the printed token, or one of "
-        f"those in ${_TOKEN}, separated by spaces; without it the console's port is any free one unless you name one",
+        help="serve streamable HTTP at /mcp, to clients that present the printed token, or one of those in "
+        f"${_TOKEN}, separated by spaces; without --http, the console uses any free port unless you pass --port",
     )
     parser.add_argument(
         "--agents",
         type=count,
         default=1,
         metavar="N",
-        help=f"with --http: print so many tokens, one for each agent, unless ${_TOKEN} has them; one agent drives at a "
-        "time (default: %(default)s)",
+        help=f"with --http: print N tokens, one for each agent, unless ${_TOKEN} has them; one agent drives at a time "
+        "(default: %(default)s)",
     )
-    parser.add_argument("--no-console", dest="console", action="store_false", help="do not show the console")
+    parser.add_argument("--no-console", dest="console", action="store_false", help="do not serve the console")
     parser.set_defaults(run=run)
 
 
 def run(arguments: McpArguments) -> int:
-    """Serve until the input ends, or a signal says so.
+    """Serve until the input ends or a signal arrives.
 
     Raises:
         MissingExtra: The `mcp` extra is not installed.
         CommandError: An option cannot be honoured.
         OSError: The port is in use.
     """
-    import urlab_client.mcp  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # says what is missing
+    import urlab_client.mcp  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # reports a missing extra
 
     check_page(arguments)
-    _check_leave(arguments)
+    _check_permissions(arguments)
     if arguments.models is not None and not arguments.models.is_dir():
-        raise CommandError(f"--models {arguments.models}: there is no such folder")
+        raise CommandError(f"--models {arguments.models}: no such folder")
     import_mujoco()
-    from urlab_client.cli._pages import ending_well  # noqa: PLC0415
+    from urlab_client.cli._pages import graceful_exit  # noqa: PLC0415
 
-    with ending_well():
+    with graceful_exit():
         asyncio.run(_serve(arguments))
     return 0
 
 
-def _check_leave(arguments: McpArguments) -> None:
-    """Refuse options that contradict each other, and to end another client's session just for looking."""
+def _check_permissions(arguments: McpArguments) -> None:
+    """Refuse contradictory options, and refuse to end another client's session only to look."""
     if arguments.agents > 1 and not arguments.http:
-        raise CommandError("--agents is for --http: on standard input and output there is one agent")
+        raise CommandError("--agents requires --http: standard input and output serve one agent")
     takes = arguments.allow_drive or arguments.allow_edit or arguments.take_over
     if arguments.handshake is not None and takes:
-        raise CommandError("--handshake is for an agent that only looks on: leave out --allow-… and --take-over")
+        raise CommandError("--handshake is for an agent that only looks: leave out --allow-… and --take-over")
     if arguments.handshake is not None and arguments.step_mode is not None:
-        raise CommandError("--step-mode is the driving client's to choose: leave it out with --handshake")
+        raise CommandError("--step-mode: leave it out with --handshake, because the driving client chooses the mode")
     if arguments.handshake is None and not takes and not arguments.address.startswith("sim://"):
         raise CommandError(
-            f"{arguments.address}: an agent that only looks takes a server over from nobody. Pass --handshake FILE "
-            "to look on beside the client that drives, --take-over if none does, or --allow-drive"
+            f"{arguments.address}: an agent that only looks does not take a server over from another client. Pass "
+            "--handshake FILE to watch alongside the driving client, --take-over if there is none, or --allow-drive"
         )
 
 
@@ -158,7 +163,7 @@ async def _serve(arguments: McpArguments) -> None:
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
-        if arguments.address.startswith("sim://"):  # which fails for good reasons; a server may still come
+        if arguments.address.startswith("sim://"):  # a failure here is final, whereas a running server may start later
             await client.discover()
         console = app(
             client,
@@ -187,7 +192,7 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
     if not arguments.console:
         await serve_stdio(agent)
         return
-    # A second agent on this machine brings a console, too.
+    # A second agent on this machine serves a console, too.
     number = 0 if arguments.port == AGENT_PORT else arguments.port
     with bound(arguments.host, number) as listener:
         served = asyncio.create_task(serve_stdio(agent))
@@ -195,12 +200,12 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
         served.add_done_callback(lambda _: ended.set())
         try:
             url = page_url(arguments, listener.getsockname()[1])
-            await serve(console, listener, lambda: _tell(arguments, url, access), ended, lifespan=False)
+            await serve(console, listener, lambda: _print_link(arguments, url, access), ended, lifespan=False)
         finally:
             served.cancel()
             await asyncio.wait((served,))
     if not served.cancelled():
-        await served  # raises what it failed with
+        await served  # raises its failure
 
 
 async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
@@ -218,13 +223,13 @@ async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette,
             for one in shown:
                 print(f"Agent: {url}/mcp with {one}", file=sys.stderr, flush=True)
             if arguments.console:
-                _tell(arguments, url, access)
+                _print_link(arguments, url, access)
 
         own = Access(hosts=access.hosts, keys=tokens)
         await serve(http_application(agent, console if arguments.console else None, own), listener, started)
 
 
-def _tell(arguments: McpArguments, url: str, access: Access) -> None:
+def _print_link(arguments: McpArguments, url: str, access: Access) -> None:
     link = f"{url}/?token={access.invite()}"
     print(f"Console: {link} (good for one browser); Ctrl-C ends it.", file=sys.stderr, flush=True)
     if arguments.open:
@@ -232,7 +237,7 @@ def _tell(arguments: McpArguments, url: str, access: Access) -> None:
 
 
 def _models(folder: Path | None) -> dict[str, Path]:
-    """Return what can be imported by name: what is in the folder, and the robots that are included."""
+    """Return the models that can be imported by name: those in the folder, and the bundled robots."""
     from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
 
     own = {} if folder is None else {file.stem: file.resolve() for file in sorted(folder.glob("*.xml"))}

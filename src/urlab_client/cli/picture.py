@@ -1,7 +1,7 @@
 """A picture of one simulation state, for `urlab demo`.
 
-Drawn in a child process: the OpenGL library is chosen by an environment variable that MuJoCo reads when it is
-imported, and a broken driver may end the process that loads it. This module is parent and child.
+A child process draws it: MuJoCo reads the environment variable that chooses the OpenGL library when it is imported,
+and a broken driver may crash the process that loads it. This module is both parent and child.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _platforms() -> Sequence[str]:
 
 
 def _draw_in_child(folder: Path, platform: str) -> str | None:
-    """Return None when the picture was drawn, else why not."""
+    """Return None if the picture was drawn, otherwise the reason why not."""
     environment = dict(os.environ)
     if platform:
         environment[_CHOICE] = platform
@@ -109,7 +109,7 @@ def _draw_in_child(folder: Path, platform: str) -> str | None:
     if child.returncode == 0:
         return None
     lines = child.stderr.decode(errors="replace").strip().splitlines()
-    return lines[-1].strip() if lines else f"the renderer ended with code {child.returncode}"
+    return lines[-1].strip() if lines else f"the renderer exited with code {child.returncode}"
 
 
 # What follows runs in the child.

@@ -1,4 +1,4 @@
-"""`urlab ping`: who answers at an address, and how fast."""
+"""`urlab ping`: show which server answers at an address, and how fast."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ REGISTRY_CLIENTS = 16
 
 
 class PingArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     address: str
     timeout: float
@@ -66,7 +66,7 @@ class RoundTrips(Struct):
 
 
 class ArticulationReport(Struct):
-    """One articulation; `joints` and `sensors` are None where the model could not be loaded here."""
+    """One articulation; `joints` and `sensors` are None if the model could not be loaded locally."""
 
     key: str
     actor_id: str
@@ -80,8 +80,8 @@ class ArticulationReport(Struct):
 class PlayReport(Struct):
     """The play session.
 
-    `physics` is `advancing`, `standing still` or None without a model; `step_mode` None where only the client that
-    drives the server knows it.
+    `physics` is `advancing`, `standing still` or None without a model. `step_mode` is None if only the driving client
+    knows it.
     """
 
     state: str
@@ -92,7 +92,7 @@ class PlayReport(Struct):
 
 
 class Identity(Struct):
-    """What a session tells about the server."""
+    """What a session reveals about the server."""
 
     urlab_version: str
     mujoco_version: str
@@ -129,7 +129,7 @@ def add_parser(commands: Commands) -> None:
     add_address(parser)
     add_ports(parser, state=False)
     parser.add_argument(
-        "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="to wait for each reply (default: 2)"
+        "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="how long to wait for each reply (default: 2)"
     )
     parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
     parser.add_argument(
@@ -147,25 +147,25 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: PingArguments) -> int:
-    """Print what is known of the server.
+    """Print a report on the server.
 
     Raises:
         CommandError: The address is malformed.
-        URLabError: Nothing answers, or it answers nonsense.
+        URLabError: No server answers, or its reply is invalid.
     """
     if arguments.all:
         servers = asyncio.run(_registered(arguments))
         print(json.dumps(msgspec.to_builtins(servers)) if arguments.json else _list(servers))
         return 0
     if not arguments.no_session:
-        import_mujoco()  # beforehand, as the event loop had better not wait for it
+        import_mujoco()  # beforehand: a slow import would block the event loop
     report = asyncio.run(_ping(arguments))
     print(json.dumps(msgspec.to_builtins(report)) if arguments.json else _text(report))
     return 0
 
 
 class RegisteredServer(Struct):
-    """A server of the registry; `answers` is None for one on another machine, which is not asked."""
+    """A server of the registry; `answers` is None for a server on another machine, which is not contacted."""
 
     instance_id: str
     address: str
@@ -176,12 +176,12 @@ class RegisteredServer(Struct):
 
 
 async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
-    at_once = asyncio.Semaphore(REGISTRY_CLIENTS)  # entries of servers that are gone would add up their timeouts
+    concurrent = asyncio.Semaphore(REGISTRY_CLIENTS)  # one by one, the timeouts of dead servers would add up
 
     async def server(instance: RegisteredInstance, written: float) -> RegisteredServer:
         local = instance.host in ("", socket.gethostname())
         address = f"tcp://{'127.0.0.1' if local else instance.host}"
-        async with at_once:
+        async with concurrent:
             answers = await _answers(address, instance.step_port, arguments.timeout) if local else None
         return RegisteredServer(
             instance_id=instance.instance_id,
@@ -194,7 +194,7 @@ async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
 
     entries: list[tuple[RegisteredInstance, float]] = []
     for path in sorted(registry_directory().glob("*.json")):
-        with suppress(OSError, ValueError):  # gone meanwhile, or not a server's
+        with suppress(OSError, ValueError):  # deleted meanwhile, or not written by a server
             entries.append((decode(path.read_bytes()), path.stat().st_mtime))
     return await asyncio.gather(*(server(instance, written) for instance, written in entries))
 
@@ -214,13 +214,13 @@ async def _answers(address: str, step_port: int, timeout: float) -> bool:
 def _list(servers: list[RegisteredServer]) -> str:
     if not servers:
         return f"The registry {registry_directory()} lists no servers."
-    said = {True: "answers", False: "does not answer", None: "on another machine"}
+    answer_texts = {True: "answers", False: "does not answer", None: "on another machine"}
     rows = [
         (
             server.instance_id,
             server.address,
             f"pid {server.pid}",
-            said[server.answers] + (", in use" if server.busy else ""),
+            answer_texts[server.answers] + (", in use" if server.busy else ""),
             f"registered {server.seen_s_ago:.0f} s ago",
         )
         for server in servers
@@ -315,7 +315,7 @@ async def _play(client: URLabClient) -> PlayReport:
 async def _pinned_mode(client: URLabClient) -> str | None:
     """Return the mode the server is pinned to; no op reads the mode, but a pinned server names it in its refusal."""
     try:
-        await client.call(SetMode(mode="?"))  # no mode: changes nothing on any server
+        await client.call(SetMode(mode="?"))  # not a mode, so it changes nothing on any server
     except ModeLocked as locked:
         return locked.pinned or "unknown"
     except URLabRPCError:
@@ -327,7 +327,7 @@ def _text(report: Report) -> str:
     rows = [("ops", str(report.ops))]
     server = report.server
     if server is not None:
-        here = "the build here" if server.same_mujoco_build else f"the build here is {server.local_mujoco_version}"
+        here = "same version here" if server.same_mujoco_build else f"{server.local_mujoco_version} here"
         rows = [
             ("URLab", server.urlab_version),
             ("MuJoCo", f"{server.mujoco_version} ({here})"),

@@ -1,4 +1,4 @@
-"""`urlab plot`: curves of a recording as a picture."""
+"""`urlab plot`: draw curves of a recording as a picture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
 
 class PlotArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     recording: Path
     output: Path | None
@@ -50,16 +50,16 @@ def add_parser(commands: Commands) -> None:
         "recording",
         type=Path,
         metavar="FILE",
-        help="a .mcap file, or a .json file of the server",
+        help="a .mcap file, or a server's .json recording",
     )
     parser.add_argument(
         "--joints",
         nargs="+",
         default=["*"],
         metavar="NAME",
-        help="names, with or without ARTICULATION/ before them; * stands for anything (default: all but free bases)",
+        help="names, with or without ARTICULATION/ before them; * matches anything (default: all but free bases)",
     )
-    parser.add_argument("--field", choices=_FIELDS, default="qpos", help="what to draw of them (default: %(default)s)")
+    parser.add_argument("--field", choices=_FIELDS, default="qpos", help="which values to draw (default: %(default)s)")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PICTURE", help="a .png, .pdf or .svg file (default: FILE with .png)"
     )
@@ -70,7 +70,7 @@ def run(arguments: PlotArguments) -> int:
     """Draw.
 
     Raises:
-        CommandError: Nothing has such a name.
+        CommandError: No joint, actuator or sensor has such a name.
         MissingExtra: A library is missing.
     """
     need("matplotlib", extra="demo")
@@ -86,7 +86,7 @@ def run(arguments: PlotArguments) -> int:
     curves: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
     for key, names in _chosen(table, arguments).items():
         owner, column = key.rpartition("/")[0], table.columns[key]
-        places: dict[str, list[int]] = {}  # one axis for what has one unit
+        places: dict[str, list[int]] = {}  # one axis per unit
         for place in map(column.names.index, names):
             places.setdefault(column.quantities[place], []).append(place)
         for quantity, chosen in places.items():

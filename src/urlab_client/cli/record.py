@@ -1,4 +1,4 @@
-"""`urlab record`: a run into a file."""
+"""`urlab record`: record a run to a file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import check_ending
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._output import progress_bar
-from urlab_client.cli._watching import go_on, interruptible
+from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _INCOMPLETE = 1
 
 
 class RecordArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     address: str
     output: Path
@@ -52,12 +52,12 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "record",
-        help="record a running simulation into an MCAP file",
-        description="Record states, poses and pictures of a play session into a file that Foxglove opens. In live mode "
-        "physics runs by itself and is watched; in direct mode this command resets and steps it, with all set-points "
-        "zero or those of the keyframe. Opens a session, which takes the server over from the client that drives it; a "
-        "program of your own can call record(client, FILE). Ctrl-C ends the recording early. Exit code 1 when states "
-        "were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'.",
+        help="record a running simulation to an MCAP file",
+        description="Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, "
+        "physics runs by itself and this command watches; in direct mode, this command resets and steps it, with all "
+        "set-points zero or those of the keyframe. Opens a session, which takes the server over from the client that "
+        "drives it; your own program can call record(client, FILE) instead. Ctrl-C ends the recording early. Exit code "
+        "1 if states were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'.",
         examples=(
             ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
             (
@@ -101,12 +101,12 @@ def run(arguments: RecordArguments) -> int:
         raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
+    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
 
     if arguments.camera and arguments.address.startswith("sim://"):
         from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
 
-        need_backend()  # the server that starts here draws with what this machine has
+        need_backend()  # the server that this command starts renders on this machine
     try:
         recorder = asyncio.run(_record(arguments))
     except KeyError as error:
@@ -143,7 +143,7 @@ async def _record(arguments: RecordArguments) -> AsyncRecorder:
                 await client.reset(arguments.keyframe)
             async with recorder:
                 with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
-                    await go_on(
+                    await run_session(
                         client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
                     )
     return recorder

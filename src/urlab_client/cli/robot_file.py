@@ -1,4 +1,4 @@
-"""What the demo has to know of an MJCF before it can place the robot sensibly."""
+"""What the demo needs to know about an MJCF file to place the robot sensibly."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class RobotFile:
         name: Bundled name, or the file's stem.
         path: Absolute path.
         bundled: Whether it ships with this package.
-        needs_floor: Whether it floats in a scene without one: it can fall, and brings no floor.
+        needs_floor: Whether the scene has to add a floor: the robot can fall, and the file has none.
         home: Hinge and slide positions of its `home` keyframe by joint name; empty without one.
         home_ctrl: Set-points of that keyframe by actuator name.
-        lift: Metres to raise it by, so that nothing of it is below a floor at z = 0 that it does not bring itself.
-        spacing: Metres between two of them.
+        lift: Metres to raise the robot by, so that no part of it is below an added floor at z = 0.
+        spacing: Metres between two such robots.
     """
 
     name: str
@@ -60,7 +60,7 @@ def read_robot(model: str) -> RobotFile:
         raise CommandError(unknown_model(model))
     path = path.resolve()
     try:
-        with mujoco_messages():  # the server repeats what it has to say about the model
+        with mujoco_messages():  # the server repeats MuJoCo's messages about the model
             compiled = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
         raise CommandError(f"MuJoCo rejects {path}: {one_line(error)}") from None

@@ -1,4 +1,4 @@
-"""`urlab robots`: the robots that are included."""
+"""`urlab robots`: list the bundled robots."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["add_parser", "run"]
 
 
 class RobotsArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     json: bool
 
 
 class Robot(Struct):
-    """A bundled model; `keyframes` by their names in the file."""
+    """A bundled model; `keyframes` holds their names."""
 
     name: str
     joints: int
@@ -37,9 +37,9 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "robots",
-        help="list the robots that are included",
-        description="List the models that are included, with what each has. Every command that takes a model, and "
-        "every sim:// address, takes their names in place of an MJCF file.",
+        help="list the bundled robots",
+        description="List the bundled models and what each one contains. Every command that takes a model, and every "
+        "sim:// address, accepts their names in place of an MJCF file.",
         examples=(
             ("urlab robots", "a table"),
             ("urlab serve arm --play", "serve one of them"),

@@ -43,7 +43,7 @@ _SEED = 0
 
 
 class RunPolicyArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     policy: Path
     address: str | None
@@ -65,13 +65,13 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "run-policy",
         help="let a network from an ONNX file drive a robot",
-        description="Run a policy: a network in an ONNX file, and a TOML file beside it that says what it sees and "
-        "what its outputs mean. Refuses to start where robot, step mode, timestep or controller are not what it "
-        "requires. Without an address it starts a simulated server; with one it opens a session, which takes the "
-        "server over from the client that drives it. Exit code 1 when the robot fell. Needs the extra "
-        "'urlab-client[onnx]'.",
+        description="Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network "
+        "observes and what its outputs mean. Refuses to start if the robot, step mode, timestep or controller is not "
+        "the one that the policy requires. Without an address it starts a simulated server; with one it opens a "
+        "session, which takes the server over from the client that drives it. Exit code 1 if the robot fell. Needs "
+        "the extra 'urlab-client[onnx]'.",
         examples=(
-            ("urlab run-policy walk.onnx", "walk.toml beside it names the robot, which is simulated here"),
+            ("urlab run-policy walk.onnx", "simulates the robot that walk.toml beside it names"),
             (
                 "urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare",
                 "walk forward at 0.5 m/s; compare with zero and random outputs",
@@ -85,13 +85,16 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
     add_address(parser, default=None, otherwise="a simulated server for --robot")
     parser.add_argument(
-        "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
+        "--declaration",
+        type=Path,
+        metavar="FILE",
+        help="the .toml file (default: the one beside POLICY with the same name)",
     )
     parser.add_argument(
         "--robot",
         metavar="ROBOT",
-        help="an MJCF file or the name of a bundled robot to simulate; with an address the articulation to drive "
-        "(default: what the declaration says)",
+        help="an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive "
+        "(default: as declared)",
     )
     parser.add_argument(
         "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
@@ -102,20 +105,20 @@ def add_parser(commands: Commands) -> None:
         type=float,
         nargs=3,
         metavar=("VX", "VY", "WZ"),
-        help="what to do: m/s forward, m/s to the left, rad/s to the left (default: what the declaration says)",
+        help="velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)",
     )
     parser.add_argument(
         "--goal",
         type=float,
         nargs="+",
         metavar="NUMBER",
-        help="what to reach, as many numbers as the declaration's table [goal] has (default: what it says)",
+        help="goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)",
     )
     parser.add_argument(
         "--step-mode",
         type=one_of(StepMode.DIRECT, StepMode.LIVE),
         metavar="MODE",
-        help="direct or live (default: the first that the declaration allows)",
+        help="direct or live (default: the first mode that the declaration allows)",
     )
     parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
     parser.add_argument(
@@ -135,7 +138,7 @@ def run(arguments: RunPolicyArguments) -> int:
     Raises:
         CommandError: An option cannot be used.
         MissingExtra: A library is missing.
-        URLabError: A file is wrong, the policy does not fit, or the server cannot be reached.
+        URLabError: A file is invalid, the policy does not fit, or the server cannot be reached.
     """
     import_mujoco()
     _check_record(arguments)
@@ -163,16 +166,16 @@ def run(arguments: RunPolicyArguments) -> int:
 def _check_record(arguments: RunPolicyArguments) -> None:
     if arguments.record is None:
         if arguments.camera or arguments.overwrite:
-            raise CommandError("--camera and --overwrite go with --record")
+            raise CommandError("--camera and --overwrite require --record")
         return
     check_ending(arguments.record, ".mcap")
     if arguments.record.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.record} exists; --overwrite replaces it")
-    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
+    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
 
 
 async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, PolicyRun]:
-    """Return what came of each run, by what acted."""
+    """Return the result of each run, by the name of its actor."""
     from urlab_client.aio import URLabClient  # noqa: PLC0415
     from urlab_client.integrations.policy import require  # noqa: PLC0415
     from urlab_client.integrations.policy import run as run_policy  # noqa: PLC0415
@@ -180,7 +183,7 @@ async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, Polic
     address, articulation = _where(arguments, policy)
     step_mode = arguments.step_mode or policy.spec.step_modes[0]
     client = make_client(URLabClient, address, arguments, step_mode=step_mode)
-    actors = {**(_others(policy) if arguments.compare else {}), "policy": policy}
+    actors = {**(_baselines(policy) if arguments.compare else {}), "policy": policy}
     runs: dict[str, PolicyRun] = {}
     async with client:
         await client.discover()
@@ -199,16 +202,16 @@ async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, Polic
 
 
 def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | None]:
-    """Return the address, and the articulation if it is not the one that is declared."""
+    """Return the address, and the articulation if it is not the declared one."""
     if arguments.address is not None:
         return arguments.address, arguments.robot
     model = arguments.robot or policy.spec.robot
-    actor = Path(model).stem  # what a server calls the actor of a file
+    actor = Path(model).stem  # a server names an actor after its file
     return with_model_options(policy.spec.simulated(model, actor)), actor
 
 
-def _others(policy: Policy) -> dict[str, Policy]:
-    """Return what to compare with: the same declaration and command, other outputs."""
+def _baselines(policy: Policy) -> dict[str, Policy]:
+    """Return policies to compare with: the same declaration and command, with zero and random outputs."""
     from urlab_client.integrations.policy import Policy  # noqa: PLC0415
 
     low, high = policy.spec.action.clip
@@ -221,18 +224,20 @@ def _others(policy: Policy) -> dict[str, Policy]:
     def random(observation: object) -> Floats:
         return rng.uniform(low, high, size)
 
-    others = {name: Policy(policy.spec, network, source=name) for name, network in (("zero", zero), ("random", random))}
-    for other in others.values():
+    baselines = {
+        name: Policy(policy.spec, network, source=name) for name, network in (("zero", zero), ("random", random))
+    }
+    for baseline in baselines.values():
         if policy.spec.command is not None:
-            other.command = policy.command
+            baseline.command = policy.command
         if policy.spec.goal is not None:
-            other.goal = policy.goal
-    return others
+            baseline.goal = policy.goal
+    return baselines
 
 
 @contextlib.asynccontextmanager
 async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -> AsyncGenerator[None]:
-    """Record what happens in the block, if that was asked for."""
+    """Record while the block runs, if `--record` was given."""
     if arguments is None or arguments.record is None:
         yield
         return

@@ -1,4 +1,4 @@
-"""`urlab serve`: a simulated server until a signal, or the end of standard input, says stop."""
+"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["add_parser", "run"]
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
-_PATIENCE_S = 0.5  # of the second that ending may take, for a start under way
+_START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
 class ControllerOption(NamedTuple):
@@ -47,7 +47,7 @@ class CameraOption(NamedTuple):
 
 
 class ServeArguments(argparse.Namespace):
-    """What the command line says."""
+    """The parsed command line."""
 
     models: list[str]
     host: str
@@ -87,15 +87,15 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "serve",
         help="run a simulated server",
-        description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM, and with 2 when it fails.",
+        description="Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
+        "(Ctrl-C) and SIGTERM, and with code 2 if it fails.",
         examples=(
             ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
             (
                 "urlab serve robot.xml --play --unpaused --mjcf-options",
                 "your own model, simulated in real time with its own <option>",
             ),
-            ("urlab serve arm ball --step-port 0 --json", "two models on any free port; one line of JSON names it"),
+            ("urlab serve arm ball --step-port 0 --json", "two models on any free port, printed as one line of JSON"),
         ),
     )
     parser.add_argument(
@@ -109,7 +109,7 @@ def add_parser(commands: Commands) -> None:
     network.add_argument(
         "--host",
         default="127.0.0.1",
-        help="interface to bind (default: %(default)s); any but loopback needs --server-key or --insecure-no-auth",
+        help="interface to bind (default: %(default)s); all but loopback need --server-key or --insecure-no-auth",
     )
     network.add_argument(
         "--server-key",
@@ -117,16 +117,17 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE",
         help="encrypt everything and prove this server's identity, with a secret key file from `urlab keys new`",
     )
-    who = network.add_mutually_exclusive_group()
-    who.add_argument(
+    admitted = network.add_mutually_exclusive_group()
+    admitted.add_argument(
         "--allow-client",
         type=Path,
         action="append",
         default=[],
         metavar="PATH",
-        help="with --server-key: admit the client with this public key file, or the clients of a folder; repeatable",
+        help="with --server-key: admit the client with this public key file, or all clients whose public keys are in "
+        "this folder; repeatable",
     )
-    who.add_argument(
+    admitted.add_argument(
         "--allow-any-client",
         action="store_true",
         help="with --server-key: admit every client that has the server's public key",
@@ -134,7 +135,7 @@ def add_parser(commands: Commands) -> None:
     network.add_argument(
         "--insecure-no-auth",
         action="store_true",
-        help="serve anyone who reaches the interface: they can read and write files as clients can",
+        help="serve anyone who can reach the interface: they can read and write files as clients can",
     )
     for name, default in _PORTS.items():
         network.add_argument(
@@ -145,7 +146,7 @@ def add_parser(commands: Commands) -> None:
         "--instance-index",
         type=index,
         metavar="N",
-        help="number of this server among several: ports 5559 + 10 N and the two after it, for those not given",
+        help="number of this server among several: ports not given are 5559 + 10 N and the next two",
     )
     network.add_argument("--instance-id", default="", metavar="NAME", help="name of this server among several")
     network.add_argument(
@@ -161,7 +162,7 @@ def add_parser(commands: Commands) -> None:
         metavar="DIR",
         help="also serve over shared memory, in a new directory below DIR (on Linux, /dev/shm avoids the disk)",
     )
-    memory.add_argument("--no-shm", action="store_true", help="do without shared memory (default)")
+    memory.add_argument("--no-shm", action="store_true", help="do not use shared memory (default)")
     content = parser.add_argument_group("content")
     content.add_argument(
         "--saved-dir",
@@ -180,17 +181,18 @@ def add_parser(commands: Commands) -> None:
         "--actor-names",
         choices=("model", "plugin"),
         default="model",
-        help="keys of articulations: the MJCF model name, or as the plugin gives them, robot_C_0 (default: model)",
+        help="keys of articulations: the MJCF model name, or names as the plugin assigns them, such as robot_C_0 "
+        "(default: model)",
     )
     physics = parser.add_argument_group("physics")
-    physics.add_argument("--play", action="store_true", help="start a play session at once")
+    physics.add_argument("--play", action="store_true", help="start a play session immediately")
     physics.add_argument("--unpaused", action="store_true", help="let physics run from the start of play")
     physics.add_argument(
         "--step-mode",
         choices=[str(mode) for mode in StepMode],
         default="auto",
         metavar="MODE",
-        help="auto: live until a client says otherwise; live, direct or puppet pin the mode (default: auto)",
+        help="auto: live until a client chooses another mode; live, direct or puppet pin the mode (default: auto)",
     )
     physics.add_argument(
         "--controller",
@@ -205,18 +207,18 @@ def add_parser(commands: Commands) -> None:
         "--scene-mib",
         type=count,
         metavar="N",
-        help="memory that all models of a level and their simulation may take, MiB (default 1024)",
+        help="memory limit for all models of a level and their simulation, MiB (default 1024)",
     )
     physics.add_argument(
         "--mjcf-options",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="honour the <option> of the first model; else the alpha ignores all, the beta merges them",
+        help="use the <option> of the first model; otherwise the alpha ignores them all and the beta merges them",
     )
     physics.add_argument(
         "--randomise",
         metavar="FILE",
-        help="vary the model from reset to reset, by the seed of the reset, as a TOML file (or JSON text) declares",
+        help="vary the model at each reset, with the seed of the reset, as a TOML file (or JSON text) declares",
     )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
@@ -235,22 +237,22 @@ def add_parser(commands: Commands) -> None:
         choices=("auto", "fast", "high"),
         default="auto",
         metavar="QUALITY",
-        help="fast: no shadows, reflections and smooth edges; high: with them; auto: fast where the processor draws "
+        help="fast: no shadows, reflections or smooth edges; high: with them; auto: fast if the CPU renders "
         "(default: auto)",
     )
-    life = parser.add_argument_group("for programs that start a server")
-    life.add_argument("--json", action="store_true", help="print one line of JSON when the server is ready")
-    life.add_argument(
+    lifetime = parser.add_argument_group("for programs that start a server")
+    lifetime.add_argument("--json", action="store_true", help="print one line of JSON when the server is ready")
+    lifetime.add_argument(
         "--until-eof",
         action="store_true",
-        help="also end when standard input closes, so that the server cannot outlive the program that started it; "
-        "it then ignores SIGINT, unless standard input is a terminal",
+        help="also exit when standard input closes, so that the server cannot outlive the program that started it; "
+        "the server then ignores SIGINT, unless standard input is a terminal",
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: ServeArguments) -> int:
-    """Serve until told to stop.
+    """Serve until stopped.
 
     Raises:
         CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
@@ -286,12 +288,12 @@ def run(arguments: ServeArguments) -> int:
                 if event is Event.FAILED:
                     raise CommandError(str(server.failure))
             return 0
-        starter.join(_PATIENCE_S)
+        starter.join(_START_GRACE_S)
         stuck = starter.is_alive()
         if not stuck:
             server.close()
     if stuck:
-        # Inside MuJoCo's compiler, which nothing can break off, and which the interpreter must not be torn down under.
+        # MuJoCo's compiler cannot be interrupted, and the interpreter must not be torn down while it runs.
         os._exit(0)
     return 0
 
@@ -332,7 +334,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
-    except OSError as error:  # nothing else is read before the start
+    except OSError as error:  # only this option reads a file before the start
         raise CommandError(f"--randomise: {error}") from None
 
 
@@ -341,10 +343,10 @@ def _curve(arguments: ServeArguments) -> CurveServer | None:
 
     if arguments.server_key is None:
         if arguments.allow_client or arguments.allow_any_client:
-            raise CommandError("--allow-client and --allow-any-client go with --server-key FILE")
+            raise CommandError("--allow-client and --allow-any-client require --server-key FILE")
         return None
     if not (arguments.allow_client or arguments.allow_any_client):
-        raise CommandError("--server-key: state who may connect, with --allow-client PATH or --allow-any-client")
+        raise CommandError("--server-key: say who may connect, with --allow-client PATH or --allow-any-client")
     return CurveServer(
         server_key=arguments.server_key, allow=arguments.allow_client, allow_any=arguments.allow_any_client
     )
@@ -352,7 +354,7 @@ def _curve(arguments: ServeArguments) -> CurveServer | None:
 
 @contextlib.contextmanager
 def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[int | None]:
-    """Serve metrics while the body runs; yields their port, None without."""
+    """Serve metrics while the block runs; yields their port, or None without `--metrics-port`."""
     if arguments.metrics_port is None:
         yield None
         return
@@ -398,7 +400,7 @@ def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: 
 
 
 def _settle_ports(arguments: ServeArguments) -> None:
-    """Fill in the ports that were not given: an index takes the place of those of the plugin's first server."""
+    """Fill in the ports that were not given: the plugin's defaults, or 0 to derive them from the instance index."""
     from urlab_client.protocol.dialects import DIALECTS  # noqa: PLC0415
 
     defaults = {**_PORTS, "camera": DIALECTS[arguments.dialect].first_camera_port}

@@ -1,4 +1,4 @@
-"""`urlab snapshot`: a picture of a model, of a saved level, or of what a camera of a running server sees."""
+"""`urlab snapshot`: write a picture of a model, of a saved level, or of what a camera of a running server sees."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ __all__ = ["add_parser", "run"]
 _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
-_CHUNK = 100  # physics steps of one request, which the server gives 5 s
-_BEYOND_M = 1e5  # farther than what a ray can meet
+_CHUNK = 100  # physics steps per request, for which the server allows 5 s
+_BEYOND_M = 1e5  # farther than any ray can hit
 
 
 class SnapshotArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     sources: list[str]
     output: Path
@@ -58,9 +58,10 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "snapshot",
         help="write a picture of a model, a level or a camera",
-        description="Write a picture of models or of a saved level, in a server of its own; or of what a camera of a "
-        "running server sees, in any mode and without a step. That opens a session, which takes the server over from "
-        "the client that drives it, unless you pass --handshake. Needs the extra 'urlab-client[demo]'.",
+        description="Write a picture of models or of a saved level, which this command simulates itself, or of what a "
+        "camera of a running server sees, in any mode and without a step. The latter opens a session, which takes the "
+        "server over from the client that drives it, unless you pass --handshake. Needs the extra "
+        "'urlab-client[demo]'.",
         examples=(
             ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
             (
@@ -69,7 +70,7 @@ def add_parser(commands: Commands) -> None:
             ),
             ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
             ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
-            ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "beside the driver"),
+            ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "alongside its client"),
         ),
     )
     parser.add_argument(
@@ -88,7 +89,9 @@ def add_parser(commands: Commands) -> None:
         help="a .png, .jpg or .webp file (default: %(default)s)",
     )
     parser.add_argument(
-        "--camera", metavar="ARTICULATION/CAMERA", help="what this camera sees (default: everything, from outside)"
+        "--camera",
+        metavar="ARTICULATION/CAMERA",
+        help="show what this camera sees (default: the whole scene, from outside)",
     )
     parser.add_argument(
         "--mode",
@@ -101,17 +104,17 @@ def add_parser(commands: Commands) -> None:
         type=image_size,
         default=(1280, 720),
         metavar="WxH",
-        help="pixels (default: 1280x720); for a camera that gives none itself",
+        help="size in pixels, also of a camera without a resolution (default: 1280x720)",
     )
     parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long first")
     add_mjcf_options(parser, "for models")
     add_ports(parser)
     parser.add_argument(
         "--timeout",
         type=seconds,
         metavar="S",
-        help="to wait for a running server (default: 5, and 30 for its first picture)",
+        help="how long to wait for a running server (default: 5, and 30 for its first picture)",
     )
     add_keys(parser)
     add_handshake(parser)
@@ -124,7 +127,7 @@ def run(arguments: SnapshotArguments) -> int:
     Raises:
         CommandError: An option cannot be honoured.
         MissingExtra: A library is missing.
-        URLabError: A model is broken, nothing can be drawn here, or the server does not answer.
+        URLabError: A model is invalid, rendering is not available, or the server does not answer.
         OSError: The file cannot be written.
     """
     need("PIL", extra="demo")
@@ -197,7 +200,7 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     if len(arguments.sources) > 1:
         raise CommandError("give one address or models, not both")
     if arguments.keyframe or arguments.seconds:
-        raise CommandError("--keyframe and --seconds are for models: what a running server does is not changed")
+        raise CommandError("--keyframe and --seconds are for models; a running server is not reset or stepped")
     (address,) = arguments.sources
     timeout_ms = round(1e3 * (arguments.timeout or _TIMEOUT_S))
     with make_client(URLabClient, address, arguments, rcv_timeout_ms=timeout_ms) as client:
@@ -259,5 +262,5 @@ def _write(path: Path, image: NDArray[np.uint8]) -> None:
     kind = _FORMATS[path.suffix.lower()]
     picture = Image.fromarray(image)
     with replaced(path) as temporary:
-        # JPEG has no transparency, and what a camera draws has none either.
+        # JPEG has no transparency, and camera pictures do not use any.
         (picture.convert("RGB") if kind == "jpeg" else picture).save(temporary, format=kind)

@@ -1,4 +1,4 @@
-"""`urlab teleop`: the keyboard moves a robot's hand, and each episode is recorded."""
+"""`urlab teleop`: move a robot's hand with the keyboard, and record each episode."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SHOWN_S = 0.1
 
 
 class TeleopArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     address: str | None
     output: Path | None
@@ -66,12 +66,12 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "teleop",
-        help="move a robot's hand by the keyboard, and record episodes",
-        description="Move a robot's hand with the keys of this terminal, by inverse kinematics within the limits of "
-        "its joints. The simulation is stepped along with the clock; an episode begins with the first key. "
-        "With --record each episode is kept with what became of it, as a key says, and `urlab convert` makes a LeRobot "
-        "dataset of those that were not discarded. Opens a session, which takes the server over from the client that "
-        "drives it. `urlab console` takes a gamepad. Needs the extra 'urlab-client[teleop]', and --task "
+        help="move a robot's hand with the keyboard, and record episodes",
+        description="Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint "
+        "limits. The simulation is stepped in real time; an episode begins with the first key. With --record, each "
+        "episode is saved with the outcome that you mark with a key, and `urlab convert` makes a LeRobot dataset of "
+        "the episodes that were not discarded. Opens a session, which takes the server over from the client that "
+        "drives it. `urlab console` supports gamepads. Needs the extra 'urlab-client[teleop]', and with --task also "
         "'urlab-client[gym]'.",
         examples=(
             ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
@@ -94,11 +94,17 @@ def add_parser(commands: Commands) -> None:
         "--speed", type=hertz, default=0.25, metavar="M/S", help="largest speed of the hand (default: %(default)s)"
     )
     parser.add_argument(
-        "--turn-speed", type=hertz, default=1.0, metavar="RAD/S", help="largest rate of turn (default: %(default)s)"
+        "--turn-speed",
+        type=hertz,
+        default=1.0,
+        metavar="RAD/S",
+        help="largest turn rate of the hand (default: %(default)s)",
     )
-    parser.add_argument("--episodes", type=count, metavar="N", help="end after so many that were not discarded")
+    parser.add_argument("--episodes", type=count, metavar="N", help="end after N episodes that were not discarded")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds after which an episode ends")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of starts and goals (default: 0)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of initial states and goals (default: 0)"
+    )
     add_cameras(parser, "with --record: a camera to record")
     parser.add_argument(
         "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
@@ -115,16 +121,16 @@ def run(arguments: TeleopArguments) -> int:
     Raises:
         CommandError: The terminal, the file or an option cannot be used.
         MissingExtra: A library is missing.
-        URLabError: The server refused something, or the robot cannot be moved so.
+        URLabError: The server refused a request, or the robot cannot be moved this way.
     """
     import_mujoco()
     if arguments.output is not None:
         check_ending(arguments.output, ".mcap")
         if arguments.output.exists() and not arguments.overwrite:
             raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
-        import urlab_client.integrations.record  # noqa: PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
+        import urlab_client.integrations.record  # noqa: PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
     elif arguments.camera or arguments.overwrite:
-        raise CommandError("--camera and --overwrite go with --record")
+        raise CommandError("--camera and --overwrite require --record")
     if arguments.seed < 0:
         raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
     import urlab_client.integrations.teleop  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
@@ -171,12 +177,12 @@ async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Call
             speed=arguments.speed,
             turn_speed=arguments.turn_speed,
         )
-        operator, shown = KeyboardOperator(keys), _Line()
+        operator, status = KeyboardOperator(keys), _StatusLine()
         with interruptible() as stop:
             _print_keys()
 
             def operate(view: TeleopView) -> TeleopCommand:
-                shown.show(view)
+                status.show(view)
                 return TeleopCommand(verdict="quit") if stop.is_set() else operator(view)
 
             async with _recorded(client, arguments) as recorder:
@@ -193,7 +199,7 @@ async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Call
                         paced=True,
                     )
                 finally:
-                    shown.end()
+                    status.end()
 
 
 @contextlib.asynccontextmanager
@@ -221,19 +227,19 @@ def _counts(tally: TeleopTally) -> str:
     return f"{tally.success} success, {tally.failure} failure, {tally.discarded} discarded"
 
 
-class _Line:
-    """One line on standard error that says how things stand."""
+class _StatusLine:
+    """A status line on standard error."""
 
     def __init__(self) -> None:
-        self._at = -np.inf
+        self._shown_at = -np.inf
         self._on = sys.stderr.isatty()
 
     def show(self, view: TeleopView) -> None:
-        """Write it, if it is some time since the last."""
+        """Rewrite the line, at most every 0.1 seconds."""
         now = asyncio.get_running_loop().time()
-        if not self._on or now - self._at < _SHOWN_S:
+        if not self._on or now - self._shown_at < _SHOWN_S:
             return
-        self._at = now
+        self._shown_at = now
         parts = [f"episode {view.episode}", f"{view.time:.1f} s", f"hand {_numbers(view.position)}"]
         parts += [f"{name} {_numbers(np.atleast_1d(value))}" for name, value in view.goal.items()]
         parts += ["success"] if view.success else []
@@ -242,8 +248,8 @@ class _Line:
         sys.stderr.flush()
 
     def end(self) -> None:
-        """Leave the line."""
-        if self._on and np.isfinite(self._at):
+        """Go to the next line."""
+        if self._on and np.isfinite(self._shown_at):
             sys.stderr.write("\n")
 
 

@@ -1,4 +1,4 @@
-"""`urlab view`: a simulation shown in MuJoCo's window, in a browser, in Rerun or in Foxglove."""
+"""`urlab view`: show a simulation in MuJoCo's window, in a browser, in Rerun or in Foxglove."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._page_options import PageArguments
-from urlab_client.cli._watching import go_on, interruptible
+from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ _RERUN_PORT = 9090
 
 
 class ViewArguments(ServerArguments):
-    """What the command line says."""
+    """The parsed command line."""
 
     address: str
     where: str
@@ -59,9 +59,9 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "view",
         help="show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
-        description="Show a play session while it goes on. In live mode physics runs by itself and is watched; in "
-        "direct mode this command resets and steps it, with all set-points zero. Opens a session, which takes the "
-        "server over from the client that drives it; a program of your own can call rerun_view(client) and its "
+        description="Show a play session while it runs. In live mode, physics runs by itself and this command watches; "
+        "in direct mode, this command resets and steps it, with all set-points zero. Opens a session, which takes the "
+        "server over from the client that drives it; your own program can call rerun_view(client) or one of its "
         "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
         "'urlab-client[foxglove]', --web 'urlab-client[web]'.",
         examples=(
@@ -77,7 +77,7 @@ def add_parser(commands: Commands) -> None:
     for name, text in (
         ("viewer", "MuJoCo's own window, which needs a display (default)"),
         ("web", "the console's page with MuJoCo's web viewer, for browsers"),
-        ("rerun", "Rerun's window; with --save a file, with --connect one elsewhere, with --page a browser's"),
+        ("rerun", "Rerun's window; with --save a file, with --connect another viewer, with --page a page for browsers"),
         ("foxglove", "a server that Foxglove connects to"),
     ):
         where.add_argument(f"--{name}", dest="where", action="store_const", const=name, help=text)
@@ -86,7 +86,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--page",
         action="store_true",
-        help="with --rerun: serve Rerun's page for browsers; Rerun does that on every interface, to anybody",
+        help="with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone",
     )
     parser.add_argument("--port", type=port, metavar="PORT", help="port for --web, --foxglove or --page")
     add_ports(parser)
@@ -96,7 +96,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--camera-hz", type=hertz, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
-    parser.add_argument("--sensors", action="store_true", help="show sensors' readings in Rerun or Foxglove")
+    parser.add_argument("--sensors", action="store_true", help="show sensor readings in Rerun or Foxglove")
     parser.add_argument(
         "--max-hz", type=hertz, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
     )
@@ -105,14 +105,14 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: ViewArguments) -> int:
-    """Show it until told to stop.
+    """Show the simulation until stopped.
 
     Raises:
         CommandError: An option cannot be honoured.
         MissingExtra: A library is missing.
     """
     if arguments.where != "rerun" and (arguments.save or arguments.connect or arguments.page):
-        raise CommandError("--save, --connect and --page go with --rerun")
+        raise CommandError("--save, --connect and --page require --rerun")
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
         raise CommandError("give one of --save, --connect and --page")
     if arguments.where == "web":
@@ -136,7 +136,9 @@ def run(arguments: ViewArguments) -> int:
 
 def _console_arguments(arguments: ViewArguments) -> PageArguments:
     if arguments.camera or arguments.sensors or arguments.seconds is not None:
-        raise CommandError("--web shows everything until Ctrl-C: --camera, --sensors and --seconds do not go with it")
+        raise CommandError(
+            "--camera, --sensors and --seconds do not apply to --web, which shows everything until Ctrl-C"
+        )
     return PageArguments(
         address=arguments.address,
         host="127.0.0.1",
@@ -164,12 +166,12 @@ async def _view(arguments: ViewArguments) -> None:
         view = _make(client, arguments)
         with interruptible() as stop:
             async with view:
-                print(_said(arguments, view), flush=True)
-                await go_on(client, arguments.seconds, over=lambda: stop.is_set() or view.closed)
+                print(_announcement(arguments, view), flush=True)
+                await run_session(client, arguments.seconds, over=lambda: stop.is_set() or view.closed)
     if view.error is not None:
         raise CommandError(f"the view ended: {view.error}")
     stats = view.stats
-    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states left out")
+    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states skipped")
 
 
 def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
@@ -200,7 +202,7 @@ def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
     )
 
 
-def _said(arguments: ViewArguments, view: AsyncView) -> str:
+def _announcement(arguments: ViewArguments, view: AsyncView) -> str:
     where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
-    who = " Rerun serves it on every interface of this machine, to anybody." if arguments.page else ""
-    return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{who}"
+    exposure = " Rerun serves it on every interface of this machine, to anyone." if arguments.page else ""
+    return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{exposure}"

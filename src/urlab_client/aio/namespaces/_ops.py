@@ -60,7 +60,7 @@ class RuntimeOps(Namespace):
     """Generated part of `client.runtime`."""
 
     async def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
-        """Set the pacing of live mode and return the value in force.
+        """Set the pacing of live mode, and return the value in force.
 
         Args:
             percent: Percent of real time; the engine clamps to 5..100.
@@ -75,7 +75,7 @@ class RuntimeOps(Namespace):
     async def set_control_source(
         self, source: str, *, articulation: str | None = None, timeout: Timeout = DEFAULT
     ) -> None:
-        """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel.
+        """Choose the source of the set-points for the actuators: this protocol or the editor's panel.
 
         Args:
             source: `zmq` or `ui`.
@@ -122,10 +122,10 @@ class RuntimeOps(Namespace):
     async def set_mocap_pose(
         self, body: str, *, pos: Vector | None = None, quat: Vector | None = None, timeout: Timeout = DEFAULT
     ) -> MocapPose:
-        """Place a mocap body; body poses follow at the next step or `forward()`.
+        """Place a mocap body. Body poses change at the next step or `forward()`.
 
         Args:
-            body: Compiled name, or with the articulation's key, actor id or nothing in front.
+            body: Compiled name, or short name with or without the articulation's key or actor id.
             pos: Position, metres, world frame; None keeps it.
             quat: Unit quaternion (w, x, y, z), world frame; None keeps it.
             timeout: Seconds to wait; None waits without limit.
@@ -145,7 +145,7 @@ class RuntimeOps(Namespace):
         """Read the pose of a mocap body.
 
         Args:
-            body: Compiled name, or with the articulation's key, actor id or nothing in front.
+            body: Compiled name, or short name with or without the articulation's key or actor id.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -187,12 +187,12 @@ class SceneOps(Namespace):
     """Generated part of `client.scene`."""
 
     async def create_level(self, name: str, *, force_overwrite: bool = False, timeout: Timeout = DEFAULT) -> None:
-        """Create an empty level, make it the open one and save it.
+        """Create an empty level, open it and save it.
 
-            The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
+        The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
 
         Args:
-            name: Short name, or a package or object path beginning with `/Game/`.
+            name: Short name, or a package or object path that starts with `/Game/`.
             force_overwrite: Replace an existing level of that name.
             timeout: Seconds to wait; None waits without limit.
 
@@ -203,10 +203,10 @@ class SceneOps(Namespace):
         await self._call(CreateLevel(name=name, force_overwrite=force_overwrite), timeout)
 
     async def load_level(self, name_or_path: str, *, timeout: Timeout = DEFAULT) -> None:
-        """Open an existing level; unsaved edits of the open one are lost.
+        """Open an existing level. Unsaved edits of the current level are lost.
 
         Args:
-            name_or_path: Short name, or a package or object path beginning with `/Game/`.
+            name_or_path: Short name, or a package or object path that starts with `/Game/`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -227,7 +227,7 @@ class SceneOps(Namespace):
         await self._call(SaveLevel(), timeout)
 
     async def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
-        """Return the package path of the open level; during play still the edited one.
+        """Return the package path of the open level; during play this is still the edited level.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -239,9 +239,9 @@ class SceneOps(Namespace):
         return (await self._call(CurrentLevel(), timeout)).level_path
 
     async def ensure_manager(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Make sure the level holds one manager actor, without which play never becomes ready.
+        """Ensure that the level has one manager actor, without which play never becomes ready.
 
-            Returns whether the level had one already.
+        Returns whether the level already had one.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -254,7 +254,7 @@ class SceneOps(Namespace):
         return (await self._call(EnsureManager(), timeout)).was_existing
 
     async def destroy_asset(self, asset_path: str, *, timeout: Timeout = DEFAULT) -> bool:
-        """Delete an asset by object path and return whether it existed.
+        """Delete an asset by object path, and return whether it existed.
 
         Args:
             asset_path: Object path with the name repeated: `/Game/Levels/lab.lab`.
@@ -276,7 +276,7 @@ class SceneOps(Namespace):
         rotation_euler: Vector | None = None,
         timeout: Timeout = DEFAULT,
     ) -> None:
-        """Move an actor of the edited level; parts that are left out stay.
+        """Move an actor of the edited level. Omitted parts of the transform do not change.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
@@ -304,7 +304,7 @@ class SceneOps(Namespace):
     async def actor_hierarchy(
         self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT
     ) -> ActorHierarchyNode:
-        """Return the tree of actors attached to an actor; a robot is a single node.
+        """Return the tree of actors attached to an actor. A robot is a single node.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
@@ -340,7 +340,7 @@ class OutlinerOps(Namespace):
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
             by_name: Look `target` up by the engine's actor name instead of the actor id.
-            components_only: Count components without collision, too.
+            components_only: Also include components without collision.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -380,7 +380,7 @@ class OutlinerOps(Namespace):
         friction: Vector = (1.0, 1.0, 1.0),
         timeout: Timeout = DEFAULT,
     ) -> None:
-        """Make a static-mesh actor a MuJoCo body from the next play session on.
+        """Turn a static-mesh actor into a MuJoCo body, from the next play session on.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
@@ -442,9 +442,9 @@ class DebugOps(Namespace):
         Args:
             location: World position, metres.
             color: Red, green, blue in [0, 1].
-            ttl: Seconds to live: 0 a single frame, negative until `clear_markers`.
+            ttl: Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.
             label: Text at the same place.
-            tag: Accepted, without effect: clearing is never by tag.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -475,9 +475,9 @@ class DebugOps(Namespace):
             from_: World position, metres.
             to: World position, metres.
             color: Red, green, blue in [0, 1].
-            ttl: Seconds to live: 0 a single frame, negative until `clear_markers`.
+            ttl: Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.
             thickness: Line width in Unreal units.
-            tag: Accepted, without effect: clearing is never by tag.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -514,8 +514,8 @@ class DebugOps(Namespace):
             half_extents: Half sizes, metres.
             color: Red, green, blue in [0, 1].
             rotation_quat: Rotation (x, y, z, w) in Unreal's frame; send (-x, y, -z, w) for a MuJoCo quaternion.
-            ttl: Seconds to live: 0 a single frame, negative until `clear_markers`.
-            tag: Accepted, without effect: clearing is never by tag.
+            ttl: Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -552,10 +552,10 @@ class DebugOps(Namespace):
             from_: World position, metres.
             to: World position, metres.
             color: Red, green, blue in [0, 1].
-            ttl: Seconds to live: 0 a single frame, negative until `clear_markers`.
+            ttl: Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.
             thickness: Line width in Unreal units.
             arrow_size: Head size, metres; default a fifth of the length.
-            tag: Accepted, without effect: clearing is never by tag.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -586,15 +586,15 @@ class DebugOps(Namespace):
         tag: str | None = None,
         timeout: Timeout = DEFAULT,
     ) -> None:
-        """Draw a red, green and blue triad; Unreal's is left-handed, so its green points along MuJoCo's -y.
+        """Draw a red, green and blue triad. Unreal's frame is left-handed, so green points along MuJoCo's -y.
 
         Args:
             location: World position, metres.
             rotation_quat: Rotation (x, y, z, w) in Unreal's frame; send (-x, y, -z, w) for a MuJoCo quaternion.
             rotation_euler: Rotation (roll, pitch, yaw) in degrees, Unreal's rotator convention.
             scale: Arrow length, metres.
-            ttl: Seconds to live: 0 a single frame, negative until `clear_markers`.
-            tag: Accepted, without effect: clearing is never by tag.
+            ttl: Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -614,10 +614,10 @@ class DebugOps(Namespace):
         )
 
     async def clear_markers(self, *, tag: str | None = None, timeout: Timeout = DEFAULT) -> None:
-        """Remove all debug drawing of the world in use.
+        """Remove all debug drawing from the world in use.
 
         Args:
-            tag: Accepted, without effect: clearing is never by tag.
+            tag: Accepted but not used; markers cannot be cleared by tag.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -630,7 +630,7 @@ class DebugOps(Namespace):
 
         Args:
             text: The text.
-            anchor: Accepted; the plugin always uses the top left.
+            anchor: Accepted but not used; the plugin always uses the top left.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -690,7 +690,7 @@ class ViewportOps(Namespace):
         return fill(CameraPose, await self._call(GetCamera(), timeout))
 
     async def frame_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> CameraPose:
-        """Move the camera so that an actor fills the view; the view direction stays.
+        """Move the camera so that an actor fills the view. The view direction does not change.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
@@ -706,7 +706,7 @@ class ViewportOps(Namespace):
         return fill(CameraPose, await self._call(FrameActor(target=target, target_by=target_by(by_name)), timeout))
 
     async def set_mode(self, mode: str, *, timeout: Timeout = DEFAULT) -> str:
-        """Switch the viewport's view mode and return it.
+        """Switch the viewport's view mode, and return the mode in force.
 
         Args:
             mode: `lit`, `unlit`, `wireframe`, `collision` or `reflections`.
@@ -729,13 +729,13 @@ class ViewportOps(Namespace):
         smoothing: float = 0.0,
         timeout: Timeout = DEFAULT,
     ) -> str:
-        """Make the camera follow an actor and return its object path; a new call replaces the old target.
+        """Make the camera follow an actor, and return its object path. A new call replaces the target.
 
         Args:
             target: Actor id, or the engine's actor name with `by_name`.
             by_name: Look `target` up by the engine's actor name instead of the actor id.
             offset: Camera position in the actor's frame, metres.
-            smoothing: Share of the old pose kept per tick, in [0, 1).
+            smoothing: Fraction of the old pose kept per tick, in [0, 1).
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -753,7 +753,7 @@ class ViewportOps(Namespace):
         ).tracked_actor_path
 
     async def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Stop following; returns whether a track was active.
+        """Stop tracking, and return whether it was active.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -765,14 +765,14 @@ class FarmOps(Namespace):
     """Generated part of `client.farm`."""
 
     async def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
-        """Take the server's one driver lease and return its id.
+        """Acquire the server's only driver lease and return its id.
 
-            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
-            alive.
+        The lease is advisory: it shows other clients that the server is in use, and the server does not enforce it.
+        Every request keeps it alive.
 
         Args:
-            owner: Who takes it, for people.
-            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            owner: Human-readable name of the holder.
+            ttl_s: Seconds without a request until the lease expires; 0 or less for immediately.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -782,10 +782,10 @@ class FarmOps(Namespace):
         return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
 
     async def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
-        """Give the driver lease back.
+        """Release the driver lease.
 
         Args:
-            lease_id: What `acquire_lease` returned.
+            lease_id: Return value of `acquire_lease`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:

@@ -1,1 +1,1 @@
-"""What a client goes through, for whoever records or shows it: states, pictures, poses and contacts."""
+"""The states, pictures, poses and contacts of a client, for recordings and views."""

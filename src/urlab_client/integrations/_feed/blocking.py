@@ -1,4 +1,4 @@
-"""The blocking flavour of what follows a client for the length of a block."""
+"""The blocking flavour of a follower."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["BlockingTwin", "Following"]
 
 
 class Following(Protocol):
-    """Follows a client between `async with` and its end."""
+    """Follows a client for the duration of an `async with` block."""
 
     async def __aenter__(self) -> Any: ...
 
@@ -21,7 +21,7 @@ class Following(Protocol):
     ) -> None: ...
 
     def finish(self) -> None:
-        """End when the client's loop is gone already. Blocks."""
+        """End if the client's loop has already ended. Blocks."""
         ...
 
 
@@ -29,7 +29,7 @@ F = TypeVar("F", bound=Following)
 
 
 class BlockingTwin(Generic[F]):
-    """Does between `with` and its end what its async twin does, on the loop of the client that it follows."""
+    """Runs its async counterpart for the duration of a `with` block, on the loop of the followed client."""
 
     def __init__(self, aio: F, portal: Portal) -> None:
         self._aio = aio
@@ -37,7 +37,7 @@ class BlockingTwin(Generic[F]):
 
     @property
     def aio(self) -> F:
-        """The async twin."""
+        """The async counterpart."""
         return self._aio
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Follows a client: each state and picture that it gets, by replies or by streams, is handed on."""
+"""Follows a client: passes on each state and picture that it receives, by replies or by streams."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ S = TypeVar("S", bound=Struct)
 
 
 class Follower(ClientObserver):
-    """Hands on what a client goes through: by replies in `direct` and `puppet` mode, by the streams in `live` mode.
+    """Passes on a client's states and pictures: from replies in `direct` and `puppet` mode, from streams in `live`
+    mode.
 
     Args:
         client: The client, after `discover()`.
-        name: What this is for, in errors and in the log.
+        name: Name of the purpose in errors and logs.
         cameras: Names of cameras, or `all`.
-        camera_hz: Pictures per second of simulation time, at most.
-        needs_model: What to do where there is no local model, as advice in the error; None if none is needed.
-        buffer: How many published states may wait, so that none is missed; 0 for the newest alone.
+        camera_hz: Maximum number of pictures per second of simulation time.
+        needs_model: Hint for the error if there is no local model; None if none is needed.
+        buffer: Number of published states that may wait so that none is missed; 0 for only the newest.
 
     Raises:
-        ValueError: `cameras` is a name by itself.
+        ValueError: `cameras` is a single name.
     """
 
     def __init__(
@@ -77,11 +78,11 @@ class Follower(ClientObserver):
         self._live = False
 
     def check(self) -> SceneMessages:
-        """Describe what there is.
+        """Describe the scene.
 
         Raises:
-            URLabError: Nothing is known yet, or the local model is missing.
-            KeyError: An unknown camera.
+            URLabError: There was no handshake yet, or the local model is missing.
+            KeyError: A camera is unknown.
         """
         if not self._client.urlab_version:
             raise URLabError(
@@ -99,7 +100,7 @@ class Follower(ClientObserver):
 
     @property
     def cameras(self) -> list[str]:
-        """Names of the cameras whose pictures are wanted and that the scene has; empty before `check`."""
+        """Names of the requested cameras that exist in the scene; empty before `check`."""
         return [] if self._scene is None else [camera.name for camera in self._scene.cameras.values()]
 
     def start(
@@ -109,12 +110,12 @@ class Follower(ClientObserver):
         room: Callable[[], Awaitable[None]] | None = None,
         lost: Callable[[int], None] | None = None,
     ) -> None:
-        """Hand on what comes from now on.
+        """Start passing on items.
 
         Args:
-            put: Takes one item, on the event loop; must be quick.
-            room: Returns when there is room for what a further step brings, in the end at least.
-            lost: Told how many pictures that were due a step did not bring.
+            put: Called with each item on the event loop; must be fast.
+            room: Returns when there is space for the items of another step, or after a limit.
+            lost: Called with the number of pictures that were due but missing in a step.
         """
         self._put, self._room, self._lost = put, room, lost
         self._client.add_observer(self)
@@ -122,20 +123,20 @@ class Follower(ClientObserver):
             self._listen()
 
     def detach(self) -> None:
-        """Hand on nothing more. Idempotent."""
+        """Stop. Idempotent."""
         self.forget()
         self._ignore()
 
     def forget(self) -> None:
-        """Hand on nothing more, when the client's loop is gone already. Idempotent."""
+        """Stop if the client's loop has already ended. Idempotent."""
         self._client.remove_observer(self)
         self._put = None
 
     async def ended(self) -> None:
-        """Wait until nothing of it runs."""
+        """Wait until its tasks have ended."""
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    # What the client calls
+    # Called by the client
 
     def on_state(self, state: StateReply | StateSnapshot) -> None:
         """See the base class."""
@@ -149,28 +150,28 @@ class Follower(ClientObserver):
             self._hand_on(_detached(state))
 
     def step_cameras(self, n_steps: int) -> Mapping[str, str]:
-        """See the base class; the cameras are wanted when their next picture is due."""
+        """See the base class; requests the cameras whose next picture is due."""
         client = self._client
         if client.step_mode is StepMode.LIVE or not self._wanted_cameras:
             return {}
         timestep = 0.0 if client.model is None else client.model.opt.timestep
         then = round((client.sim_time + max(n_steps, 1) * timestep) * _NS)
-        # The period counts as used only once the step was taken: it may be refused, or never answered.
+        # The period counts as used only after the step: it may be refused, or never answered.
         self._due_at = then if self._pictures.is_due(then) else None
         if self._due_at is None:
             return {}
         return {camera.name: "sync" for camera in self._current().cameras.values()}
 
     async def ready(self) -> None:
-        """Wait until there is room; see the base class."""
+        """Wait until there is space; see the base class."""
         if self._put is not None and self._room is not None:
             await self._room()
 
     # Inside
 
     def _current(self) -> SceneMessages:
-        """Return the scene, described anew when there was another handshake."""
-        described = self._client.articulations  # another map with each handshake
+        """Return the scene, described again after another handshake."""
+        described = self._client.articulations  # a new map with each handshake
         if self._scene is None or described is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: the new scene has %s", self._name, unknown)
@@ -192,7 +193,7 @@ class Follower(ClientObserver):
             return None
 
     def _unknown_cameras(self) -> str:
-        """Say which cameras are not there; nothing if all are."""
+        """Raise if cameras are missing."""
         wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
         missing = [name for name in wanted if self._camera(name) is None]
         there = ", ".join(self._every_camera()) or "none"
@@ -237,14 +238,14 @@ class Follower(ClientObserver):
                 self._lost(missing)
 
     def _listen(self) -> None:
-        """Follow the streams, as live mode brings nothing by replies."""
+        """Follow the streams, because live mode has no state in replies."""
         scene = self._current()
         self._live = True
         self._begin(self._follow_states())
         self._follow_cameras(scene)
 
     def _follow_cameras(self, scene: SceneMessages) -> None:
-        """Follow this scene's cameras instead of those before."""
+        """Follow this scene's cameras instead of the previous ones."""
         for task in self._camera_tasks:
             task.cancel()
         self._camera_tasks = [self._begin(self._follow_camera(camera)) for camera in scene.cameras.values()]
@@ -277,7 +278,8 @@ class Follower(ClientObserver):
                     continue
                 except ClientClosed:
                     return
-                # While paused the same state comes with every tick, and another server's comes before its handshake.
+                # While paused, every tick repeats the state; and a restarted server's state arrives before its
+                # handshake.
                 fresh = self._client.step_mode is StepMode.LIVE and snapshot.time != last
                 if fresh and self._client.matches(snapshot):
                     last = snapshot.time
@@ -297,7 +299,7 @@ class Follower(ClientObserver):
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:
-    """Return a state with arrays of its own: the caller of `step()` may write to those it came with."""
+    """Return a copy of a state: the caller of `step()` may write to the original arrays."""
     own = copy.copy(reply)
     own.per_articulation = {key: _with_own_arrays(state) for key, state in reply.per_articulation.items()}
     if isinstance(own, (StepOk, StateSnapshot)) and own.entities is not None:

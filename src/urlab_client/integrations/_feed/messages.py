@@ -1,7 +1,7 @@
-"""What a recording holds: one struct per schema, JSON as Foxglove reads it. No I/O.
+"""The messages of a recording: one struct per schema, as JSON for Foxglove. No I/O.
 
-Messages named `foxglove.*` have the fields of Foxglove's own schemas, so its panels show them without any set-up; those
-named `urlab.*` are this project's and can be plotted there.
+Messages named `foxglove.*` have the fields of Foxglove's own schemas, so its panels show them without configuration;
+those named `urlab.*` are specific to this project and can be plotted there.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ __all__ = [
     "values",
 ]
 
-_NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as protobuf writes them in JSON
+_NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as in protobuf's JSON
 
 
 class Time(Struct, frozen=True):
-    """A time of the recording's clock."""
+    """A time on the recording's clock."""
 
     sec: int
     nsec: int
@@ -53,7 +53,7 @@ class Time(Struct, frozen=True):
 
     @property
     def nanoseconds(self) -> int:
-        """Both parts as one number."""
+        """Both parts as one number of nanoseconds."""
         return self.sec * 1_000_000_000 + self.nsec
 
 
@@ -75,22 +75,22 @@ class Quaternion(Struct, frozen=True):
 
 
 EpisodeOutcome = Literal["success", "failure", "discarded"]
-"""What became of an episode."""
+"""Outcome of an episode."""
 
 
 class ArticulationMessage(Struct, kw_only=True, omit_defaults=True):
     """State of one articulation, as the server sent it.
 
     Attributes:
-        timestamp: Time of the recording's clock.
+        timestamp: Time on the recording's clock.
         sim_time: `mjData.time`, seconds.
         sample: Number of the sample; articulations and entities with the same one belong together.
         step: Step counter of the session.
-        episode: Number of resets before.
+        episode: Number of preceding resets.
         wall_time: The server's UTC clock.
-        qpos: Joint positions; what each value is, the channel's `layout` says.
+        qpos: Joint positions; the channel's `layout` names the values.
         qvel: Joint velocities.
-        set_points: What the client had set, before any controller.
+        set_points: Set-points of the client, before any controller.
         ctrl: `mjData.ctrl`, as applied.
         act: Activations.
         sensors: Readings by name.
@@ -111,7 +111,7 @@ class ArticulationMessage(Struct, kw_only=True, omit_defaults=True):
 
 
 class EntityMessage(Struct, kw_only=True, omit_defaults=True):
-    """State of one plain entity: position in metres, orientation (w, x, y, z), of a free one the joint's velocity."""
+    """State of one plain entity: position in metres, orientation (w, x, y, z), velocity of the free joint, if any."""
 
     timestamp: Time
     sim_time: float
@@ -139,7 +139,7 @@ class JointStates(Struct, frozen=True):
 
 
 class FrameTransform(Struct, frozen=True):
-    """Pose of a frame in another one."""
+    """Pose of a frame in another frame."""
 
     timestamp: Time
     parent_frame_id: str
@@ -164,7 +164,7 @@ class CompressedImage(Struct, frozen=True):
 
 
 class RawImage(Struct, frozen=True):
-    """A picture of depths, metres, as 32-bit floats."""
+    """A depth picture, metres, as 32-bit floats."""
 
     timestamp: Time
     frame_id: str
@@ -210,7 +210,7 @@ class ContactsMessage(Struct, frozen=True):
 
 
 class VariedQuantity(Struct, frozen=True):
-    """What was drawn for a quantity, by element: factors, offsets or values, as `by` (`scale`, `add`, `set`) says."""
+    """Draws for a quantity by element: factors, offsets or values, according to `by` (`scale`, `add`, `set`)."""
 
     what: str
     by: str
@@ -218,7 +218,7 @@ class VariedQuantity(Struct, frozen=True):
 
 
 class EpisodeMessage(Struct, frozen=True):
-    """What varies in the episode that begins, and the seed that decided on it."""
+    """Randomisation of the episode that begins, and its seed."""
 
     timestamp: Time
     episode: int
@@ -227,13 +227,13 @@ class EpisodeMessage(Struct, frozen=True):
 
 
 class OutcomeMessage(Struct, frozen=True):
-    """What became of an episode, as whoever drove it judged; the last message of an episode counts.
+    """Outcome of an episode, as marked by the operator; the last message of an episode counts.
 
     Attributes:
-        timestamp: Time of the recording's clock.
-        episode: Number of resets before.
+        timestamp: Time on the recording's clock.
+        episode: Number of preceding resets.
         outcome: `success`, `failure` or `discarded`.
-        goal: What the episode was about, by name.
+        goal: Goal of the episode, by name.
     """
 
     timestamp: Time
@@ -243,7 +243,7 @@ class OutcomeMessage(Struct, frozen=True):
 
 
 class GapMessage(Struct, frozen=True):
-    """What was dropped since the previous message of this kind, because the file could not be written fast enough."""
+    """Losses since the previous message of this kind, because the file could not be written fast enough."""
 
     timestamp: Time
     states: int
@@ -267,7 +267,7 @@ def schema_name(kind: type[Struct]) -> str:
 
 
 def schema_of(kind: type[Struct]) -> bytes:
-    """Return the JSON schema of a message, without references: readers in the field do not follow them."""
+    """Return the JSON schema of a message, without references, which some readers do not resolve."""
     (whole,), definitions = msgspec.json.schema_components([kind], ref_template="{name}")
     schema = _inlined(whole, definitions)
     schema["title"] = schema_name(kind)
@@ -289,9 +289,9 @@ _encode = msgspec.json.Encoder().encode
 
 
 def encode(message: Struct) -> bytes:
-    """Return the message as JSON. Numbers read back to the same bits; NaN and infinities are written as text."""
+    """Return the message as JSON. Numbers keep their precision; NaN and infinities are written as text."""
     data = _encode(message)
-    # msgspec writes null for what JSON has no number for. A name that holds the word costs only time.
+    # msgspec writes null for numbers that JSON cannot represent. A name that contains the word only costs time.
     return _encode(_spelled_out(msgspec.to_builtins(message))) if b"null" in data else data
 
 
@@ -308,5 +308,5 @@ def _spelled_out(node: Any) -> Any:
 
 
 def values(array: Floats | None) -> list[float]:
-    """Return the numbers of an array; none for None."""
+    """Return the numbers of an array; empty for None."""
     return [] if array is None else array.tolist()

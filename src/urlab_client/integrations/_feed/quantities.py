@@ -1,4 +1,4 @@
-"""What the values of a recording measure: quantity and unit for axes, names of the components. No I/O."""
+"""Quantities and units of recorded values, for axis labels, and names of components. No I/O."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ _SEPARATOR = "."
 
 
 def quantities(layout: SceneLayout, field: str, names: list[str]) -> list[str]:
-    """Return what each value of a field measures, with its unit, as the label of an axis.
+    """Return quantity and unit of each value of a field, as axis labels.
 
     Args:
-        layout: The articulation's.
-        field: As in `Table.columns`.
+        layout: Layout of the articulation.
+        field: Field name as in `Table.columns`.
         names: Names of the values.
     """
     match field:
@@ -84,7 +84,7 @@ def quantities(layout: SceneLayout, field: str, names: list[str]) -> list[str]:
 
 
 def component_name(layout: SceneLayout, name: str) -> str:
-    """Return the name of a sensor's value with its axis, `imu.x` for `imu.0`, where the sensor's kind has axes."""
+    """Return the name of a sensor's value with its axis, `imu.x` for `imu.0`, if sensors of its kind have axes."""
     sensor, dot, index = name.rpartition(_SEPARATOR)
     kind = layout.sensors.get(sensor, "")
     if not dot or not index.isdecimal() or not kind:

@@ -1,4 +1,4 @@
-"""One state, one picture; when something is due; the clock of a run. No I/O."""
+"""States, pictures, periodic timers and the clock of a run. No I/O."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _FALLBACK_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state on its way to whoever keeps or shows it.
+    """One state for a recording or view.
 
-    `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room, and `seed`
-    is that of the reset which the state is the reply to. `draws` are those of the episode that begins, where an
-    environment varies it over the wire; what a server varies follows from `scene` and `seed`.
+    `waits` means that it is the reply to a step of this client, so that the next step can wait for space. `seed` is
+    that of the reset to which the state is the reply. `draws` are those of a new episode that an environment varies
+    over the wire; a server's draws follow from `scene` and `seed`.
     """
 
     scene: SceneMessages
@@ -46,7 +46,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class CameraPicture:
-    """One picture on its way likewise; without a time of its own it belongs to the last state before it."""
+    """One picture for a recording or view; without its own time it belongs to the preceding state."""
 
     camera: CameraLayout
     frame: CameraFrame | Pixels
@@ -55,7 +55,7 @@ class CameraPicture:
     waits: bool = False
 
     def pixels(self, memory: PictureMemory | None = None) -> Pixels:
-        """Return the picture as an array, as `CameraSample.pixels` is; in `memory` where it is not one yet."""
+        """Return the picture as an array like `CameraSample.pixels`, converted in `memory` if necessary."""
         frame = self.frame
         if isinstance(frame, CameraFrame):
             mode = self.camera.view.mode
@@ -65,7 +65,7 @@ class CameraPicture:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeMark:
-    """What became of the episode that the last state before it belongs to."""
+    """Outcome of the episode of the preceding state."""
 
     outcome: EpisodeOutcome
     goal: dict[str, list[float]]
@@ -73,11 +73,11 @@ class EpisodeMark:
 
 
 class Schedule:
-    """Says when something is due that happens at most once in each period of simulation time."""
+    """A timer that fires at most once in each period of simulation time."""
 
     def __init__(self, period_ns: int) -> None:
         self._period = period_ns
-        self._slack = period_ns // 100  # times are rounded on their way
+        self._slack = period_ns // 100  # times are rounded
         self._next = 0
 
     def is_due(self, now: int) -> bool:
@@ -85,12 +85,12 @@ class Schedule:
         return not self._next - self._period <= now + self._slack < self._next
 
     def done(self, now: int) -> None:
-        """Wait for the next period: it happened at `now`, nanoseconds."""
+        """Start the next period: it fired at `now`, nanoseconds."""
         now += self._slack
-        self._next = now - now % self._period + self._period  # also when time was set back
+        self._next = now - now % self._period + self._period  # also after a reset of time
 
     def due(self, now: int) -> bool:
-        """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
+        """Return whether it is due at `now`, nanoseconds, and start the next period if so."""
         due = self.is_due(now)
         if due:
             self.done(now)
@@ -99,7 +99,7 @@ class Schedule:
 
 @dataclass(slots=True)
 class SampleClock:
-    """The clock of a run: simulation time that goes on where a reset sets it back."""
+    """The clock of a run: simulation time that continues across resets."""
 
     offset: int = 0
     last: int | None = None
@@ -109,9 +109,9 @@ class SampleClock:
     moved: bool = False
 
     def advance(self, sim: int, restarts: bool) -> int:
-        """Take the next state's simulation time over, nanoseconds, and return the run's.
+        """Update from the next state's simulation time, nanoseconds, and return the time of the run.
 
-        Resets that follow each other without a step in between begin one episode, not several.
+        Consecutive resets without a step in between start one episode.
         """
         if self.last is not None and (restarts or sim < self.sim):
             if self.moved or sim != self.sim:
@@ -127,7 +127,7 @@ class SampleClock:
 
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
-    """Return a picture of bytes as JPEG, or as PNG without a quality."""
+    """Encode a picture of bytes as JPEG, or as PNG if there is no quality."""
     if jpeg_quality is not None:
         return jpeg(pixels, mode, jpeg_quality)
     return encoded(pillow_image(pixels, mode, alpha=mode != CameraMode.REAL), "PNG", compress_level=1)
@@ -136,13 +136,13 @@ def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
 def picture_message(
     picture: CameraPicture, stamp: Time, jpeg_quality: int | None, memory: PictureMemory | None = None
 ) -> CompressedImage | RawImage:
-    """Return a picture as a message: depths as they are, colours as JPEG if there is a quality, all others as PNG.
+    """Return a picture as a message: depths unchanged, colours as JPEG if there is a quality, everything else as PNG.
 
     Args:
         picture: The picture.
-        stamp: Its time.
+        stamp: Time of the picture.
         jpeg_quality: 1 to 100, or None.
-        memory: That of the camera's earlier pictures, for whoever makes many messages.
+        memory: Memory of the camera's earlier pictures, to reuse for many messages.
     """
     pixels, name, mode = picture.pixels(memory), picture.camera.name, picture.camera.view.mode
     if pixels.dtype == np.float32:

@@ -1,4 +1,4 @@
-"""What the values of a recording belong to: names, addresses and cameras of one handshake, and poses from its model."""
+"""Names, addresses and cameras of a recording from one handshake, and poses from its model."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ _FREE_QVEL = ("vx", "vy", "vz", "wx", "wy", "wz")
 class SceneLayout(Struct, kw_only=True):
     """Name of each value of an articulation, in the order of the message's arrays; empty without a local model.
 
-    `slides` are the names of slide joints, whose positions are metres, None where that is not known, and `sensors` the
-    kind of each sensor by name, as MJCF calls it (`accelerometer`).
+    `slides` are the names of slide joints, whose positions are metres, or None if unknown. `sensors` has the kind of
+    each sensor by name, as in MJCF (`accelerometer`).
     """
 
     qpos: list[str] = []
@@ -75,8 +75,8 @@ class CameraLayout:
 
     Attributes:
         name: `ARTICULATION/CAMERA`, or the name of a scene-level camera.
-        view: The client's.
-        model_id: Id in the compiled model, -1 if it is not there.
+        view: The client's camera.
+        model_id: Id in the compiled model; -1 if missing.
     """
 
     name: str
@@ -86,16 +86,16 @@ class CameraLayout:
 
 @dataclass(frozen=True, slots=True)
 class SceneMessages:
-    """What one handshake says, as far as a recording needs it. Immutable: it crosses to the writing thread.
+    """The parts of a handshake that a recording needs. Immutable, because the writing thread uses it.
 
     Attributes:
         model: The local model, or None.
-        layouts: By articulation key.
-        names: By articulation key.
-        entities: Offset of the free joint in `qpos` and in `qvel`, or None, by name of the plain entity.
-        mocap: Mocap id of the plain entities that have one.
-        cameras: What to record, by the view's identity.
-        variation: How the server varies the scene from reset to reset, or None.
+        layouts: Layouts by articulation key.
+        names: Names by articulation key.
+        entities: Offsets of the free joint in `qpos` and in `qvel`, or None, by name of the plain entity.
+        mocap: Mocap ids of the plain entities that have one.
+        cameras: Cameras to record, by the identity of the client's camera.
+        variation: The server's randomisation, or None.
     """
 
     model: mujoco.MjModel | None
@@ -108,7 +108,7 @@ class SceneMessages:
 
     @classmethod
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
-        """Describe what the client knows."""
+        """Build the description of a client's scene."""
         model, arts = client.model, client.articulations
         prefixes = {key: art.compiled_prefix for key, art in arts.items()}
         layouts = {key: ArticulationLayout() for key in arts}
@@ -135,12 +135,12 @@ class SceneMessages:
 
 
 def joint_columns(names: list[str], dof: bool = False) -> list[str]:
-    """Return those of a layout's names that belong to a hinge or slide joint: without a component."""
+    """Return the names in a layout that belong to hinge and slide joints, which have no component."""
     return [name for name in names if name.rpartition(".")[2] not in (_FREE_QVEL if dof else _FREE_QPOS)]
 
 
 class Simulation:
-    """Computes poses and contacts of recorded states. For one thread; the model is only read.
+    """Computes poses and contacts of recorded states. Not thread-safe; the model is only read.
 
     Args:
         scene: The scene, with a model.
@@ -160,7 +160,7 @@ class Simulation:
     def take(
         self, articulations: Mapping[str, ArticulationState], entities: Mapping[str, EntityState], *, forces: bool
     ) -> None:
-        """Take over a state and compute what follows from it."""
+        """Set a state and compute its poses and contacts."""
         data = self._data
         for key, state in articulations.items():
             layout = self._scene.layouts.get(key)
@@ -183,7 +183,7 @@ class Simulation:
         self._compute(forces)
 
     def start_from(self, qpos: Floats, qvel: Floats, *, forces: bool) -> None:
-        """Take over whole arrays of joint positions and velocities and compute what follows from them."""
+        """Set complete arrays of joint positions and velocities and compute poses and contacts."""
         self._data.qpos[:], self._data.qvel[:] = qpos, qvel
         self._compute(forces)
 
@@ -204,12 +204,12 @@ class Simulation:
 
     @property
     def data(self) -> mujoco.MjData:
-        """What was computed last."""
+        """The data computed last."""
         return self._data
 
     @property
     def bodies(self) -> list[str]:
-        """Name of each body, which is that of its frame."""
+        """Name of each body, which is also that of its frame."""
         return self._bodies
 
     def joints(self) -> list[JointState]:
@@ -228,7 +228,7 @@ class Simulation:
         return found
 
     def contacts(self) -> list[ContactMessage]:
-        """Return the contacts of a state that was taken with its forces."""
+        """Return the contacts of a state that was set with forces."""
         import mujoco  # noqa: PLC0415
 
         model, data = self._model, self._data
@@ -254,7 +254,7 @@ class Simulation:
         return found
 
     def _owner(self, geom: int) -> str:
-        """Return the body of a geom; a flex has none."""
+        """Return the body of a geom; None for a flex."""
         return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
 
     def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
@@ -290,11 +290,11 @@ def _transform(time: Time, child: str, position: list[float], rotation: list[flo
 
 
 def _camera_id(model: mujoco.MjModel | None, prefixes: Mapping[str, str], name: str) -> int:
-    """Return the id of `ARTICULATION/CAMERA`, or of a camera of the scene; -1 if the model has none of that name."""
+    """Return the id of `ARTICULATION/CAMERA`, or of a camera of the scene; -1 if the model does not have it."""
     if model is None:
         return -1
     owner, slash, short = name.rpartition("/")
-    wanted = cleaned_name(f"{prefixes.get(owner, owner)}_{short}" if slash else name)  # as the beta cleans its part
+    wanted = cleaned_name(f"{prefixes.get(owner, owner)}_{short}" if slash else name)  # the beta cleans the same way
     return next((i for i in range(model.ncam) if cleaned_name(model.cam(i).name) == wanted), -1)
 
 
@@ -324,7 +324,7 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
 
 
 def sensor_kinds() -> dict[int, str]:
-    """Return MJCF's word for each number in `model.sensor_type`."""
+    """Return the MJCF name of each number in `model.sensor_type`."""
     import mujoco  # noqa: PLC0415
 
     members = mujoco.mjtSensor.__members__

@@ -1,8 +1,8 @@
-"""Writes a LeRobot dataset as its frames come. Run by an interpreter that has LeRobot, which has none of ours.
+"""Writes a LeRobot dataset while its frames arrive. Runs in an interpreter with LeRobot, but without this project.
 
-It imports nothing of this project, and is given a folder with `plan.json` as its only argument. Each line of standard
-input names a file of frames in that folder, and whether they end an episode; each is answered with a line, once its
-frames have been taken over.
+It imports nothing of this project. Its only argument is a folder with `plan.json`. Each line of standard input names a
+file of frames in that folder, and whether they end an episode. It answers each with a line after it has read the
+frames.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["main"]
 def main(work: Path) -> None:
     """Write the dataset that `work/plan.json` describes, from the frames that standard input names."""
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as replies:
-        os.dup2(2, 1)  # what libraries print is no reply
+        os.dup2(2, 1)  # output of libraries must not look like a reply
         plan: dict[str, Any] = json.loads((work / "plan.json").read_text(encoding="utf-8"))
         dataset: Any = None
         for line in sys.stdin:

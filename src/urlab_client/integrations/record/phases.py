@@ -1,4 +1,4 @@
-"""The progress of work that goes through a recording more than once."""
+"""Progress of operations that read a recording several times."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Progress: TypeAlias = Callable[[int], None]
 
 
 def phases(size: int, progress: Progress | None, count: int) -> list[Progress]:
-    """Return what is told, in each of some phases, how far that phase is; `progress` is told how far all are.
+    """Return a progress callback for each phase, which report the total to `progress`.
 
     Args:
-        size: How far each phase goes, and all together: the size of the recording, bytes.
-        progress: Told of it; None if nobody is.
-        count: How many phases there are.
+        size: Size of the recording, bytes, which is the end of each phase and of the total.
+        progress: Callback for the total; None for none.
+        count: Number of phases.
     """
 
     def phase(number: int) -> Progress:

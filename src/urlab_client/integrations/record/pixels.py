@@ -1,4 +1,4 @@
-"""Recorded pictures as what other formats take: RGB, and of even size."""
+"""Conversion of recorded pictures for other formats: RGB, with even sizes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ __all__ = ["even", "farthest", "visible"]
 
 
 def farthest(pixels: Pixels) -> float:
-    """Return the largest finite depth of a picture of depths, metres; 1 for any other."""
+    """Return the largest finite depth of a depth picture, metres; 1 for other pictures."""
     depths = pixels[np.isfinite(pixels)] if pixels.dtype == np.float32 else np.zeros(0)
     return float(depths.max()) if depths.size else 1.0
 
 
 def visible(pixels: Pixels, far: float) -> NDArray[np.uint8]:
-    """Return pixels as RGB: depths in grey, near bright, black from `far` on."""
+    """Return pixels as RGB: depths in grey, from bright (near) to black (`far` and beyond)."""
     if pixels.dtype == np.float32:
         grey = np.clip(1.0 - np.nan_to_num(pixels, nan=far, posinf=far) / far, 0.0, 1.0)
         return np.repeat(np.rint(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
@@ -25,6 +25,6 @@ def visible(pixels: Pixels, far: float) -> NDArray[np.uint8]:
 
 
 def even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Repeat the last row and column where their number is odd, which H.264 and AV1 with 4:2:0 refuse."""
+    """Repeat the last row and column if their number is odd, which H.264 and AV1 with 4:2:0 do not support."""
     height, width = pixels.shape[:2]
     return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge") if height % 2 or width % 2 else pixels

@@ -1,4 +1,4 @@
-"""A table of states that need not fit in memory: pieces of it are in a temporary file until somebody reads them."""
+"""A table of states larger than memory: its pieces are stored in a temporary file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["StoredTable"]
 
 
 class _Place(NamedTuple):
-    """Where an array is in the file."""
+    """Location of an array in the file."""
 
     offset: int
     shape: tuple[int, ...]
@@ -26,16 +26,17 @@ class _Place(NamedTuple):
 
 
 class StoredTable:
-    """The states of a recording in pieces. Its file has no name where the system allows that, so no crash leaves it.
+    """The states of a recording in pieces. If the system supports it, the file has no name, so a crash leaves nothing
+    behind.
 
     Attributes:
         last: The last piece, which stays in memory. Its columns are those of the table.
 
     Args:
-        folder: Where the file is made.
+        folder: Folder of the file.
 
     Raises:
-        OSError: The file cannot be made.
+        OSError: The file cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -59,7 +60,7 @@ class StoredTable:
         """Write the next piece to the file.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The file cannot be written.
         """
         places: dict[str, _Place] = {}
         for name, values in piece.arrays().items():
@@ -68,7 +69,7 @@ class StoredTable:
         self._places.append(places)
 
     def pieces(self) -> Iterator[Table]:
-        """Iterate over the pieces, all with the same columns; NaN where a piece has no values."""
+        """Iterate over the pieces, all with the same columns; missing values are NaN."""
         for places in self._places:
             arrays = {name: self._read(places, name, values.shape[1:]) for name, values in self.last.arrays().items()}
             yield self.last.with_arrays(arrays)

@@ -1,6 +1,6 @@
-"""States one after the other to a table, in arrays that grow: an overnight recording holds millions.
+"""Building a table from successive states, of which an overnight recording has millions, in growing arrays.
 
-A table that is too large for memory is given away in pieces while it grows.
+A table that is too large for memory is passed on in pieces while it grows.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from urlab_client.protocol.base import Floats
 __all__ = ["PIECE_VALUES", "Number", "SampleTimes", "TableBuilder"]
 
 PIECE_VALUES = 1 << 21
-"""How many numbers a piece of a table holds, about: 16 MiB."""
+"""Approximate number of values in a piece of a table: 16 MiB."""
 
 Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
-"""A number as it is read: what JSON lacks is text."""
+"""A number as decoded; numbers that JSON cannot represent are text."""
 
 
 class SampleTimes(NamedTuple):
-    """When a sample was taken: see `Table`, in nanoseconds and seconds."""
+    """Time of a sample: see `Table`, in nanoseconds and seconds."""
 
     log_ns: int
     sim_time: float
@@ -38,7 +38,7 @@ class SampleTimes(NamedTuple):
 
 
 class _Values:
-    """Rows of one field, of one width; those that have none are NaN."""
+    """Rows of one field with a fixed width; missing rows are NaN."""
 
     def __init__(self) -> None:
         self.width = 0
@@ -58,7 +58,7 @@ class _Values:
         return np.frombuffer(self._numbers, np.float64)[: count * self.width].reshape(count, self.width)
 
     def clear(self) -> None:
-        """Begin anew, with rows of the same width."""
+        """Start again with rows of the same width."""
         self._numbers = array("d")
 
     def _fill(self, size: int) -> None:
@@ -86,12 +86,12 @@ class _Source:
 
 
 class TableBuilder:
-    """Makes one table. Samples come in their order, each in as many parts as it has articulations and entities.
+    """Builds one table. Samples arrive in order, with one part for each articulation and entity.
 
     Args:
         only: Fields to keep, such as `qpos`; None keeps all.
-        take: Takes each full piece of the table, which is then forgotten here; None keeps all. A later piece may have
-            more columns, and wider ones.
+        take: Called with each full piece of the table, which is then released; None keeps all. Later pieces may have
+            more and wider columns.
     """
 
     def __init__(self, only: Collection[str] | None = None, take: Callable[[Table], None] | None = None) -> None:
@@ -107,7 +107,7 @@ class TableBuilder:
         self._size = 0
 
     def source(self, key: str, layout: SceneLayout) -> _Source:
-        """Return the samples of an articulation or entity up to now."""
+        """Return the samples of an articulation or entity so far."""
         return self._sources.setdefault(key, _Source(layout))
 
     def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
@@ -127,7 +127,7 @@ class TableBuilder:
                 self._size += len(values)
 
     def build(self, *, broken_off: bool) -> Table:
-        """Return the table, or what has not been taken of it, without the last sample if that is not whole."""
+        """Return the table, or its rest after `take`, without the last sample if that is incomplete."""
         count = len(self._samples)
         if broken_off and self._last_is_partial():
             count -= 1
@@ -160,7 +160,7 @@ class TableBuilder:
         self._begin()
 
     def _last_is_partial(self) -> bool:
-        """Return whether one that is in the sample before is not in the last."""
+        """Return whether an articulation or entity of the previous sample is missing in the last one."""
         if not self._samples:
             return False
         last = self._samples[-1]

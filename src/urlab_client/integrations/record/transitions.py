@@ -16,27 +16,27 @@ from urlab_client.integrations.record.reader import Run
 __all__ = ["GOAL", "Episodes", "check_episodes", "transition_pieces", "transitions", "transitions_of", "with_goals"]
 
 Episodes = Literal["kept", "success", "all"]
-"""Which episodes: those that were not discarded, successes alone, or all."""
+"""Selection of episodes: those not discarded, only successes, or all."""
 
 GOAL = "goal"
-"""What columns of an episode's goal are called: `goal/NAME`."""
+"""Name of the columns with an episode's goal: `goal/NAME`."""
 
 _SET_POINTS = "/set_points"
 
 
 def transitions_of(run: Run, *, only: Episodes = "kept", progress: Callable[[int], None] | None = None) -> Table:
-    """Return the pairs of a recording, as `transitions` has them, of the episodes that are wanted.
+    """Return the pairs of a recording, as in `transitions`, for a selection of episodes.
 
-    Where episodes were marked, `kept` leaves out those that were discarded, and those without a mark, which were broken
-    off; `success` leaves out failures, too. What an episode was about is in columns `goal/NAME`, the same in each row.
+    If episodes are marked, `kept` omits discarded ones and those without a mark, which were aborted; `success` also
+    omits failures. The goal of an episode is in columns `goal/NAME`, constant over its rows.
 
     Args:
         run: The recording.
-        only: Which episodes.
-        progress: Told now and then how many bytes have been read.
+        only: The selection.
+        progress: Called occasionally with the number of bytes read so far.
 
     Raises:
-        ValueError: `only` is none of these.
+        ValueError: `only` is not a valid selection.
         RecordingError: The file is not a recording.
     """
     check_episodes(only)
@@ -45,23 +45,24 @@ def transitions_of(run: Run, *, only: Episodes = "kept", progress: Callable[[int
 
 
 def transition_pieces(pieces: Iterable[Table], outcomes: Sequence[OutcomeMessage], only: Episodes) -> Iterator[Table]:
-    """Yield what `transitions_of` returns, from consecutive pieces of a table; each has rows of one or two pieces."""
+    """Yield the result of `transitions_of` from consecutive pieces of a table, in parts with rows of one or two
+    pieces."""
     before: Table | None = None
     for piece in pieces:
         if not _acting(piece):
             yield _chosen(piece, outcomes, only)
             continue
-        # The last state of a piece is kept until it is known what follows it.
+        # The last state of a piece is kept until the next one is known.
         whole = piece if before is None else _one_after_the_other(before, piece)
         yield _chosen(transitions(whole), outcomes, only)
         before = _rows(whole, np.arange(len(whole))[-1:])
 
 
 def check_episodes(only: Episodes) -> None:
-    """Check which episodes are wanted.
+    """Check a selection of episodes.
 
     Raises:
-        ValueError: `only` is none of the values that it may have.
+        ValueError: `only` is not a valid selection.
     """
     if only not in ("kept", "success", "all"):
         raise ValueError(f"only must be kept, success or all, not {only!r}")
@@ -76,7 +77,7 @@ def _chosen(table: Table, outcomes: Sequence[OutcomeMessage], only: Episodes) ->
 
 
 def with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
-    """Return a table with what its episodes were about; NaN for those of which it is not known."""
+    """Return a table with the goals of its episodes; NaN if unknown."""
     goals = {mark.episode: mark.goal for mark in outcomes}
     widths = {name: len(values) for goal in goals.values() for name, values in goal.items()}
     columns = dict(table.columns)
@@ -90,11 +91,11 @@ def with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
 
 
 def transitions(table: Table) -> Table:
-    """Return the states that an action followed, with the action: one row per pair, in an episode's order.
+    """Return the states that are followed by an action, with the action, one row per pair, in order.
 
-    A state is recorded with the set-points that led to it, so the action taken at one state stands beside the next. Of
-    several states at one time, as resets leave them, the last counts. The last state of an episode has no action, and
-    goes. A run without set-points is returned as it is.
+    A state is recorded with the set-points that led to it, so the action taken at a state is in the row of the next
+    one. Of several states at the same time, which resets produce, the last one is used. The last state of an episode
+    has no action and is omitted. A run without set-points is returned unchanged.
 
     Returns:
         A table with columns `ARTICULATION/action`, named as `ARTICULATION/set_points`, after all others.
@@ -111,7 +112,7 @@ def transitions(table: Table) -> Table:
 
 
 def _acting(table: Table) -> list[str]:
-    """Return the articulations that have set-points."""
+    """Return the articulations with set-points."""
     return [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]
 
 

@@ -55,31 +55,31 @@ __all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "Writer
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
 FORMAT = "1"
-"""Version of what is in a recording."""
+"""Version of the recording format."""
 
-_WAKE_S = 0.02  # in batches: a thread that wakes for each state would take the interpreter from who steps each time
+_WAKE_S = 0.02  # in batches: waking for each state would take the interpreter lock from the stepping thread
 _STALL_S = 30.0
 _CHUNK_BYTES = 1 << 20
-_STATE_BYTES = 1 << 10  # what a state is taken to occupy besides its arrays
+_STATE_BYTES = 1 << 10  # assumed size of a state without its arrays
 
 
 class RecordingError(URLabError):
-    """A recording could not be written to its end, or is not one."""
+    """A recording could not be written completely, or a file is not a recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """How to write.
+    """Options for writing.
 
     Attributes:
-        image_format: `jpeg` or `png`, of colour pictures.
+        image_format: `jpeg` or `png`, for colour pictures.
         jpeg_quality: 1 to 95.
-        pose_ns: Least time between two sets of poses, nanoseconds; 0 for none.
+        pose_ns: Shortest time between two sets of poses, nanoseconds; 0 for none.
         contacts: Whether to add contacts to each set of poses.
-        buffer_bytes: What may wait.
+        buffer_bytes: Size of the queue.
         flush_s: Seconds after which a chunk is written even if it is not full.
         overwrite: Whether the file may exist.
-        lossless: Whether what can wait for room does.
+        lossless: Whether senders that can wait for space do so.
         about: Metadata.
     """
 
@@ -100,9 +100,9 @@ class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
     Attributes:
         states: States written.
         frames: Pictures written.
-        dropped_states: States that found the queue full, or came after a failure.
-        dropped_frames: Likewise pictures, and those that were due and that the server did not send.
-        waiting_bytes: What waits to be written, about.
+        dropped_states: States dropped because the queue was full, or after a failure.
+        dropped_frames: Pictures dropped likewise, and pictures that were due but not sent by the server.
+        waiting_bytes: Approximate size of the queue's contents.
         file_bytes: Bytes written to the file.
     """
 
@@ -119,7 +119,7 @@ class WriterThread:
 
     Args:
         path: The file.
-        options: How to write.
+        options: Options for writing.
     """
 
     def __init__(self, path: Path, options: WriterOptions) -> None:
@@ -127,7 +127,7 @@ class WriterThread:
         self.error: OSError | RecordingError | None = None
         self._options = options
         self._queue: deque[tuple[State | CameraPicture | EpisodeMark, int]] = deque()
-        # Each number has one writer, so no lock: the producer adds, the thread takes away.
+        # No lock needed, because each counter has one writer.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
         self._stalled = False
@@ -140,7 +140,7 @@ class WriterThread:
         """Create the file and start the thread.
 
         Raises:
-            OSError: The file cannot be made, or exists already.
+            OSError: The file cannot be created, or already exists.
         """
         self._file = _McapFile(self.path, "wb" if self._options.overwrite else "xb")
         try:
@@ -152,7 +152,7 @@ class WriterThread:
 
     @property
     def stats(self) -> RecorderStats:
-        """Counters up to now."""
+        """Current counters."""
         sink, file = self._sink, self._file
         return RecorderStats(
             states=sink.states if sink else 0,
@@ -165,13 +165,13 @@ class WriterThread:
 
     @property
     def cameras(self) -> frozenset[str]:
-        """Names of the cameras that have a picture in the file."""
+        """Names of the cameras with a picture in the file."""
         return frozenset(self._sink.cameras) if self._sink else frozenset()
 
     def put(self, item: State | CameraPicture) -> None:
-        """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room.
+        """Queue an item, or drop it. Pictures are dropped from half of the queue's size, to leave space for states.
 
-        Without losses an item whose sender waits for room is always queued.
+        In lossless mode, an item whose sender waits for space is always queued.
         """
         size = _size(item)
         limit, waiting = self._options.buffer_bytes, self._put_bytes - self._taken_bytes
@@ -187,15 +187,15 @@ class WriterThread:
         self._queue.append((item, size))
 
     def mark(self, item: EpisodeMark) -> None:
-        """Queue what became of the episode; that is never dropped."""
+        """Queue the outcome of the episode, which is never dropped."""
         self._queue.append((item, 0))
 
     def lose_frames(self, count: int) -> None:
-        """Count pictures that never came; from the thread that calls `put`."""
+        """Count pictures that did not arrive. Call from the thread that calls `put`."""
         self._dropped_frames += count
 
     async def room(self) -> None:
-        """Wait until half of the queue is free. A disk that takes nothing for 30 s is waited for no longer."""
+        """Wait until half of the queue is free, but no longer if the disk has accepted nothing for 30 s."""
         if not self._options.lossless or self._stalled:
             return
         half, taken, rest = self._options.buffer_bytes // 2, self._taken_bytes, _STALL_S
@@ -211,14 +211,14 @@ class WriterThread:
                 return
 
     def end(self) -> None:
-        """Let the thread write what waits and finish the file, without waiting for that."""
+        """Tell the thread to write the queue and finish the file, without waiting."""
         self._stop.set()
 
     def close(self) -> None:
-        """Write what waits, finish the file, and wait for that. Idempotent.
+        """Write the queue, finish the file, and wait until that is done. Idempotent.
 
         Raises:
-            RecordingError: Something could not be written.
+            RecordingError: Writing failed.
         """
         self.end()
         self._thread.join()
@@ -246,7 +246,7 @@ class WriterThread:
         except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on and `close` tells
             self._fail(RecordingError(f"{self.path}: the recording broke off: {error!r}"))
         finally:
-            with contextlib.suppress(OSError):  # told already, if it could not be written
+            with contextlib.suppress(OSError):  # already reported if writing failed
                 file.close()
 
     def _drain(self, sink: _Sink) -> None:
@@ -268,7 +268,7 @@ class WriterThread:
 
 
 class _McapFile:
-    """A file without a buffer in this process, which a forked child would write a second time."""
+    """An unbuffered file: a forked child would write a buffer a second time."""
 
     def __init__(self, path: Path, mode: str) -> None:
         self.written = 0
@@ -288,7 +288,7 @@ class _McapFile:
         return self.written
 
     def flush(self) -> None:
-        """Do nothing: what was written is with the operating system."""
+        """Do nothing, because there is no buffer."""
 
     def close(self) -> None:
         """Close it."""
@@ -303,7 +303,7 @@ class _Topic:
 
 @dataclass
 class _Sink:
-    """Encodes items and writes them. All of it happens in the writing thread, apart from making it."""
+    """Encodes and writes items. Used only in the writing thread, except for the constructor."""
 
     file: _McapFile
     options: WriterOptions
@@ -339,7 +339,7 @@ class _Sink:
                 self._add("/recording/outcomes", outcome, now, item.wall_ns, {})
 
     def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
-        """Write the chunk if its oldest message is old enough, so that a crash costs no more than that."""
+        """Write the chunk if its oldest message is old enough, which limits the loss in a crash."""
         self._report(dropped_states, dropped_frames)
         now = time.monotonic()
         if self._dirty_since is not None and now - self._dirty_since >= self.options.flush_s:
@@ -355,7 +355,7 @@ class _Sink:
             "dropped_states": dropped_states,
             "dropped_frames": dropped_frames,
         }
-        self._writer.flush()  # metadata stands outside of chunks, and would come before the last one
+        self._writer.flush()  # metadata is outside of chunks, and would precede the last one
         self._writer.add_metadata("urlab.end", {name: str(count) for name, count in totals.items()})
         self._writer.finish()
 
@@ -404,7 +404,7 @@ class _Sink:
             self._write_derived(self._simulation, now, item.wall_ns)
 
     def _write_episode(self, item: State, now: int) -> None:
-        """Write what varies in an episode, once: an environment may reset several times at its start."""
+        """Write an episode's randomisation once, because an environment may reset several times at its start."""
         variation, seed, episode = item.scene.variation, item.seed, self._clock.episode
         if seed is None or self._varied == (episode, seed):
             return

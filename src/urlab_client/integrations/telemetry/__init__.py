@@ -1,6 +1,6 @@
-"""What a client does, in OpenTelemetry and in Prometheus: observers for `URLabClient(observe=…)`.
+"""Observers for `URLabClient(observe=…)` that export to OpenTelemetry and Prometheus.
 
-OpenTelemetry needs the extra `opentelemetry`, Prometheus the extra `prometheus`.
+OpenTelemetry requires the extra `opentelemetry`, Prometheus the extra `prometheus`.
 """
 
 from urlab_client.integrations.telemetry.opentelemetry_observer import OpenTelemetryObserver

@@ -1,4 +1,4 @@
-"""Limits between the buckets of durations: a step takes tenths of a millisecond, an import minutes."""
+"""Bucket boundaries of duration histograms: a step takes tenths of a millisecond, an import minutes."""
 
 from typing import Final
 

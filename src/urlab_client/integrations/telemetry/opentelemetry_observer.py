@@ -20,16 +20,16 @@ _SYSTEM: Final = "urlab"
 
 
 class OpenTelemetryObserver:
-    """Makes a span and measurements of each request: `URLabClient(…, observe=OpenTelemetryObserver())`.
+    """Creates a span and measurements for each request: `URLabClient(…, observe=OpenTelemetryObserver())`.
 
-    Spans are of the kind `CLIENT`, named by the op, from the time the request came up to its reply, and children of the
-    span in force where the call was made. The metrics are `rpc.client.call.duration`, `urlab.client.queue.duration`,
-    in seconds, `urlab.client.request.size` and `urlab.client.response.size`, in bytes. What is exported, and how many
-    spans of a thousand steps per second are kept, the providers decide.
+    Spans have the kind `CLIENT` and the name of the op, last from the request to its reply, and are children of the
+    span that is current when the call is made. The metrics are `rpc.client.call.duration`,
+    `urlab.client.queue.duration`, in seconds, `urlab.client.request.size` and `urlab.client.response.size`, in bytes.
+    The providers decide what is exported, and how many spans are sampled at a thousand steps per second.
 
     Args:
-        tracer_provider: Makes the spans; the program's by default.
-        meter_provider: Makes the metrics; the program's by default.
+        tracer_provider: Provider of spans; by default the global one.
+        meter_provider: Provider of metrics; by default the global one.
 
     Raises:
         MissingExtra: OpenTelemetry is not installed.
@@ -61,7 +61,7 @@ class OpenTelemetryObserver:
         self._servers: dict[str, dict[str, str | int]] = {}
 
     def __call__(self, record: CallRecord) -> None:
-        """Take note of a request."""
+        """Record a request."""
         about: dict[str, str | int] = {
             "rpc.system.name": _SYSTEM,
             "rpc.method": record.op,

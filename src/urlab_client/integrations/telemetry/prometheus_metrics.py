@@ -1,4 +1,4 @@
-"""Requests as Prometheus metrics: of a client, or of a simulated server."""
+"""Prometheus metrics of the requests of a client or of a simulated server."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class PrometheusObserver:
     may serve many clients.
 
     Args:
-        registry: Where the metrics go; the program's by default.
+        registry: Registry of the metrics; by default the global one.
 
     Raises:
         MissingExtra: `prometheus_client` is not installed.
-        ValueError: The registry has such metrics already: share the observer.
+        ValueError: The registry already has these metrics; share the observer.
     """
 
     def __init__(self, registry: CollectorRegistry | None = None) -> None:
@@ -48,7 +48,7 @@ class PrometheusObserver:
         self._received = Counter(f"{prefix}_received_bytes", "Size of replies.", ["op"], registry=into)
 
     def __call__(self, record: CallRecord) -> None:
-        """Take note of a request."""
+        """Record a request."""
         op = record.op
         self._requests.labels(op, str(record.outcome)).inc()
         self._queue.labels(op).observe(record.queued_s)
@@ -61,17 +61,17 @@ class PrometheusObserver:
 class PrometheusServerMetrics:
     """Counts the requests of a simulated server.
 
-    The metrics are `urlab_server_requests_total` by op and error code (empty without), and by op
-    `urlab_server_request_seconds`, `urlab_server_request_bytes_total` and `urlab_server_reply_bytes_total`. Read when
-    asked for: `urlab_server_playing`, `urlab_server_simulation_seconds` and `urlab_server_healthy`.
+    The metrics are `urlab_server_requests_total` by op and error code (empty on success), and by op
+    `urlab_server_request_seconds`, `urlab_server_request_bytes_total` and `urlab_server_reply_bytes_total`. Read on
+    scrape: `urlab_server_playing`, `urlab_server_simulation_seconds` and `urlab_server_healthy`.
 
     Args:
-        server: The server, started; it is counted until it is closed.
-        registry: Where the metrics go; the program's by default.
+        server: The started server; its requests are counted until it is closed.
+        registry: Registry of the metrics; by default the global one.
 
     Raises:
         MissingExtra: `prometheus_client` is not installed.
-        ValueError: The registry has such metrics already.
+        ValueError: The registry already has these metrics.
         RuntimeError: The server is closed.
     """
 

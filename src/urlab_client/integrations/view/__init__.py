@@ -1,7 +1,7 @@
-"""Seeing a simulation while it goes on: in Rerun, in Foxglove, in MuJoCo's own window.
+"""Live views of a simulation in Rerun, in Foxglove, and in MuJoCo's own window.
 
-Rerun needs the extra `rerun`, Foxglove the extra `foxglove`, the window a display. All coordinates are MuJoCo's world:
-metres, right-handed, z up.
+Rerun requires the extra `rerun`, Foxglove the extra `foxglove`, and the window a display. All coordinates are in the
+MuJoCo world frame: metres, right-handed, z up.
 """
 
 from urlab_client.integrations.view.foxglove_view import foxglove_view

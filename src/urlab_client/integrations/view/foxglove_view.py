@@ -41,12 +41,12 @@ __all__ = ["foxglove_view"]
 
 _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
-_BACKLOG = 64  # messages that may wait for one browser; older ones are dropped
-_JOINING_S = 1.0  # after a subscription, how long the newest moment is shown again
+_BACKLOG = 64  # queue length per browser; older messages are dropped
+_JOINING_S = 1.0  # how long after a subscription the newest state is sent again
 
 
 class _Foxglove:
-    """Shows moments to whoever is connected."""
+    """Shows states to all connected clients."""
 
     def __init__(self, *, host: str, port: int, sensors: bool) -> None:
         self._host, self._port = host, port
@@ -62,7 +62,7 @@ class _Foxglove:
 
     @property
     def address(self) -> str:
-        """Where the server listens."""
+        """Address of the server."""
         if self._server is None:
             return ""
         host = f"[{self._host}]" if ":" in self._host else self._host
@@ -106,7 +106,7 @@ class _Foxglove:
         if self._server is not None and self._last is not None:
             self._server.clear_session()
         for key in [key for key in self._channels if key[1]]:
-            self._channels.pop(key).close()  # the layout in its metadata is another one now
+            self._channels.pop(key).close()  # the layout in its metadata has changed
         self._joined = time.monotonic()
 
     def show(self, moment: Moment) -> None:
@@ -130,8 +130,9 @@ class _Foxglove:
 
     def idle(self) -> bool:
         """See `ViewBackend`."""
-        # Or who joins while time stands still sees nothing. More than once: a subscription may be told of before it is
-        # in force.
+        # So that clients that join while time stands still see something. Repeated, because a subscription may be
+        # reported
+        # before it takes effect.
         now = time.monotonic()
         if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
             self._shown = now
@@ -147,7 +148,7 @@ class _Foxglove:
             self._server.stop()
 
     def _send(self, topic: str, make: Callable[[], Struct], ns: int, metadata: dict[str, str] | None = None) -> None:
-        """Send what `make` returns; it is asked only when somebody has subscribed, and once for the topic's schema."""
+        """Send the result of `make`, which is called only if there is a subscriber, and once for the topic's schema."""
         import foxglove  # noqa: PLC0415
 
         key = topic, (metadata or {}).get("layout", "")
@@ -231,7 +232,7 @@ class _Foxglove:
 
 
 def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quaternion:
-    """Return the shortest turn of the x axis, along which arrows point, into a direction of length 1."""
+    """Return the shortest rotation of the x axis, along which arrows point, to a unit vector."""
     from foxglove import messages as fox  # noqa: PLC0415
 
     x, y, z = direction.tolist()
@@ -353,31 +354,31 @@ def foxglove_view(
     sensors: bool = False,
     max_hz: float = 30.0,
 ) -> AsyncView | View:
-    """Serve what a client goes through to Foxglove: a context manager, of the client's own flavour.
+    """Show a client's simulation in Foxglove; a context manager of the client's flavour.
 
     Foxglove connects to the view's `address`. Topics and frames are those of a recording (`record`): `/tf`,
-    `/joint_states`, `/state/ARTICULATION`, `/contacts`, `/camera/NAME`; besides, `/scene` has the bodies' geometry and
-    `/contact_markers` arrows of 2 mm per newton. Frames are in `world`: metres, right-handed, z up. The newest state is
-    shown, at most `max_hz` times per second; what came between is left out and counted, so stepping never waits. After
-    another handshake the new scene replaces the old one.
+    `/joint_states`, `/state/ARTICULATION`, `/contacts`, `/camera/NAME`; in addition, `/scene` has the geometry of the
+    bodies and `/contact_markers` arrows of 2 mm per newton. Frames are in `world`: metres, right-handed, z up. The
+    newest state is shown, at most `max_hz` times per second; skipped states are counted, and stepping never waits.
+    After another handshake the new scene replaces the old one.
 
     Args:
         client: A client after `discover()`, during play, with its local model.
-        host: Interface to listen on. The server asks nobody for a password: others than this machine's own show the
-            simulation to whoever reaches them.
+        host: Interface to listen on. The server has no authentication: on an interface other than loopback, everyone
+            who can reach it sees the simulation.
         port: Port to listen on; 0 for any free one.
-        cameras: Cameras whose pictures to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for each of them.
-            In `direct` mode they are drawn with the step in which they are due, which takes longer then.
-        camera_hz: Pictures per second of simulation time, at most.
-        contacts: Show contacts, computed from the state with the client's own model.
-        sensors: Send sensors' readings in `/state/ARTICULATION`.
-        max_hz: States shown per second of wall time, at most.
+        cameras: Cameras to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for all of them.
+            In `direct` mode they are drawn with the step in which they are due, which then takes longer.
+        camera_hz: Maximum number of pictures per second of simulation time.
+        contacts: Show contacts, computed from the state with the client's local model.
+        sensors: Send sensor readings in `/state/ARTICULATION`.
+        max_hz: Maximum number of states shown per second of wall time.
 
     Raises:
         ImportError: The extra `foxglove` is not installed.
         ValueError: An option is out of range.
 
-    Entering the block raises `URLabError` when the port cannot be used, before `discover()` or without a local model,
+    Entering the block raises `URLabError` if the port cannot be used, before `discover()` or without a local model,
     and `KeyError` for an unknown camera.
     """
     need("foxglove", "PIL", extra="foxglove")

@@ -1,4 +1,4 @@
-"""What a compiled model looks like: its visible geoms as primitives and triangles, in the frames of their bodies."""
+"""The visible geoms of a compiled model as primitives and triangles, in the frames of their bodies."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Kind", "Shape", "shapes_of"]
 
-_VISIBLE_GROUPS = 3  # as MuJoCo's viewers: 0 to 2 are shown, collision geometry is by custom in 3
-_PLANE_M = 20.0  # size of what MuJoCo draws without end
+_VISIBLE_GROUPS = 3  # as in MuJoCo's viewers: 0 to 2 are shown; collision geometry is usually in 3
+_PLANE_M = 20.0  # size of infinite planes
 _PLANE_THICKNESS_M = 0.001
 
 
 class Kind(StrEnum):
-    """What a shape is, and what its size means, metres."""
+    """Kind of a shape, which determines the meaning of its size, metres."""
 
     BOX = "box"
     """Half of each side."""
@@ -33,7 +33,7 @@ class Kind(StrEnum):
     CYLINDER = "cylinder"
     """Radius, and half of the length along z."""
     MESH = "mesh"
-    """Nothing: vertices say it."""
+    """Unused; the vertices determine the size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,14 @@ class Shape:
 
     Attributes:
         body: Name of its body's frame.
-        name: Its own name, or one made of its number.
-        kind: What it is.
+        name: Its name, or one made from its id.
+        kind: Kind of shape.
         size: Three numbers; see `Kind`.
-        position: In the body's frame, metres.
-        orientation: In the body's frame, (w, x, y, z).
-        rgba: Colour, each 0 to 1.
-        vertices: Of a mesh, (n, 3), metres.
-        triangles: Of a mesh, (m, 3), indices of vertices.
+        position: Position in the body's frame, metres.
+        orientation: Quaternion (w, x, y, z) in the body's frame.
+        rgba: Colour, each component 0 to 1.
+        vertices: Vertices of a mesh, shape (n, 3), metres.
+        triangles: Triangles of a mesh, shape (m, 3), indices of vertices.
     """
 
     body: str
@@ -64,7 +64,7 @@ class Shape:
 
 
 def shapes_of(model: mujoco.MjModel, bodies: list[str]) -> list[Shape]:
-    """Return what MuJoCo's viewers show of a model by default.
+    """Return the geoms that MuJoCo's viewers show by default.
 
     Args:
         model: The model.
@@ -75,7 +75,7 @@ def shapes_of(model: mujoco.MjModel, bodies: list[str]) -> list[Shape]:
     for geom in range(model.ngeom):
         rgba = model.geom_rgba[geom]
         material = int(model.geom_matid[geom])
-        if material >= 0 and np.allclose(rgba, 0.5):  # a material counts where the geom has no colour of its own
+        if material >= 0 and np.allclose(rgba, 0.5):  # the material applies if the geom has no colour of its own
             rgba = model.mat_rgba[material]
         if int(model.geom_group[geom]) >= _VISIBLE_GROUPS or rgba[3] == 0:
             continue
@@ -125,7 +125,7 @@ def _outline(model: mujoco.MjModel, geom: int) -> _Outline | None:
         return Kind.MESH, (0.0, 0.0, 0.0), vertices, triangles
     if kind == types.mjGEOM_HFIELD:
         return Kind.MESH, (0.0, 0.0, 0.0), *_height_field(model, data)
-    return None  # signed distance fields are drawn by MuJoCo's plugins alone
+    return None  # signed distance fields can be drawn only by MuJoCo's plugins
 
 
 def _height_field(model: mujoco.MjModel, field: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

@@ -31,7 +31,7 @@ _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 
 
 class _Rerun:
-    """Shows moments in Rerun."""
+    """Shows states in Rerun."""
 
     def __init__(
         self, *, save: Path | None, connect: str | None, web: bool, web_port: int, grpc_port: int, sensors: bool
@@ -60,7 +60,7 @@ class _Rerun:
 
         recording = rr.RecordingStream("urlab")
         if self._save is not None:
-            self._save.open("wb").close()  # Rerun tells nobody when it cannot write
+            self._save.open("wb").close()  # Rerun does not report when it cannot write
             recording.save(self._save)
         elif self._connect is not None:
             recording.connect_grpc(self._connect)
@@ -86,7 +86,7 @@ class _Rerun:
             pose = rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
             recording.log(where, pose, drawn, static=True)
         for where in before.keys() - self._static.keys():
-            # What is static stays for all times, so robots that are gone are emptied.
+            # Static data stays at all times, so robots that are gone are cleared.
             recording.log(where, before[where].cleared(), static=True)  # type: ignore[attr-defined]  # of each archetype
 
     def show(self, moment: Moment) -> None:
@@ -202,7 +202,7 @@ def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
         case Kind.CYLINDER:
             return rr.Cylinders3D(lengths=[2 * y], radii=[x], colors=rgba, fill_mode=solid), rr.Cylinders3D
         case Kind.CAPSULE:
-            # Rerun's begins at its lower end, MuJoCo's is about its middle.
+            # Rerun's origin is the lower end, MuJoCo's the centre.
             middle = [(0.0, 0.0, -y)]
             capsule = rr.Capsules3D(lengths=[2 * y], radii=[x], translations=middle, colors=rgba, fill_mode=solid)
             return capsule, rr.Capsules3D
@@ -256,35 +256,35 @@ def rerun_view(
     sensors: bool = False,
     max_hz: float = 30.0,
 ) -> AsyncView | View:
-    """Show what a client goes through in Rerun: a context manager, of the client's own flavour.
+    """Show a client's simulation in Rerun; a context manager of the client's flavour.
 
-    The newest state is shown, at most `max_hz` times per second; what came between is left out and counted, so
-    stepping never waits. Bodies are under `world/BODY`, metres, right-handed, z up, their geoms below them; joint
+    The newest state is shown, at most `max_hz` times per second; skipped states are counted, and stepping never
+    waits. Bodies are under `world/BODY`, metres, right-handed, z up, their geoms below them; joint
     positions under `joints/ARTICULATION/JOINT`, radians or metres; contacts under `world/contacts`, their forces in
-    newtons as arrows of 2 mm each; pictures under `world/cameras/NAME`. The timelines are `sim_time`, which goes on
-    where a reset sets it back, `wall_time` and `step`. After another handshake the new scene replaces the old one.
+    newtons as arrows of 2 mm each; pictures under `world/cameras/NAME`. The timelines are `sim_time`, which continues
+    across resets, `wall_time` and `step`. After another handshake the new scene replaces the old one.
 
     Args:
         client: A client after `discover()`, during play, with its local model.
-        save: Write to this `.rrd` file instead of showing anything; one that exists is replaced.
-        connect: Send to a viewer that runs elsewhere, `rerun+http://HOST:9876/proxy`, which may come later.
-        web: Serve Rerun's page for browsers instead of opening a window. Rerun serves page and data on every interface
-            of this machine, to anybody who reaches it; it has no option for that.
-        web_port: Of the page.
-        grpc_port: Of the data, for the page and for the window.
-        cameras: Cameras whose pictures to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for each of them.
-            In `direct` mode they are drawn with the step in which they are due, which takes longer then.
-        camera_hz: Pictures per second of simulation time, at most.
-        contacts: Show contacts, computed from the state with the client's own model.
-        sensors: Show sensors' readings under `sensors/ARTICULATION/SENSOR`.
-        max_hz: States shown per second of wall time, at most.
+        save: Write to this `.rrd` file instead of showing anything, replacing an existing file.
+        connect: Send to a viewer at another address, `rerun+http://HOST:9876/proxy`, which may start later.
+        web: Serve Rerun's page for browsers instead of opening a window. Rerun serves page and data on all interfaces
+            of this machine without authentication, and has no option for that.
+        web_port: Port of the page.
+        grpc_port: Port of the data, for the page and the window.
+        cameras: Cameras to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for all of them.
+            In `direct` mode they are drawn with the step in which they are due, which then takes longer.
+        camera_hz: Maximum number of pictures per second of simulation time.
+        contacts: Show contacts, computed from the state with the client's local model.
+        sensors: Show sensor readings under `sensors/ARTICULATION/SENSOR`.
+        max_hz: Maximum number of states shown per second of wall time.
 
     Raises:
         ImportError: The extra `rerun` is not installed.
         ValueError: An option is out of range, or two destinations are given.
 
-    Entering the block raises `OSError` when the file cannot be made, `KeyError` for an unknown camera, and `URLabError`
-    before `discover()` or without a local model.
+    Entering the block raises `OSError` if the file cannot be created, `KeyError` for an unknown camera, and
+    `URLabError` before `discover()` or without a local model.
     """
     need("rerun", "PIL", extra="rerun")
     if (save is not None) + (connect is not None) + web > 1:

@@ -1,4 +1,4 @@
-"""A view: what a client goes through, shown by a thread that takes the newest state and lets the others go."""
+"""A view of a client's simulation: a thread that shows the newest state and skips the others."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ViewStats(Serializable, Struct, kw_only=True, frozen=True):
         states: States shown.
         frames: Pictures shown.
         dropped_states: States that a newer one replaced before they could be shown.
-        dropped_frames: Likewise pictures.
+        dropped_frames: Pictures that a newer one replaced before they could be shown.
     """
 
     states: int
@@ -63,17 +63,17 @@ class ViewOptions:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What is shown at once.
+    """A state to show.
 
     Attributes:
-        ns: Simulation time, nanoseconds, which goes on where a reset sets it back.
-        wall_ns: UTC.
+        ns: Simulation time, nanoseconds, which continues across resets.
+        wall_ns: UTC, nanoseconds.
         step: Step counter of the session.
-        scene: Names.
+        scene: Names of the scene.
         simulation: Poses and contacts.
-        episode: Number of resets before.
-        contacts: Whether contacts were asked for.
-        state: What the server said; None of the first moment, which is the client's own state.
+        episode: Number of preceding resets.
+        contacts: Whether contacts were requested.
+        state: State from the server; None for the first one, which is the client's own state.
     """
 
     ns: int
@@ -87,24 +87,24 @@ class Moment:
 
 
 class ViewBackend(Protocol):
-    """Where a view shows things. Used by the view's thread alone, except `open` and `address`."""
+    """Display of a view. Used only by the view's thread, except `open` and `address`."""
 
     @property
     def address(self) -> str:
-        """Where what is served can be seen; empty when nothing is."""
+        """Address of the served view; empty if nothing is served."""
         ...
 
     def open(self) -> None:
-        """Get ready.
+        """Open the display.
 
         Raises:
             OSError: A file or port cannot be used.
-            URLabError: Something else is missing.
+            URLabError: Something else is missing, for example a display.
         """
         ...
 
     def use(self, simulation: Simulation, scene: SceneMessages) -> None:
-        """Show this scene from now on instead of the one before."""
+        """Show this scene from now on."""
         ...
 
     def show(self, moment: Moment) -> None:
@@ -112,21 +112,21 @@ class ViewBackend(Protocol):
         ...
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        """Show a picture taken at `ns` of the view's clock."""
+        """Show a picture taken at `ns` on the view's clock."""
         ...
 
     def idle(self) -> bool:
-        """Do what is to be done without a new state; return whether anybody can still look."""
+        """Process events without a new state; return whether the display is still open."""
         ...
 
     def close(self) -> None:
-        """Finish."""
+        """Close the display."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """The state that the client has when the view starts."""
+    """The client's state when the view starts."""
 
     scene: SceneMessages
     qpos: Floats
@@ -136,7 +136,7 @@ class _Start:
 
 
 class AsyncView:
-    """A view that is open between `async with` and its end. Made by `rerun_view` and its siblings."""
+    """A view that is open for the duration of an `async with` block. Created by `rerun_view` and similar functions."""
 
     def __init__(self, client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> None:
         self._client = client
@@ -161,22 +161,22 @@ class AsyncView:
 
     @property
     def stats(self) -> ViewStats:
-        """Counters up to now, from any thread."""
+        """Current counters. Thread-safe."""
         return ViewStats(**self._counts)
 
     @property
     def address(self) -> str:
-        """Where what is served can be seen; empty before the block, and where nothing is served."""
+        """Address of the served view; empty before the block, and if nothing is served."""
         return self._backend.address
 
     @property
     def closed(self) -> bool:
-        """Whether nothing is shown any more: the window was closed, or showing failed, or the block has ended."""
+        """Whether the view has ended: the window was closed, displaying failed, or the block has ended."""
         return self._gone.is_set()
 
     @property
     def error(self) -> Exception | None:
-        """What showing failed with; the simulation goes on without the view."""
+        """The error with which displaying failed; the simulation continues without the view."""
         return self._error
 
     async def __aenter__(self) -> Self:
@@ -185,7 +185,7 @@ class AsyncView:
         scene = self._follower.check()
         self._opened = True
         await anyio.to_thread.run_sync(self._backend.open)
-        if not self._client.config.read_only:  # which knows no state until the first one is published
+        if not self._client.config.read_only:  # a read-only client has no state until the first one is published
             self._states.append(self._start(scene))
         self._thread.start()
         self._follower.start(self._put)
@@ -208,7 +208,7 @@ class AsyncView:
             return _Start(scene, data.qpos.copy(), data.qvel.copy(), round(data.time * _NS), client.step_count)
 
     def finish(self) -> None:
-        """End when the client's loop is gone already. Blocks."""
+        """End if the client's loop has already ended. Blocks."""
         self._follower.forget()
         self._stop.set()
         self._thread.join()
@@ -221,7 +221,7 @@ class AsyncView:
         if isinstance(item, State):
             if self._states:
                 self._counts["dropped_states"] += 1
-            self._states.append(item)  # in place of the one that waits
+            self._states.append(item)  # replaces the waiting one
         else:
             if id(item.camera.view) in self._pictures:
                 self._counts["dropped_frames"] += 1
@@ -233,7 +233,7 @@ class AsyncView:
         period = 1 / self._options.max_hz
         pause = 0.0
         try:
-            # Looking at intervals, not at each state: whoever steps would lose the interpreter each time.
+            # At intervals instead of at each state, which would take the interpreter lock from the stepping thread.
             while not self._stop.wait(pause):
                 started = time.monotonic()
                 self._drain()
@@ -266,7 +266,7 @@ class AsyncView:
         simulation = self._simulation
         if simulation is None or item.scene is not self._scene:
             if item.scene.model is None:
-                return  # what follows has no model; the last scene stays
+                return  # the next scene has no model; the last one stays
             simulation = Simulation(item.scene, item.scene.model)
             self._simulation, self._scene = simulation, item.scene
             self._backend.use(simulation, item.scene)
@@ -290,26 +290,26 @@ class AsyncView:
 
 
 class View(BlockingTwin[AsyncView]):
-    """A view that is open between `with` and its end. Made by `rerun_view` and its siblings."""
+    """A view that is open for the duration of a `with` block. Created by `rerun_view` and similar functions."""
 
     @property
     def stats(self) -> ViewStats:
-        """Counters up to now."""
+        """Current counters."""
         return self._aio.stats
 
     @property
     def address(self) -> str:
-        """Where what is served can be seen; empty before the block, and where nothing is served."""
+        """Address of the served view; empty before the block, and if nothing is served."""
         return self._aio.address
 
     @property
     def closed(self) -> bool:
-        """Whether nothing is shown any more: the window was closed, or showing failed, or the block has ended."""
+        """Whether the view has ended: the window was closed, displaying failed, or the block has ended."""
         return self._aio.closed
 
     @property
     def error(self) -> Exception | None:
-        """What showing failed with; the simulation goes on without the view."""
+        """The error with which displaying failed; the simulation continues without the view."""
         return self._aio.error
 
 
@@ -324,7 +324,7 @@ def make_view(
 def make_view(
     client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
 ) -> AsyncView | View:
-    """Return a view of the client's own flavour.
+    """Return a view of the client's flavour.
 
     Raises:
         ValueError: An option is out of range.

@@ -21,7 +21,7 @@ __all__ = ["missing_for_window", "window_view"]
 
 
 def missing_for_window() -> str:
-    """Say why a window cannot be opened here; empty where it can."""
+    """Return why no window can be opened here; empty if it can."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "there is no display: neither DISPLAY nor WAYLAND_DISPLAY is set"
     if sys.platform == "darwin" and not os.environ.get("MJPYTHON_BIN"):
@@ -30,7 +30,7 @@ def missing_for_window() -> str:
 
 
 class _Window:
-    """Shows moments in `mujoco.viewer`'s window, which is opened anew for another scene."""
+    """Shows states in `mujoco.viewer`'s window, which is reopened for another scene."""
 
     def __init__(self) -> None:
         self._viewer: Any = None
@@ -89,18 +89,18 @@ def window_view(client: AsyncClient, *, max_hz: float = ...) -> AsyncView: ...
 @overload
 def window_view(client: URLabClient, *, max_hz: float = ...) -> View: ...
 def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> AsyncView | View:
-    """Show what a client goes through in MuJoCo's own window: a context manager, of the client's own flavour.
+    """Show a client's simulation in MuJoCo's own window; a context manager of the client's flavour.
 
-    The window shows; it does not drive. When it is closed, `closed` is true and the client goes on.
+    The window does not control the simulation. When it is closed, `closed` is true and the client continues.
 
     Args:
         client: A client after `discover()`, during play, with its local model.
-        max_hz: States shown per second of wall time, at most.
+        max_hz: Maximum number of states shown per second of wall time.
 
     Raises:
         ValueError: `max_hz` is out of range.
 
-    Entering the block raises `URLabError` where no window can be opened, and says what is missing.
+    Entering the block raises `URLabError` if no window can be opened; the message says what is missing.
     """
     options = ViewOptions(cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True)
     return make_view(client, _Window(), options, "window_view")

@@ -1,4 +1,4 @@
-"""Ops by which a client becomes the owner of a robot, without which newer servers refuse its writes."""
+"""Ops with which a client becomes the owner of a robot; newer servers refuse writes from other clients."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, doc
 __all__ = ["OPS", "UNCLAIMED", "ClaimControl", "ClaimControlOk", "ReleaseControl", "ReleaseControlOk"]
 
 UNCLAIMED: Final = "(unclaimed)"
-"""What a server names as owner of a robot that nobody owns."""
+"""Owner that a server reports for a robot without one."""
 
 
 class ClaimControlOk(Reply, tag="claim_control_ok", kw_only=True):
-    """The robot is the client's."""
+    """The client owns the robot."""
 
-    articulation: Annotated[str, doc("Engine's object name, whatever was asked for.")]
-    owner: Annotated[str, doc("Who owns it: `control_owner`, or the session id where the server does not read that.")]
-    ttl_s: Annotated[float, doc("Seconds without a write after which the claim ends; 0 for never.")]
+    articulation: Annotated[str, doc("Engine's object name, regardless of the requested name.")]
+    owner: Annotated[str, doc("Owner: `control_owner`, or the session id if the server does not read that field.")]
+    ttl_s: Annotated[float, doc("Seconds without a write after which the claim expires; 0 for never.")]
 
 
 class ClaimControl(ControlRequest[ClaimControlOk], tag="claim_control", kw_only=True, omit_defaults=True):
-    """Become the one owner of a robot, or stay it."""
+    """Become the only owner of a robot, or renew the ownership."""
 
     articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
-    ttl_s: Annotated[float, doc("Seconds without a write after which the claim ends; 0 or less for never.")] = 0.0
+    ttl_s: Annotated[float, doc("Seconds without a write after which the claim expires; 0 or less for never.")] = 0.0
     force: Annotated[bool, doc("Take the robot from its owner.")] = False
 
 
 class ReleaseControlOk(Reply, tag="release_control_ok", kw_only=True):
-    """The robot is nobody's."""
+    """The robot has no owner."""
 
-    articulation: Annotated[str, doc("Engine's object name, whatever was asked for.")]
+    articulation: Annotated[str, doc("Engine's object name, regardless of the requested name.")]
 
 
 class ReleaseControl(ControlRequest[ReleaseControlOk], tag="release_control", kw_only=True, omit_defaults=True):
-    """Give up a robot."""
+    """Release a robot."""
 
     articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
 

@@ -26,8 +26,8 @@ __all__ = [
     "SetOverlayTextOk",
 ]
 
-Ttl = Annotated[float, doc("Seconds to live: 0 a single frame, negative until `clear_markers`.")]
-Tag = Annotated[str | None, doc("Accepted, without effect: clearing is never by tag.")]
+Ttl = Annotated[float, doc("Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.")]
+Tag = Annotated[str | None, doc("Accepted but not used; markers cannot be cleared by tag.")]
 UnrealQuat = Annotated[
     Quat, doc("Rotation (x, y, z, w) in Unreal's frame; send (-x, y, -z, w) for a MuJoCo quaternion.")
 ]
@@ -99,7 +99,7 @@ class DrawAxesOk(Reply, tag="draw_axes_ok", kw_only=True):
 
 
 class DrawAxes(Request[DrawAxesOk], tag="draw_axes", kw_only=True, omit_defaults=True):
-    """Draw a red, green and blue triad; Unreal's is left-handed, so its green points along MuJoCo's -y."""
+    """Draw a red, green and blue triad. Unreal's frame is left-handed, so green points along MuJoCo's -y."""
 
     location: Point
     rotation_quat: UnrealQuat | None = None
@@ -114,7 +114,7 @@ class ClearMarkersOk(Reply, tag="clear_markers_ok", kw_only=True):
 
 
 class ClearMarkers(Request[ClearMarkersOk], tag="clear_markers", kw_only=True, omit_defaults=True):
-    """Remove all debug drawing of the world in use."""
+    """Remove all debug drawing from the world in use."""
 
     tag: Tag = None
 
@@ -127,7 +127,7 @@ class SetOverlayText(Request[SetOverlayTextOk], tag="set_overlay_text", kw_only=
     """Show a line of text on the screen for 10 s; empty text clears it."""
 
     text: Annotated[str, doc("The text.")]
-    anchor: Annotated[str, doc("Accepted; the plugin always uses the top left.")] = "top_left"
+    anchor: Annotated[str, doc("Accepted but not used; the plugin always uses the top left.")] = "top_left"
 
 
 OPS: Final = (

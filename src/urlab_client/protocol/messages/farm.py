@@ -1,4 +1,4 @@
-"""Ops of `client.farm`: which of several clients may use a server."""
+"""Ops of `client.farm`: leases, with which clients share servers."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ __all__ = ["OPS", "AcquireLease", "AcquireLeaseOk", "ReleaseLease", "ReleaseLeas
 class AcquireLeaseOk(Reply, tag="acquire_lease_ok", kw_only=True):
     """The lease."""
 
-    lease_id: Annotated[str, doc("Id to give it back with.")]
-    ttl_s: Annotated[float, doc("Seconds without a request after which it ends.")]
+    lease_id: Annotated[str, doc("Id for `release_lease`.")]
+    ttl_s: Annotated[float, doc("Seconds without a request after which the lease expires.")]
 
 
 class AcquireLease(Request[AcquireLeaseOk], tag="acquire_lease", kw_only=True, omit_defaults=True):
-    """Take the server's one driver lease and return its id.
+    """Acquire the server's only driver lease and return its id.
 
-    The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
-    alive.
+    The lease is advisory: it shows other clients that the server is in use, and the server does not enforce it.
+    Every request keeps it alive.
     """
 
-    owner: Annotated[str, doc("Who takes it, for people.")] = ""
-    ttl_s: Annotated[float, doc("Seconds without a request after which it ends; 0 or less ends it at once.")] = 60.0
+    owner: Annotated[str, doc("Human-readable name of the holder.")] = ""
+    ttl_s: Annotated[float, doc("Seconds without a request until the lease expires; 0 or less for immediately.")] = 60.0
 
 
 class ReleaseLeaseOk(Reply, tag="release_lease_ok", kw_only=True):
@@ -32,9 +32,9 @@ class ReleaseLeaseOk(Reply, tag="release_lease_ok", kw_only=True):
 
 
 class ReleaseLease(Request[ReleaseLeaseOk], tag="release_lease", kw_only=True):
-    """Give the driver lease back."""
+    """Release the driver lease."""
 
-    lease_id: Annotated[str, doc("What `acquire_lease` returned.")]
+    lease_id: Annotated[str, doc("Return value of `acquire_lease`.")]
 
 
 OPS: Final = (

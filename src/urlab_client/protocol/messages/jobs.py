@@ -1,4 +1,4 @@
-"""Editor ops that take long: their start, and the op that tells how far they are and hands over their reply."""
+"""Editor ops that run as jobs: the reply that announces a job, and the op that returns its progress and result."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ __all__ = ["OPS", "OpStarted", "OpStatus", "OpStatusOk"]
 
 
 class OpStarted(Reply, tag="op_started", kw_only=True):
-    """The op has begun; `op_status` hands over its reply."""
+    """The op has started; `op_status` returns its reply."""
 
     job_id: Annotated[str, doc("`job_` and a number, unique in the editor's process.")]
     state: Annotated[str, doc("`running`.")] = "running"
 
 
 class OpStatusOk(Reply, tag="op_status_ok", kw_only=True, omit_defaults=True):
-    """How far a job is. Its end is told once; after that the server does not know the job any more."""
+    """Progress of a job. The server reports its end once, and no longer knows the job after that."""
 
     job_id: Annotated[str, doc("As requested.")]
     state: Annotated[str, doc("`running`, `done` or `failed`.")]
-    progress: Annotated[str | None, doc("Text for people; the plugin sends none.")] = None
-    result: Annotated[dict[str, Any] | None, doc("The op's reply, or its error, with its own `op`; at the end.")] = None
+    progress: Annotated[str | None, doc("Human-readable text; the plugin sends none.")] = None
+    result: Annotated[dict[str, Any] | None, doc("At the end, the op's reply or error, with its own `op`.")] = None
 
 
 class OpStatus(Request[OpStatusOk], tag="op_status", kw_only=True):
-    """Ask how far a job is."""
+    """Query the progress of a job."""
 
     job_id: Annotated[str, doc("From `op_started`.")]
 
 
 OPS: Final = (
-    # Not a read: the reply that tells the end exists once.
+    # Not a read: the server sends the reply that reports the end only once.
     Op(request=OpStatus, ns="scene", needs=Needs.EDITOR, errors=("bad_request", "unknown_job"), dialects=("beta",)),
 )

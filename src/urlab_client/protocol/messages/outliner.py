@@ -1,4 +1,4 @@
-"""Ops of `client.outliner`: looking at the world."""
+"""Ops of `client.outliner`: inspecting the world."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class ActorsReply(Reply, kw_only=True):
     """Rows of actors."""
 
     actors: Annotated[list[ActorRow], doc("One row per actor.")]
-    in_pie: Annotated[bool, doc("Whether a play session runs, or was searched.")]
+    in_pie: Annotated[bool, doc("Whether a play session is running, or was searched.")]
 
 
 class ListActorsOk(ActorsReply, tag="list_actors_ok", kw_only=True):
@@ -107,7 +107,7 @@ class FindActors(Request[FindActorsOk], tag="find_actors", kw_only=True, omit_de
     class_filter: Annotated[str | None, doc("Class or parent class name, any letter case.")] = None
     tag: Annotated[str | None, doc("Whole tag, any letter case.")] = None
     name_prefix: Annotated[str | None, doc("Beginning of the engine actor name, any letter case.")] = None
-    in_pie: Annotated[bool, doc("Search the play world when it runs.")] = False
+    in_pie: Annotated[bool, doc("Search the play world if play is running.")] = False
 
 
 class GetActorBoundsOk(Reply, tag="get_actor_bounds_ok", kw_only=True):
@@ -125,7 +125,7 @@ class GetActorBounds(Request[GetActorBoundsOk], tag="get_actor_bounds", kw_only=
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
-    components_only: Annotated[bool, doc("Count components without collision, too.")] = False
+    components_only: Annotated[bool, doc("Also include components without collision.")] = False
 
 
 class SelectActorOk(Reply, tag="select_actor_ok", kw_only=True):
@@ -153,7 +153,7 @@ class AddQuickConvertOk(Reply, tag="add_quick_convert_ok", kw_only=True):
 
 
 class AddQuickConvert(Request[AddQuickConvertOk], tag="add_quick_convert", kw_only=True, omit_defaults=True):
-    """Make a static-mesh actor a MuJoCo body from the next play session on."""
+    """Turn a static-mesh actor into a MuJoCo body, from the next play session on."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"

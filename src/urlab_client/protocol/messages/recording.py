@@ -40,15 +40,15 @@ class RecordingStartOk(Reply, tag="recording_start_ok", kw_only=True):
 class RecordingStart(Request[RecordingStartOk], tag="recording_start", kw_only=True, omit_defaults=True):
     """Start recording joint states."""
 
-    name: Annotated[str | None, doc("Accepted; servers name the session themselves.")] = None
-    max_duration_s: Annotated[float | None, doc("Keep only the newest seconds of simulation time.")] = None
+    name: Annotated[str | None, doc("Accepted but not used; the server names the session.")] = None
+    max_duration_s: Annotated[float | None, doc("Seconds of simulation time to keep; None for no limit.")] = None
 
 
 class RecordingStopOk(Reply, tag="recording_stop_ok", kw_only=True):
-    """What was recorded."""
+    """The stopped recording."""
 
     name: Annotated[str, doc("Session name.")]
-    frame_count: Annotated[int, doc("Frames; the plugin counts some twice.")]
+    frame_count: Annotated[int, doc("Number of frames; the plugin counts some twice.")]
     sim_duration_s: Annotated[float, doc("Last minus first timestamp, seconds.")]
 
 
@@ -57,7 +57,7 @@ class RecordingStop(Request[RecordingStopOk], tag="recording_stop", kw_only=True
 
 
 class RecordingSaveOk(Reply, tag="recording_save_ok", kw_only=True):
-    """Where it went."""
+    """The saved file."""
 
     absolute_path: Annotated[str, doc("Path on the server's machine.")]
 
@@ -109,25 +109,25 @@ class ReplaySetActive(Request[ReplaySetActiveOk], tag="replay_set_active", kw_on
 
 
 class ReplayStartOk(Reply, tag="replay_start_ok", kw_only=True):
-    """The replay that runs."""
+    """The running replay."""
 
     active_session: Annotated[str, doc("Session name.")]
-    total_frames: Annotated[int, doc("Frames in it.")]
+    total_frames: Annotated[int, doc("Number of frames.")]
 
 
 class ReplayStart(Request[ReplayStartOk], tag="replay_start", kw_only=True):
-    """Play the active session; needs mode direct or puppet."""
+    """Play the active session. Requires step mode `direct` or `puppet`."""
 
 
 class ReplayStopOk(Reply, tag="replay_stop_ok", kw_only=True):
-    """Nothing plays any more."""
+    """The replay has stopped."""
 
 
 class ReplayStop(Request[ReplayStopOk], tag="replay_stop", kw_only=True):
     """Stop playing."""
 
 
-# The plugin declares no reply fields for these.
+# The plugin declares no reply fields for these ops.
 OPS: Final = (
     Op(
         request=RecordingStart,

@@ -63,7 +63,7 @@ class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
 
 
 class SetMode(Request[SetModeOk], tag="set_mode", kw_only=True):
-    """Switch the step mode; any mode but live un-pauses physics."""
+    """Switch the step mode. Every mode except live resumes paused physics."""
 
     mode: Annotated[str, doc("`live`, `direct`, `puppet` or `auto`.")]
 
@@ -75,7 +75,7 @@ class SetPausedOk(Reply, tag="set_paused_ok", kw_only=True):
 
 
 class SetPaused(Request[SetPausedOk], tag="set_paused", kw_only=True):
-    """Pause or resume physics and return the state in force."""
+    """Pause or resume physics, and return the state in force."""
 
     paused: Annotated[bool, doc("True to pause.")]
 
@@ -87,13 +87,13 @@ class SetSimSpeedOk(Reply, tag="set_sim_speed_ok", kw_only=True):
 
 
 class SetSimSpeed(Request[SetSimSpeedOk], tag="set_sim_speed", kw_only=True):
-    """Set the pacing of live mode and return the value in force."""
+    """Set the pacing of live mode, and return the value in force."""
 
     percent: Annotated[float, doc("Percent of real time; the engine clamps to 5..100.")]
 
 
 class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_defaults=True):
-    """What was switched."""
+    """The control source in force."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
     scope: Annotated[str, doc("`global` or `articulation`.")]
@@ -101,7 +101,7 @@ class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_
 
 
 class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
-    """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
+    """Choose the source of the set-points for the actuators: this protocol or the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
     articulation: Annotated[str | None, doc("Articulation key, actor id or engine's object name; None for all.")] = None
@@ -124,17 +124,17 @@ class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_d
 
 
 class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
-    """What was written."""
+    """The written positions."""
 
     target: Annotated[str, doc("As requested.")]
     actor_name: Annotated[str, doc("Articulation key.")]
     actor_id: ActorId = ""
-    qpos: Annotated[Floats, doc("Values read back, shape (7,) for the shortcut, else all of the articulation's.")]
-    free_base_shortcut: Annotated[bool, doc("True when only the free base was written.")]
+    qpos: Annotated[Floats, doc("Values read back, shape (7,) for the shortcut, otherwise all of the articulation.")]
+    free_base_shortcut: Annotated[bool, doc("True if only the free base was written.")]
 
 
 class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
-    """Write joint positions of an articulation and run `mj_forward`; velocities and time stay."""
+    """Write joint positions of an articulation and run `mj_forward`. Velocities and time do not change."""
 
     target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]
     qpos: Annotated[Floats, doc("All joint positions in joint order, or 7 values for the free base alone.")]
@@ -154,9 +154,9 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
 
 
 class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
-    """Place a mocap body; body poses follow at the next step or `forward()`."""
+    """Place a mocap body. Body poses change at the next step or `forward()`."""
 
-    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
+    body: Annotated[str, doc("Compiled name, or short name with or without the articulation's key or actor id.")]
     pos: Annotated[Vec3 | None, doc("Position, metres, world frame; None keeps it.")] = None
     quat: Annotated[QuatWXYZ | None, doc("Unit quaternion (w, x, y, z), world frame; None keeps it.")] = None
 
@@ -168,14 +168,14 @@ class ReadMocapPoseOk(MocapReply, tag="read_mocap_pose_ok", kw_only=True):
 class ReadMocapPose(Request[ReadMocapPoseOk], tag="read_mocap_pose", kw_only=True):
     """Read the pose of a mocap body."""
 
-    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
+    body: Annotated[str, doc("Compiled name, or short name with or without the articulation's key or actor id.")]
 
 
 class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):
     """Active contacts."""
 
     n_contacts: Annotated[int, doc("Length of `contacts`, not the total.")]
-    truncated: Annotated[bool, doc("True when more contacts matched.")]
+    truncated: Annotated[bool, doc("True if more contacts matched.")]
     contacts: Annotated[list[Contact], doc("In the order of `mjData.contact`.")]
 
 
@@ -189,9 +189,9 @@ class ContactFilter(Serializable, Struct, kw_only=True, omit_defaults=True):
 
 
 class GetContacts(Request[GetContactsOk], tag="get_contacts", kw_only=True, omit_defaults=True):
-    """Snapshot the active contacts."""
+    """Return a snapshot of the active contacts."""
 
-    max_contacts: Annotated[int, doc("Cap on the number returned.")] = 64
+    max_contacts: Annotated[int, doc("Maximum number of contacts to return.")] = 64
     filter: Annotated[ContactFilter | None, doc("Names to match.")] = None
 
 
@@ -213,16 +213,16 @@ class ConfigureControllerOk(Reply, tag="configure_controller_ok", kw_only=True):
 
 
 class ConfigureController(Request[ConfigureControllerOk], tag="configure_controller", kw_only=True):
-    """Change parameters of an articulation's controller; those left out stay."""
+    """Change parameters of an articulation's controller. Omitted parameters do not change."""
 
     articulation: Annotated[str, doc("Articulation key.")]
     params: Annotated[dict[str, Any], doc("Parameters to change.")]
 
 
 class SetUserChannelsOk(Reply, tag="set_user_channels_ok", kw_only=True):
-    """What became of the values; a success even if none was taken."""
+    """Result for the values; a success even if all were rejected."""
 
-    applied: Annotated[int, doc("Number of values taken.")]
+    applied: Annotated[int, doc("Number of accepted values.")]
     rejected: Annotated[
         dict[str, str],
         doc(
@@ -233,14 +233,14 @@ class SetUserChannelsOk(Reply, tag="set_user_channels_ok", kw_only=True):
 
 
 class SetUserChannels(Request[SetUserChannelsOk], tag="set_user_channels", kw_only=True, omit_defaults=True):
-    """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+    """Write user channels that the level declares for its robots or the scene; the state returns their values.
 
-    Returns the reason by `<articulation>/<channel>` or `scene/<channel>` for each value that was not taken.
+    Returns the reason for each rejected value, by `<articulation>/<channel>` or `scene/<channel>`.
     """
 
     arts: Annotated[
         dict[str, dict[str, Any]] | None,
-        doc("Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`."),
+        doc("Articulation to channel to a bool, number, string, list of numbers, or map of `pos` and `quat`."),
     ] = None
     scene: Annotated[dict[str, Any] | None, doc("Channel of the scene to value.")] = None
 
@@ -252,9 +252,9 @@ class SetSimOptionsOk(Reply, tag="set_sim_options_ok", kw_only=True):
 
 
 class SetSimOptions(Request[SetSimOptionsOk], tag="set_sim_options", kw_only=True):
-    """Change fields of `mjOption`; effective from the next step."""
+    """Change fields of `mjOption`, effective from the next step."""
 
-    options: Annotated[SimOptions, doc("Fields to change; None leaves a field alone.")]
+    options: Annotated[SimOptions, doc("Fields to change; None keeps a field.")]
 
 
 OPS: Final = (

@@ -67,7 +67,7 @@ __all__ = [
 
 
 class LevelReply(Reply, kw_only=True):
-    """Answer of the ops that name a level."""
+    """Reply of the ops that name a level."""
 
     level_path: Annotated[str, doc("Package path, for example `/Game/Levels/lab`.")]
 
@@ -77,11 +77,11 @@ class ImportXmlOk(Reply, tag="import_xml_ok", kw_only=True):
 
     blueprint_class_path: Annotated[str, doc("Class path for `spawn_actor`.")]
     blueprint_short_name: Annotated[str, doc("Asset name: the file's stem.")]
-    imported_now: Annotated[bool, doc("False when an existing blueprint was reused.")]
+    imported_now: Annotated[bool, doc("False if an existing blueprint was reused.")]
 
 
 class ImportXml(Request[ImportXmlOk], tag="import_xml", kw_only=True, omit_defaults=True):
-    """Turn an MJCF file on the server's disk into an articulation blueprint."""
+    """Import an MJCF file on the server's disk as an articulation blueprint."""
 
     path: Annotated[str, doc("MJCF file on the server's machine; absolute paths are safest.")]
     force_reimport: Annotated[bool, doc("Replace an existing blueprint of the same file stem.")] = False
@@ -92,12 +92,12 @@ class CreateLevelOk(LevelReply, tag="create_level_ok", kw_only=True):
 
 
 class CreateLevel(Request[CreateLevelOk], tag="create_level", kw_only=True, omit_defaults=True):
-    """Create an empty level, make it the open one and save it.
+    """Create an empty level, open it and save it.
 
     The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
     """
 
-    name: Annotated[str, doc("Short name, or a package or object path beginning with `/Game/`.")]
+    name: Annotated[str, doc("Short name, or a package or object path that starts with `/Game/`.")]
     force_overwrite: Annotated[bool, doc("Replace an existing level of that name.")] = False
 
 
@@ -106,9 +106,9 @@ class LoadLevelOk(LevelReply, tag="load_level_ok", kw_only=True):
 
 
 class LoadLevel(Request[LoadLevelOk], tag="load_level", kw_only=True):
-    """Open an existing level; unsaved edits of the open one are lost."""
+    """Open an existing level. Unsaved edits of the current level are lost."""
 
-    name_or_path: Annotated[str, doc("Short name, or a package or object path beginning with `/Game/`.")] = field(
+    name_or_path: Annotated[str, doc("Short name, or a package or object path that starts with `/Game/`.")] = field(
         name="level_path"
     )
 
@@ -126,7 +126,7 @@ class CurrentLevelOk(LevelReply, tag="current_level_ok", kw_only=True):
 
 
 class CurrentLevel(Request[CurrentLevelOk], tag="current_level", kw_only=True):
-    """Return the package path of the open level; during play still the edited one."""
+    """Return the package path of the open level; during play this is still the edited level."""
 
 
 class EnsureManagerOk(Reply, tag="ensure_manager_ok", kw_only=True):
@@ -134,13 +134,13 @@ class EnsureManagerOk(Reply, tag="ensure_manager_ok", kw_only=True):
 
     actor_name: Annotated[str, doc("Name of the manager actor.")]
     actor_path: Annotated[str, doc("Full object path.")]
-    was_existing: Annotated[bool, doc("True when the level had one already.")]
+    was_existing: Annotated[bool, doc("True if the level already had one.")]
 
 
 class EnsureManager(Request[EnsureManagerOk], tag="ensure_manager", kw_only=True):
-    """Make sure the level holds one manager actor, without which play never becomes ready.
+    """Ensure that the level has one manager actor, without which play never becomes ready.
 
-    Returns whether the level had one already.
+    Returns whether the level already had one.
     """
 
 
@@ -151,14 +151,14 @@ class SpawnActorOk(Reply, tag="spawn_actor_ok", kw_only=True):
     actor_name: Annotated[str, doc("Engine actor name; becomes the articulation key.")]
     actor_path: Annotated[str, doc("Full object path.")]
     blueprint_class_path: Annotated[str, doc("Class path after expansion.")]
-    location: Annotated[Vec3, doc("Wrong in the plugin (divided by 100, y negated): use what was sent.")]
+    location: Annotated[Vec3, doc("Wrong in the plugin (divided by 100, y negated); use the sent location.")]
     rotation_quat: QuatXYZW
-    was_existing: Annotated[bool, doc("True when an existing actor was moved.")]
+    was_existing: Annotated[bool, doc("True if an existing actor was moved.")]
     requires_pie_restart: RequiresPieRestart
 
 
 class SpawnActor(Request[SpawnActorOk], tag="spawn_actor", kw_only=True, omit_defaults=True):
-    """Place an instance of a blueprint in the edited level, or move the one that carries the id."""
+    """Place an instance of a blueprint in the edited level, or move the actor that has the id."""
 
     blueprint: Annotated[str, doc("Blueprint, or its package or class path.")]
     actor_id: ActorId = ""
@@ -174,7 +174,7 @@ class GridCell(Serializable, Struct, kw_only=True):
     actor_id: ActorId
     actor_name: Annotated[str, doc("Engine actor name.")]
     actor_path: Annotated[str, doc("Full object path.")]
-    was_existing: Annotated[bool, doc("True when an existing actor was moved.")]
+    was_existing: Annotated[bool, doc("True if an existing actor was moved.")]
     location: Location
 
 
@@ -216,18 +216,18 @@ class SpawnLightOk(Reply, tag="spawn_light_ok", kw_only=True):
 
 
 class SpawnLight(Request[SpawnLightOk], tag="spawn_light", kw_only=True, omit_defaults=True):
-    """Place a light; each call adds one."""
+    """Place a light. Each call adds one."""
 
     kind: Annotated[str, doc("`directional`, `point` or `spot`.")] = "directional"
     actor_id: ActorId = ""
     location: Location = (0.0, 0.0, 0.0)
     rotation_euler: EulerDeg = (0.0, 0.0, 0.0)
-    intensity: Annotated[float, doc("In Unreal's unit for that kind of light.")] = 5000.0
+    intensity: Annotated[float, doc("Intensity in Unreal's unit for that kind of light.")] = 5000.0
     color: Color = (1.0, 1.0, 1.0)
 
 
 class DestroyActorOk(Reply, tag="destroy_actor_ok", kw_only=True):
-    """The actor is gone from the edited level."""
+    """The actor was removed from the edited level."""
 
     requires_pie_restart: RequiresPieRestart
 
@@ -240,27 +240,27 @@ class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True, o
 
 
 class RemoveActorOk(Reply, tag="remove_actor_ok", kw_only=True):
-    """The actor is gone from the edited level."""
+    """The actor was removed from the edited level."""
 
     requires_pie_restart: RequiresPieRestart
 
 
 class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True, omit_defaults=True):
-    """Remove an actor from the edited level; the beta's name of `destroy_actor`."""
+    """Remove an actor from the edited level; the beta's name for `destroy_actor`."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
 
 
 class DestroyAssetOk(Reply, tag="destroy_asset_ok", kw_only=True):
-    """The asset is gone."""
+    """The asset no longer exists."""
 
     asset_path: Annotated[str, doc("As requested.")]
-    was_found: Annotated[bool, doc("False when nothing was there.")]
+    was_found: Annotated[bool, doc("False if the asset did not exist.")]
 
 
 class DestroyAsset(Request[DestroyAssetOk], tag="destroy_asset", kw_only=True):
-    """Delete an asset by object path and return whether it existed."""
+    """Delete an asset by object path, and return whether it existed."""
 
     asset_path: Annotated[str, doc("Object path with the name repeated: `/Game/Levels/lab.lab`.")]
 
@@ -273,7 +273,7 @@ class SetActorTransformOk(Reply, tag="set_actor_transform_ok", kw_only=True):
 
 
 class SetActorTransform(Request[SetActorTransformOk], tag="set_actor_transform", kw_only=True, omit_defaults=True):
-    """Move an actor of the edited level; parts that are left out stay."""
+    """Move an actor of the edited level. Omitted parts of the transform do not change."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
@@ -295,7 +295,7 @@ class DuplicateActor(Request[DuplicateActorOk], tag="duplicate_actor", kw_only=T
     """Spawn another instance of an actor's class with the same rotation and scale."""
 
     target: ActorTarget
-    new_actor_id: Annotated[str, doc("Id of the copy; one that exists moves that actor.")]
+    new_actor_id: Annotated[str, doc("Id of the copy; an existing id moves that actor.")]
     target_by: TargetBy = "actor_id"
     location: Annotated[Vec3 | None, doc("Position of the copy, metres; default 1 m along x from the source.")] = None
 
@@ -303,11 +303,11 @@ class DuplicateActor(Request[DuplicateActorOk], tag="duplicate_actor", kw_only=T
 class ActorHierarchyOk(Reply, tag="actor_hierarchy_ok", kw_only=True):
     """The tree."""
 
-    root: Annotated[ActorHierarchyNode, doc("The actor asked for.")]
+    root: Annotated[ActorHierarchyNode, doc("The requested actor.")]
 
 
 class ActorHierarchy(Request[ActorHierarchyOk], tag="actor_hierarchy", kw_only=True, omit_defaults=True):
-    """Return the tree of actors attached to an actor; a robot is a single node."""
+    """Return the tree of actors attached to an actor. A robot is a single node."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
@@ -333,14 +333,14 @@ class SnapshotRow(Serializable, Struct, kw_only=True, omit_defaults=True):
     location: Location
     rotation_quat: QuatXYZW
     tags: Annotated[list[str], doc("Actor tags.")]
-    urlab: Annotated[UrlabBlock | None, doc("On articulations.")] = None
+    urlab: Annotated[UrlabBlock | None, doc("Metadata, on articulations only.")] = None
 
 
 class SnapshotOk(Reply, tag="snapshot_ok", kw_only=True):
     """Every visible actor."""
 
     actors: Annotated[list[SnapshotRow], doc("One row per actor.")]
-    in_pie: Annotated[bool, doc("True when the rows come from the play world.")]
+    in_pie: Annotated[bool, doc("True if the rows are from the play world.")]
     level_path: Annotated[str, doc("Package path of the world shown.")]
 
 

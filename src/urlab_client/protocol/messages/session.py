@@ -49,10 +49,10 @@ __all__ = [
 
 
 NOT_SENT: Final = msgspec.Raw()
-"""Stands in an undecoded field for what is not there; a field is left out when it holds this very object."""
+"""Value of an undecoded field that is absent; encoding omits a field that holds this very object."""
 
 
-# Some servers leave these fields out, ours never does: msgspec omits what `dict` and `list` themselves made, only.
+# Some servers omit these fields, the simulated one never does: msgspec omits only defaults made by `dict` and `list`.
 def _empty_map() -> dict[str, Any]:
     return {}
 
@@ -65,9 +65,9 @@ class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
     """The server refused a request."""
 
     code: Annotated[str, doc("Short stable code.")]
-    message: Annotated[str, doc("Text for people; absent from one plugin reply.")] = ""
+    message: Annotated[str, doc("Human-readable text; absent from one plugin reply.")] = ""
     absolute_path: Annotated[str | None, doc("Path that `recording_save` could not write.")] = None
-    owner: Annotated[str | None, doc("Who owns the robot, or `(unclaimed)`; with a refused claim or write.")] = None
+    owner: Annotated[str | None, doc("Owner of the robot, or `(unclaimed)`; with a refused claim or write.")] = None
     lease_id: Annotated[str | None, doc("Lease of the holder, with code `busy`.")] = None
 
 
@@ -100,13 +100,13 @@ class ArticulationState(Serializable, Struct, kw_only=True, omit_defaults=True):
     ctrl: Annotated[
         Floats | None,
         doc(
-            "`mjData.ctrl`, what was applied after any controller: the inputs of each actuator, nearly always one, in "
+            "`mjData.ctrl`, as applied after any controller: the inputs of each actuator, nearly always one, in "
             "actuator order. Level standard."
         ),
     ] = None
     act: Annotated[
         Floats | None,
-        doc("First activation of the actuator of each input, 0 where stateless; ordered as `ctrl`. Level standard."),
+        doc("First activation of the actuator of each input, 0 if stateless; ordered as `ctrl`. Level standard."),
     ] = None
     sensors: Annotated[
         dict[str, list[float]] | None, doc("Raw `sensordata` by unprefixed sensor name. Level standard.")
@@ -152,7 +152,7 @@ class Perturbation(Serializable, Struct, kw_only=True):
 
 
 class StateReply(Reply, kw_only=True, omit_defaults=True):
-    """What `step`, `reset` and `forward` have in common."""
+    """Common fields of the replies to `step`, `reset` and `forward`."""
 
     time: Annotated[float, doc("`mjData.time`, seconds.")]
     step: Annotated[int, doc("Step counter of the session; constant in live mode.")]
@@ -162,20 +162,20 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
     sim_time: Annotated[Clock | None, doc("`time` as two integers.")] = None
     wall_time: Annotated[Clock | None, doc("UTC when the reply was built.")] = None
     arts: Annotated[
-        dict[str, ArticulationState] | None, doc("What the beta sends as `per_articulation`, which then is the same.")
+        dict[str, ArticulationState] | None, doc("The beta's field for `per_articulation`, which then is the same.")
     ] = None
 
     def __post_init__(self) -> None:
-        """Bring a reply of either generation into one shape."""
+        """Give replies of both generations the same shape."""
         if self.arts is not None:
             self.per_articulation = self.arts
 
 
 class ReplayProgress(Serializable, Struct, kw_only=True):
-    """Where a replay stands."""
+    """Progress of a replay."""
 
-    current_frame: Annotated[int, doc("Index, from 0, of the newest frame that has been reached.")]
-    total_frames: Annotated[int, doc("Frames of the session.")]
+    current_frame: Annotated[int, doc("Index, from 0, of the newest frame reached.")]
+    total_frames: Annotated[int, doc("Number of frames of the session.")]
 
 
 class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
@@ -183,14 +183,14 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
 
     entities: Annotated[dict[str, EntityState] | None, doc("Plain entities by name.")] = None
     cameras: Annotated[dict[str, CameraFrame] | None, doc("Frames, keyed exactly as requested.")] = None
-    perturbation: Annotated[Perturbation | None, doc("Only in puppet mode pinned by the project.")] = None
+    perturbation: Annotated[Perturbation | None, doc("Only if the project is locked to puppet mode.")] = None
     replay: Annotated[ReplayProgress | None, doc("While a recording plays; the plugin never sends it.")] = None
     frame_id: Annotated[
-        int | None, doc("Number of the state's snapshot, which pictures of it carry; the alpha sends none.")
+        int | None, doc("Number of the state snapshot, also sent with its pictures; the alpha sends none.")
     ] = None
-    scene: Annotated[
-        dict[str, EntityState] | None, doc("What the beta sends as `entities`, which then is the same.")
-    ] = None
+    scene: Annotated[dict[str, EntityState] | None, doc("The beta's field for `entities`, which then is the same.")] = (
+        None
+    )
 
     def __post_init__(self) -> None:
         """See the base class."""
@@ -200,10 +200,10 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
 
 
 class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True):
-    """What a direct or live step tells one articulation."""
+    """Command of a direct or live step for one articulation."""
 
     ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
-    ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; wins over `ctrl`. Direct only.")] = (
+    ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; overrides `ctrl`. Direct only.")] = (
         None
     )
     control_mode: Annotated[str | None, doc("`raw` bypasses the controller for this request. Direct only.")] = None
@@ -213,23 +213,23 @@ class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True
 
 
 CameraChoice: TypeAlias = bool | Mapping[str, str | dict[str, float] | None]
-"""What a step says about pictures: all or none, or camera name to which picture."""
+"""Pictures that a step requests: all or none, or camera name to the kind of picture."""
 
 
 class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True):
-    """Advance physics, or exchange state, as the step mode says."""
+    """Advance physics, or exchange state, according to the step mode."""
 
     n_steps: Annotated[int, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
     observations: Annotated[str | None, doc("Observation level; sticky on the server.")] = None
     include_cameras: Annotated[
         CameraChoice,
-        doc("True, or camera name to `sync`, `latest` or, not in the alpha, `{frame_id: N}` for one of N or later."),
+        doc("True, or camera name to `sync`, `latest` or (not in the alpha) `{frame_id: N}` for picture N or later."),
     ] = False
     wait_cameras: Annotated[bool, doc("Wait for pictures of this step. Not in the alpha.")] = False
     render: Annotated[
         str | None, doc("`sync` renders for this step and waits, `async` does not wait. Not in the alpha.")
     ] = None
-    camera_timeout_ms: Annotated[float | None, doc("Longest wait for pictures, 200 by default.")] = None
+    camera_timeout_ms: Annotated[float | None, doc("Longest wait for pictures, milliseconds; 200 by default.")] = None
     per_articulation: Annotated[dict[str, ArticulationCommand] | None, doc("Commands by articulation key.")] = None
     qpos: Annotated[Floats | None, doc("Full `mjData.qpos`, shape (nq,). Puppet only.")] = None
     qvel: Annotated[Floats | None, doc("Full `mjData.qvel`, shape (nv,). Puppet only.")] = None
@@ -245,7 +245,7 @@ class Reset(Request[ResetOk], tag="reset", kw_only=True, omit_defaults=True):
     """Reset the simulation, optionally to a keyframe, then override joints."""
 
     keyframe_name: Annotated[str | None, doc("Compiled keyframe name, prefix included.")] = None
-    seed: Annotated[int | None, doc("Remembered by the server; no effect on MuJoCo.")] = None
+    seed: Annotated[int | None, doc("Stored by the server; no effect on MuJoCo.")] = None
     per_articulation_qpos: Annotated[
         dict[str, dict[str, float]] | None, doc("First coordinate of a joint, by articulation key and joint name.")
     ] = None
@@ -256,13 +256,13 @@ class ForwardOk(StateReply, tag="forward_ok", kw_only=True, omit_defaults=True):
 
 
 class Forward(Request[ForwardOk], tag="forward", kw_only=True):
-    """Run `mj_forward`: kinematics and dynamics without integration; time and step counter stay."""
+    """Run `mj_forward`: kinematics and dynamics without integration. Time and step counter do not change."""
 
 
 class ControllerInfo(Serializable, Struct, kw_only=True):
     """Controller attached to an articulation."""
 
-    kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
+    kind: Annotated[str, doc("`pd`; `base` for the plugin's passthrough controller.")]
     params: Annotated[dict[str, Any], doc("Current parameters.")]
     schema: Annotated[dict[str, dict[str, Any]], doc("Parameter name to `{type, dtype, min}`.")]
 
@@ -290,11 +290,11 @@ class ArticulationInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One articulation as the handshake describes it."""
 
     prefix: Annotated[str, doc("Articulation key, no trailing underscore.")]
-    actor_id: Annotated[str, doc("Stable id; empty when unset.")]
+    actor_id: Annotated[str, doc("Stable id; empty if unset.")]
     actor_name: Annotated[
-        str | None, doc("Engine's object name, which compiled names begin with; in the alpha that is `prefix`.")
+        str | None, doc("Engine's object name, the prefix of compiled names; in the alpha that is `prefix`.")
     ] = None
-    default_control_mode: Annotated[str, doc("`ue_controller` with a controller attached, else `raw`.")] = field(
+    default_control_mode: Annotated[str, doc("`ue_controller` with a controller attached, otherwise `raw`.")] = field(
         default_factory=str
     )
     controller: Annotated[ControllerInfo | None, doc("The attached controller.")] = None
@@ -304,13 +304,13 @@ class ArticulationInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     original_names: Annotated[OriginalNames, doc("Elements that were renamed; none from the beta on.")] = field(
         default_factory=OriginalNames
     )
-    camera_topics: Annotated[dict[str, CameraInfo], doc("Cameras by name; the beta says `<prefix>/<name>`.")] = field(
+    camera_topics: Annotated[dict[str, CameraInfo], doc("Cameras by name; in the beta `<prefix>/<name>`.")] = field(
         default_factory=_empty_map
     )
 
     @property
     def compiled_prefix(self) -> str:
-        """What compiled names of its elements begin with, before an underscore."""
+        """Prefix of the compiled names of its elements, without the underscore."""
         return self.prefix if self.actor_name is None else self.actor_name
 
 
@@ -318,15 +318,15 @@ class EntityInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One dynamic body outside any articulation."""
 
     id: Annotated[int, doc("MuJoCo body id.")]
-    has_free_base: Annotated[bool, doc("True when its first joint is free.")]
-    free_joint_id: Annotated[int | None, doc("MuJoCo joint id, when it has a free joint.")] = None
+    has_free_base: Annotated[bool, doc("True if its first joint is free.")]
+    free_joint_id: Annotated[int | None, doc("MuJoCo joint id, if it has a free joint.")] = None
     qpos_offset: Annotated[int | None, doc("Start of its 7 values in `mjData.qpos`.")] = None
     qvel_offset: Annotated[int | None, doc("Start of its 6 values in `mjData.qvel`.")] = None
     free_joint: Annotated[str | None, doc("Name of the free joint.")] = None
 
 
 class RobotEntry(ArticulationInfo, kw_only=True, omit_defaults=True):
-    """One entry of `entities` where a server lists robots there; those without `prefix` are none."""
+    """One entry of `entities` on servers that list robots there; entries without `prefix` are not robots."""
 
     prefix: Annotated[str, doc("Articulation key; empty for what is not a robot.")] = ""
     actor_id: Annotated[str, doc("Stable id; empty when unset.")] = ""
@@ -406,16 +406,16 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
 
 
 class Hello(Request[HelloOk], tag="hello", kw_only=True, omit_defaults=True):
-    """Open a session; the previous one becomes invalid at once."""
+    """Open a session. The previous one becomes invalid immediately."""
 
-    client_version: Annotated[str | None, doc("Who asks, for the server's log; without effect.")] = None
-    observations: Annotated[str | None, doc("Observation level of the session; absent keeps the server's.")] = None
-    encoding: Annotated[str | None, doc("`json` for readable replies, else msgpack.")] = None
-    include_assets: Annotated[bool, doc("Ship the model as MJCF with its assets, too.")] = False
+    client_version: Annotated[str | None, doc("Name of the client, for the server's log only.")] = None
+    observations: Annotated[str | None, doc("Observation level of the session; if absent, the server's.")] = None
+    encoding: Annotated[str | None, doc("`json` for readable replies, otherwise msgpack.")] = None
+    include_assets: Annotated[bool, doc("Also send the model as MJCF with its assets.")] = False
 
 
 class OpInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
-    """One op as the server lists it."""
+    """One op in the server's list."""
 
     name: Annotated[str, doc("Name of the op.")]
     category: Annotated[str, doc("`editor_only`, `manager_required` or `no_manager`.")]
@@ -427,11 +427,11 @@ class OpInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
 class MetaOk(Reply, tag="meta_ok", kw_only=True):
     """The server's list of ops."""
 
-    ops: Annotated[list[OpInfo], doc("Every registered op but `hello` and `meta`.")]
+    ops: Annotated[list[OpInfo], doc("Every registered op except `hello` and `meta`.")]
 
 
 class Meta(Request[MetaOk], tag="meta", kw_only=True):
-    """List the ops this server offers; needs no session."""
+    """List the ops that the server offers. Needs no session."""
 
 
 OPS: Final = (
@@ -440,7 +440,7 @@ OPS: Final = (
     Op(
         request=Step,
         needs=Needs.MANAGER,
-        # Above the server's own limit of 5 s, or its step_timeout would arrive too late.
+        # Above the server's own limit of 5 s; otherwise its step_timeout would arrive too late.
         timeout=6.5,
         hot=True,
         errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
@@ -463,7 +463,7 @@ OPS: Final = (
         request=Forward,
         ns="runtime",
         needs=Needs.MANAGER,
-        # Computes what follows from the state, which it leaves as it is: the same the second time.
+        # Computes derived quantities and leaves the state unchanged, so repeating it has no effect.
         effect=Effect.READ,
         errors=("not_ready",),
         declares=("op:string", "time:float", "step:int", "per_articulation:object"),

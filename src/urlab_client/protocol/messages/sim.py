@@ -12,11 +12,11 @@ __all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie
 
 
 class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
-    """How the start ended."""
+    """Result of the start."""
 
     state: Annotated[PIEState, doc("`ready`, `compile_failed` or `timeout`.")]
-    compile_error: Annotated[str, doc("MuJoCo's message when the model was rejected.")]
-    handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, when ready.")] = None
+    compile_error: Annotated[str, doc("MuJoCo's message if the model was rejected, otherwise empty.")]
+    handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, if ready.")] = None
 
 
 class BeginPie(Request[BeginPieOk], tag="begin_pie", kw_only=True, omit_defaults=True):
@@ -27,19 +27,19 @@ class BeginPie(Request[BeginPieOk], tag="begin_pie", kw_only=True, omit_defaults
 
 
 class StopPieOk(Reply, tag="stop_pie_ok", kw_only=True):
-    """The end was requested; the plugin may still be winding down."""
+    """The end of play was requested; the plugin may still be ending it."""
 
 
 class StopPie(Request[StopPieOk], tag="stop_pie", kw_only=True):
-    """End the play session; a success without one."""
+    """End the play session. Succeeds if there is none."""
 
 
 class PieStatusOk(Reply, tag="pie_status_ok", kw_only=True, omit_defaults=True):
-    """Where Play-In-Editor stands."""
+    """State of Play-In-Editor."""
 
     state: Annotated[PIEState, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
-    compile_error: Annotated[str, doc("MuJoCo's message after a failed compile, else empty.")]
-    sim_time: Annotated[float | None, doc("`mjData.time`, seconds, when data exist.")] = None
+    compile_error: Annotated[str, doc("MuJoCo's message after a failed compile, otherwise empty.")]
+    sim_time: Annotated[float | None, doc("`mjData.time`, seconds, if the simulation exists.")] = None
 
 
 class PieStatus(Request[PieStatusOk], tag="pie_status", kw_only=True):
@@ -47,7 +47,7 @@ class PieStatus(Request[PieStatusOk], tag="pie_status", kw_only=True):
 
 
 OPS: Final = (
-    # The server may take 10 s to reach its game thread, on top of the request's own timeout_s.
+    # The server may need 10 s to reach its game thread, in addition to the request's own timeout_s.
     Op(
         request=BeginPie,
         ns="sim",

@@ -1,4 +1,4 @@
-"""What the client's streams hand out: snapshots, rows, pictures and events, each with how it was delivered. No I/O."""
+"""Items of the client's streams: snapshots, rows, pictures and events, with information on their delivery. No I/O."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class StreamPolicy(StrEnum):
-    """What a stream keeps for a reader that is busy."""
+    """Which messages a stream keeps for a busy reader."""
 
     LATEST = "latest"
     """Only the newest message."""
@@ -52,37 +52,37 @@ class StreamPolicy(StrEnum):
 
 
 class StreamItem(Serializable, Struct, kw_only=True, omit_defaults=True):
-    """How an item of a stream was delivered."""
+    """Delivery information of a stream's item."""
 
-    seq: Annotated[int, doc("Number of the message among all that this stream received, from 1.")] = 0
+    seq: Annotated[int, doc("Sequence number among all messages that this stream received, from 1.")] = 0
     dropped: Annotated[
         int,
         doc(
-            "Messages received and not handed out since the previous item: superseded, overflowed or malformed. "
-            "With `latest_per_key`, what was superseded counts on the item of the same topic."
+            "Messages received but not delivered since the previous item: superseded, overflowed or malformed. "
+            "With `latest_per_key`, superseded messages count on the item of the same topic."
         ),
     ] = 0
     gap: Annotated[
-        str | None, doc("Why an unknown number of messages is missing before this one, for example a reconnect.")
+        str | None, doc("Reason why an unknown number of messages is missing before this one, such as a reconnect.")
     ] = None
     recv_wall_time_ns: Annotated[int, doc("This machine's UTC clock when the message arrived, nanoseconds.")] = 0
 
 
 class StreamStats(Serializable, Struct, kw_only=True, frozen=True):
-    """Counters of one stream. What was received is delivered, dropped, malformed or still waiting."""
+    """Counters of one stream. Every received message is delivered, dropped, malformed or still waiting."""
 
     received: Annotated[int, doc("Messages received.")]
-    delivered: Annotated[int, doc("Items handed to the reader.")]
-    dropped: Annotated[int, doc("Messages dropped for newer ones, by policy or for want of space.")]
+    delivered: Annotated[int, doc("Items delivered to the reader.")]
+    dropped: Annotated[int, doc("Messages dropped in favour of newer ones, by policy or for lack of space.")]
     malformed: Annotated[int, doc("Messages skipped because they could not be decoded.")]
     waiting: Annotated[int, doc("Messages waiting for the reader.")]
-    gaps: Annotated[int, doc("Times that messages went missing before they got here, for example by a reconnect.")]
-    received_bytes: Annotated[int, doc("Bytes received, topics not included.")]
+    gaps: Annotated[int, doc("Number of times that messages were lost before they arrived here, as on a reconnect.")]
+    received_bytes: Annotated[int, doc("Bytes received, excluding topics.")]
     last_age_s: Annotated[float | None, doc("Seconds since the last message arrived; None before the first.")]
 
 
 class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True, eq=False):
-    """State of everything at the end of one tick, observation level `standard` whatever the session asked for."""
+    """State of everything at the end of one tick, always at observation level `standard`."""
 
     time: Annotated[float, doc("`mjData.time`, seconds. Order live snapshots by this, not by `step`.")]
     step: Annotated[int, doc("Step counter of the session; constant in live mode.")]
@@ -92,14 +92,14 @@ class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, 
     entities: Annotated[dict[str, EntityState], doc("Plain entities by name; the plugin sends none.")] = {}
     user: Annotated[dict[str, Any], doc("User channels that the scene declares, by name; from the beta on.")] = {}
     arts: Annotated[
-        dict[str, ArticulationState] | None, doc("What the beta sends as `per_articulation`, which then is the same.")
+        dict[str, ArticulationState] | None, doc("The beta's field for `per_articulation`, which then is the same.")
     ] = None
-    scene: Annotated[
-        dict[str, EntityState] | None, doc("What the beta sends as `entities`, which then is the same.")
-    ] = None
+    scene: Annotated[dict[str, EntityState] | None, doc("The beta's field for `entities`, which then is the same.")] = (
+        None
+    )
 
     def __post_init__(self) -> None:
-        """Bring a snapshot of either generation into one shape."""
+        """Give snapshots of both generations the same shape."""
         if self.arts is not None:
             self.per_articulation = self.arts
         if self.scene is not None:
@@ -124,10 +124,10 @@ class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, 
 
     @classmethod
     def decode(cls, payload: BytesLike, where: object = "") -> StateSnapshot:
-        """Read the msgpack map of a `state/full` message or of a state region; `where` names its source in errors.
+        """Decode the msgpack map of a `state/full` message or a state region; `where` names its source in errors.
 
         Raises:
-            ProtocolError: If it is not such a map.
+            ProtocolError: The payload is not such a map.
         """
         try:
             return _SNAPSHOT.decode(payload)
@@ -143,10 +143,10 @@ _SNAPSHOT = msgspec.msgpack.Decoder(StateSnapshot, strict=False, dec_hook=from_w
 class RowSample(StreamItem, kw_only=True, eq=False):
     """One row of the state stream."""
 
-    kind: Annotated[TopicKind, doc("What the row is about.")]
+    kind: Annotated[TopicKind, doc("Kind of the row.")]
     owner: Annotated[str, doc("Articulation key; for the scene kinds the entity's name.")]
     component: Annotated[
-        str, doc("Component name of a joint, free joint or sensor, else empty. Not always the compiled name.")
+        str, doc("Component name of a joint, free joint or sensor, otherwise empty. Not always the compiled name.")
     ]
     row: Annotated[Row, doc("The values; its class follows from `kind`.")]
 
@@ -155,34 +155,35 @@ class CameraSample(StreamItem, kw_only=True, eq=False):
     """One picture of a camera."""
 
     camera: Annotated[str, doc("Name of the camera.")]
-    mode: Annotated[CameraMode | str, doc("What the pixels mean.")]
+    mode: Annotated[CameraMode | str, doc("Meaning of the pixels.")]
     pixels: Annotated[
-        Pixels, doc("Real: uint8 (H, W, 4) RGBA. Depth: float32 (H, W), metres. Else uint8 (H, W, 4) BGRA. Yours.")
+        Pixels,
+        doc("Real: uint8 (H, W, 4) RGBA. Depth: float32 (H, W), metres. Otherwise uint8 (H, W, 4) BGRA. Never reused."),
     ]
     frame_id: Annotated[int | None, doc("The server's number of the picture; None from the plugin.")] = None
     sim_time: Annotated[float | None, doc("Simulation time of the picture, seconds; None from the plugin.")] = None
     capture_time: Annotated[float | None, doc("Unix time of the picture, seconds; None from the plugin.")] = None
 
     def png(self) -> bytes:
-        """Return it as PNG, without loss: colours as RGB, depth as 16-bit grey in millimetres, 0 beyond 65.535 m.
+        """Encode the picture as PNG: colours as RGB, depth as 16-bit grey in millimetres, 0 beyond 65.535 m.
 
-        Encoding takes milliseconds, so async code calls it with `asyncio.to_thread`.
+        Encoding takes milliseconds, so async code should call it with `asyncio.to_thread`.
 
         Raises:
-            MissingExtra: Pillow is not installed; the message has the command.
+            MissingExtra: Pillow is not installed; the message contains the command to install it.
         """
         return png(self.pixels, self.mode)
 
     def jpeg(self, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
-        """Return it as JPEG, to be looked at: colours, or depth as grey, near is bright.
+        """Encode the picture as JPEG, for viewing: colours, or depth as grey with near points bright.
 
         Args:
-            quality: 1 to 100.
-            max_size: Pixels that the longer side may have, for a smaller picture; None leaves it as large as it is.
+            quality: JPEG quality, 1 to 100.
+            max_size: Maximum length of the longer side, pixels; larger pictures are scaled down. None keeps the size.
 
         Raises:
-            MissingExtra: Pillow is not installed; the message has the command.
-            ValueError: There is no such quality or size.
+            MissingExtra: Pillow is not installed; the message contains the command to install it.
+            ValueError: The quality or size is out of range.
         """
         return jpeg(self.pixels, self.mode, quality, max_size=max_size)
 
@@ -192,41 +193,41 @@ class ClientEvent(StreamItem, tag_field="event", kw_only=True, omit_defaults=Tru
 
 
 class ServerConnected(ClientEvent, tag="connected", kw_only=True, omit_defaults=True):
-    """The first connection to the server stands."""
+    """The first connection to the server was established."""
 
-    endpoint: Annotated[str, doc("Where the server is.")]
+    endpoint: Annotated[str, doc("Endpoint of the server.")]
 
 
 class ServerLost(ClientEvent, tag="lost", kw_only=True, omit_defaults=True):
     """The connection broke; it is being restored."""
 
-    endpoint: Annotated[str, doc("Where the server was.")]
-    reason: Annotated[str, doc("What is known about why.")] = ""
+    endpoint: Annotated[str, doc("Endpoint of the server.")]
+    reason: Annotated[str, doc("Reason, as far as it is known.")] = ""
 
 
 class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True, omit_defaults=True):
-    """The connection stands again. The server may be another one: the next call tells whether the session lives."""
+    """The connection was restored, maybe to another server: the next call shows whether the session still exists."""
 
-    endpoint: Annotated[str, doc("Where the server is.")]
+    endpoint: Annotated[str, doc("Endpoint of the server.")]
     down_s: Annotated[float, doc("Seconds without a connection.")]
     refused: Annotated[
-        bool, doc("Whether connections were refused meanwhile: no server was there, as while one restarts.")
+        bool, doc("Whether connections were refused in the meantime: no server was listening, as during a restart.")
     ] = False
 
 
 class ServerSilent(ClientEvent, tag="silent", kw_only=True, omit_defaults=True):
-    """A reply is overdue while the connection stands: the server is busy, blocked by a dialog, or stuck."""
+    """A reply is overdue although the connection is up: the server is busy, blocked by a dialog, or stuck."""
 
-    endpoint: Annotated[str, doc("Where the server is.")]
-    op: Annotated[str, doc("Op whose reply did not come in time.")]
-    waited_s: Annotated[float, doc("Seconds that were waited for it.")]
+    endpoint: Annotated[str, doc("Endpoint of the server.")]
+    op: Annotated[str, doc("Op whose reply did not arrive in time.")]
+    waited_s: Annotated[float, doc("Seconds spent waiting for the reply.")]
 
 
 class ServerAnswers(ClientEvent, tag="answers", kw_only=True, omit_defaults=True):
     """A server that was silent answers again."""
 
-    endpoint: Annotated[str, doc("Where the server is.")]
-    silent_s: Annotated[float, doc("Seconds since the request that it left unanswered.")]
+    endpoint: Annotated[str, doc("Endpoint of the server.")]
+    silent_s: Annotated[float, doc("Seconds since the unanswered request.")]
 
 
 class SessionOpened(ClientEvent, tag="session_opened", kw_only=True, omit_defaults=True):
@@ -238,21 +239,21 @@ class SessionOpened(ClientEvent, tag="session_opened", kw_only=True, omit_defaul
 
 
 class SessionLost(ClientEvent, tag="session_lost", kw_only=True, omit_defaults=True):
-    """The server no longer knows the session: call `discover()`."""
+    """The server no longer knows the session; call `discover()`."""
 
-    session_id: Annotated[str, doc("Id of the session that was.")]
-    reason: Annotated[str, doc("The server's words.")] = ""
+    session_id: Annotated[str, doc("Id of the lost session.")]
+    reason: Annotated[str, doc("The server's message.")] = ""
 
 
 class PlayStarted(ClientEvent, tag="play_started", kw_only=True, omit_defaults=True):
-    """A play world is there to be driven."""
+    """A play world is ready."""
 
     articulations: Annotated[
-        list[str], doc("Keys of its articulations; empty when somebody else started it: `discover()` tells them.")
+        list[str], doc("Keys of its articulations; empty if another client started it; `discover()` finds them.")
     ] = []
 
 
 class PlayEnded(ClientEvent, tag="play_ended", kw_only=True, omit_defaults=True):
-    """The play world is gone."""
+    """The play world has ended."""
 
-    reason: Annotated[str, doc("Who ended it, as far as this client knows.")] = ""
+    reason: Annotated[str, doc("What ended it, as far as this client knows.")] = ""

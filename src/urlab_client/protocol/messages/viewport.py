@@ -39,7 +39,7 @@ __all__ = [
 
 
 class CameraReply(Reply, kw_only=True):
-    """Pose of the viewport's camera: local +x looks forward, +z is up."""
+    """Pose of the viewport's camera: local +x points forward, +z up."""
 
     location: Location
     rotation_quat: QuatXYZW
@@ -75,7 +75,7 @@ class FrameActorOk(CameraReply, tag="frame_actor_ok", kw_only=True):
 
 
 class FrameActor(Request[FrameActorOk], tag="frame_actor", kw_only=True, omit_defaults=True):
-    """Move the camera so that an actor fills the view; the view direction stays."""
+    """Move the camera so that an actor fills the view. The view direction does not change."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
@@ -88,7 +88,7 @@ class SetViewportModeOk(Reply, tag="set_mode_ok", kw_only=True):
 
 
 class SetViewportMode(Request[SetViewportModeOk], tag="set_viewport_mode", kw_only=True):
-    """Switch the viewport's view mode and return it."""
+    """Switch the viewport's view mode, and return the mode in force."""
 
     mode: Annotated[str, doc("`lit`, `unlit`, `wireframe`, `collision` or `reflections`.")]
 
@@ -100,22 +100,22 @@ class TrackActorOk(Reply, tag="track_actor_ok", kw_only=True):
 
 
 class TrackActor(Request[TrackActorOk], tag="track_actor", kw_only=True, omit_defaults=True):
-    """Make the camera follow an actor and return its object path; a new call replaces the old target."""
+    """Make the camera follow an actor, and return its object path. A new call replaces the target."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
     offset: Annotated[Vec3 | None, doc("Camera position in the actor's frame, metres.")] = None
-    smoothing: Annotated[float, doc("Share of the old pose kept per tick, in [0, 1).")] = 0.0
+    smoothing: Annotated[float, doc("Fraction of the old pose kept per tick, in [0, 1).")] = 0.0
 
 
 class UntrackOk(Reply, tag="untrack_ok", kw_only=True):
     """Tracking ended."""
 
-    was_tracking: Annotated[bool, doc("Whether a track was active.")]
+    was_tracking: Annotated[bool, doc("Whether tracking was active.")]
 
 
 class Untrack(Request[UntrackOk], tag="untrack", kw_only=True):
-    """Stop following; returns whether a track was active."""
+    """Stop tracking, and return whether it was active."""
 
 
 OPS: Final = (

@@ -1,4 +1,4 @@
-// Rows of the joint panel: an actuator's set-point as slider and number, beside what its joint measures.
+// Rows of the joint panel: an actuator's set-point as slider and number, beside the measured joint position.
 
 import { h, number, text } from "./dom.js";
 import { setPoint } from "./link.js";
@@ -11,12 +11,12 @@ export function share(value, [low, high]) {
   return Math.min(1, Math.max(0, (value - low) / (high - low || 1)));
 }
 
-/** Digits that tell values of this range apart, and no more. */
+/** The number of digits needed to tell values of this range apart. */
 export const digits = ([low, high]) => Math.min(4, Math.max(1, 3 - Math.floor(Math.log10(Math.max(1e-3, high - low)))));
 
 const shortly = (value) => `${+value.toPrecision(3)}`.replace("-", "−");
 
-/** Actuators that share a scale: what set-points mean, and in which unit. */
+/** Actuators grouped by scale: the meaning and unit of their set-points. */
 export function groups(art) {
   const found = new Map();
   for (const actuator of art.actuators) {
@@ -39,7 +39,7 @@ export class ActuatorRow {
       "data-actuator": name, "aria-label": `${name} set-point${actuator.unit ? `, ${actuator.unit}` : ""}`, oninput: () => this.set(+this.slider.value) });
     this.box = h("input", { type: "number", step: "any", "data-set-point": name, "aria-label": `${name} set-point as a number`,
       onchange: () => this.box.value !== "" && this.set(+this.box.value) });
-    this.mark = h("i", { class: "mark", title: this.follows ? "Where the joint is" : "What was applied" });
+    this.mark = h("i", { class: "mark", title: this.follows ? "Joint position" : "Applied control" });
     this.measured = h("span", { class: "num", "data-value": name });
     this.held = -Infinity;
     const limits = actuator.range ? `${shortly(range[0])} … ${shortly(range[1])} ${actuator.unit}` : "no limits";
@@ -79,19 +79,19 @@ export class ActuatorRow {
     const applied = state.ctrl?.[index];
     const position = this.joint && state.qpos?.[this.joint.index];
     const target = state.targets?.[index] ?? (this.follows ? position : applied);
-    // Not while somebody moves it here: what comes is older than what they do.
+    // Not while the user moves it: the state is older than the input.
     if (target != null && performance.now() - this.held > HELD_MS && !this.slider.matches(":active")) {
       this.slider.value = target;
       if (document.activeElement !== this.box) this.write(target);
     }
     const where = this.follows ? position : applied;
-    this.mark.style.left = `calc(8px + ${share(where ?? 0, this.range)} * (100% - 16px))`; // as far as the thumb's middle goes
+    this.mark.style.left = `calc(8px + ${share(where ?? 0, this.range)} * (100% - 16px))`; // the range of the thumb's centre
     const shown = this.joint ? [position, this.joint.unit] : [applied, this.actuator.unit];
     text(this.measured, `${number(shown[0])} ${shown[1]}`);
   }
 }
 
-/** A table of actuators of one scale, with what can be done to all of them. */
+/** A table of actuators of one scale, with buttons that act on all of them. */
 export function actuatorTable(group, rows) {
   const act = (what) => rows.forEach((row) => row[what]());
   return h("div", { class: "table actuators" },
@@ -104,12 +104,12 @@ export function actuatorTable(group, rows) {
     rows.map((row) => row.element));
 }
 
-/** Why a robot lies there, as far as its state tells; else nothing. */
+/** The reason why a robot does not move, as far as its state shows it, or an empty string. */
 export function stillness(art, state, status) {
-  if (!art.actuators.length) return "It has no actuators: it moves by contacts and gravity only.";
+  if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";
   if (status?.source === "ui") return "The editor's panel drives it (control “ui”): set-points from here have no effect.";
   const limits = Object.values(art.controller?.params.torque_limit ?? {});
-  if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so that nothing drives it. Raise them under “Gains”.";
+  if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");
   if (forces.length === art.actuators.length && forces.every((actuator) => !state.ctrl?.[actuator.index])) {
     return "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";

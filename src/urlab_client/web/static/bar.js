@@ -1,4 +1,4 @@
-// The bar at the top: connection, age, time, play and stop, modes, who drives.
+// The bar at the top: connection, age, time, play and stop, modes, driver.
 
 import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
@@ -16,7 +16,7 @@ const LINKS = {
   gone: "No console",
 };
 
-/** On a phone the picture comes first, and the controls are in a sheet over it. */
+/** On a phone, the picture comes first and a sheet over it holds the controls. */
 const PHONE = matchMedia("(max-width: 700px)");
 
 function toggleSheet() {
@@ -54,9 +54,9 @@ async function invite() {
   const link = new URL(answer.path, location.href).href;
   try {
     await navigator.clipboard.writeText(link);
-    toast("A link for one more browser is on the clipboard.", "good");
+    toast("Copied a link for one more browser.", "good");
   } catch {
-    toast(`For one more browser: ${link}`, "good");
+    toast(`Link for one more browser: ${link}`, "good");
   }
 }
 
@@ -66,24 +66,24 @@ export function makeBar() {
   ui.age = h("b", { id: "age" }, "–");
   ui.time = h("b", { id: "time" }, "–");
   ui.rate = h("b", {}, "–");
-  ui.play = h("button", { class: "primary", id: "play", title: "Let physics run or stop it (space)", onclick: toggleRun }, "▶ Play");
-  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: stop }, "■ Stop");
+  ui.play = h("button", { class: "primary", id: "play", title: "Run or pause physics (space)", onclick: toggleRun }, "▶ Play");
+  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; anyone can (escape)", onclick: stop }, "■ Stop");
   ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
-  ui.step = h("button", { id: "step", title: "Step, in mode direct (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
+  ui.step = h("button", { id: "step", title: "Step, in direct mode (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
   ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
   ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
   ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => op("set_mode", { mode: ui.mode.value }) },
     ...["live", "direct", "puppet"].map((mode) => h("option", {}, mode)));
-  ui.source = h("select", { id: "source", "aria-label": "Control source", title: "Whose set-points drive: those of this protocol, or of the editor's panel",
+  ui.source = h("select", { id: "source", "aria-label": "Control source", title: "Which set-points drive: this client's (zmq) or the editor panel's (ui)",
     onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
     h("option", { value: "", hidden: true }, "–"), h("option", { value: "zmq" }, "zmq"), h("option", { value: "ui" }, "ui"));
   ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
     onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
   ui.speedText = h("span", { class: "num" }, "100 %");
   ui.driver = h("span", { id: "driver", class: "pill" });
-  ui.drive = h("button", { id: "drive", title: "Take the controls, or give them back (d)", onclick: drive }, "Take the controls");
-  ui.restart = confirmed({ id: "restart", title: "Begin play, or begin again" }, () => now.status?.playing ? "Restart play" : "Begin play",
-    () => now.status?.playing && "Lose this simulation?", restartPlay);
+  ui.drive = h("button", { id: "drive", title: "Take or release the controls (d)", onclick: drive }, "Take the controls");
+  ui.restart = confirmed({ id: "restart", title: "Begin play, or restart it" }, () => now.status?.playing ? "Restart play" : "Begin play",
+    () => now.status?.playing && "Discard this simulation?", restartPlay);
 
   ui.sheet = h("button", { id: "sheet-toggle", "aria-expanded": "false", "aria-controls": "sheet", onclick: toggleSheet }, "Controls");
   ui.more = h("div", { class: "row more" },
@@ -99,9 +99,9 @@ export function makeBar() {
       h("h1", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), h("span", {}, "URLab console")),
       ui.link, ui.address,
       h("span", { class: "facts" },
-        h("span", { title: "How old what you see is" }, "age ", ui.age),
+        h("span", { title: "Age of the state shown" }, "age ", ui.age),
         h("span", { title: "Simulation time" }, "time ", ui.time),
-        h("span", { title: "Simulation time per real time" }, "pace ", ui.rate)),
+        h("span", { title: "Simulation time relative to real time" }, "pace ", ui.rate)),
       h("span", { class: "space" }),
       ui.driver,
       h("span", { class: "acts" }, ui.drive,
@@ -133,7 +133,7 @@ export function makeBar() {
   }, 200);
 }
 
-/** Show how things stand; without a console that is nothing that could be relied on, or touched. */
+/** Show the status; without a console nothing on the page is current, so all of it is inert. */
 function show(status) {
   const link = now.socket ? status?.link.state : "gone";
   document.body.dataset.link = link ?? "connecting";
@@ -152,8 +152,8 @@ function show(status) {
     ui.speed.value = status.speed;
     text(ui.speedText, `${Math.round(status.speed)} %`);
   }
-  const others = status.viewers > 1 ? ` · ${status.viewers} watch` : "";
-  text(ui.driver, status.driver === null ? `nobody drives${others}`
+  const others = status.viewers > 1 ? ` · ${status.viewers} viewers` : "";
+  text(ui.driver, status.driver === null ? `no driver${others}`
     : status.mine ? `you drive · ${Math.ceil(status.lease_left)} s${others}`
     : `${status.driver} drives · ${Math.ceil(status.lease_left)} s${others}`);
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
@@ -172,17 +172,17 @@ function banner() {
   let button = null;
   let title = "";
   if (!now.socket) {
-    said = `The console does not answer for ${whole(Date.now() - (now.since ?? Date.now()))}. Retrying. If it was started again, open its new link.`;
+    said = `The console has not answered for ${whole(Date.now() - (now.since ?? Date.now()))}. Retrying. If it was restarted, open its new link.`;
   } else if (link && link.state !== "connected") {
     const since = whole(Date.now() + clock.offset - link.since * 1000);
     if (link.state === "taken_over") {
       said = `Another program took the session over ${since} ago.`;
       button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
     } else if (link.state === "silent") said = `The server has not answered for ${since}. Waiting.`;
-    else said = now.state ? `Server not reachable for ${since}. Retrying.` : `Connecting to the server for ${since}.`;
+    else said = now.state ? `Server unreachable for ${since}. Retrying.` : `Connecting to the server for ${since}.`;
     title = link.reason;
   } else if (now.status && !now.status.playing) {
-    said = "No play session runs.";
+    said = "No play session is running.";
     button = h("button", { onclick: restartPlay }, "Begin play");
   }
   document.body.classList.toggle("stale", !now.socket || (link && !["connected", "taken_over"].includes(link.state)));

@@ -1,4 +1,4 @@
-// Over the 3-D view: fit, overlays, and the selected body, which can be pushed.
+// Tools above the 3-D view: fit, overlays, and the selected body, which can be pushed.
 
 import { choices, h, number, text } from "./dom.js";
 import { ask, on } from "./link.js";
@@ -6,7 +6,7 @@ import { ask, on } from "./link.js";
 const LOOK_MS = 300;
 const RENEW_MS = 150;
 
-/** `frame` returns the window of the viewer, or nothing. */
+/** Make the tools; `frame` returns the viewer's window, or undefined. */
 export function makeBodies(frame) {
   const say = (message) => frame()?.postMessage(message, location.origin);
   const here = { selected: -1, pushing: false, pull: null, sending: false, fitted: false, mode: "", known: 0 };
@@ -59,7 +59,7 @@ export function makeBodies(frame) {
     return true;
   }
 
-  /** Send the newest pull, and again while it is held: a console that hears nothing lets go. */
+  /** Send the newest pull, and repeat it while it is held: without renewal the console releases it. */
   async function send() {
     if (here.sending) return;
     here.sending = true;

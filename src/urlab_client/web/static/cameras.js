@@ -1,5 +1,5 @@
-// Cameras: one WebSocket each while it is looked at. The console sends the next picture when the last one is shown.
-// During a replay they show the recorded pictures of its moment; what the recording lacks stays live, and says so.
+// Cameras: one WebSocket per visible camera. The console sends the next picture when the last one has been shown.
+// During a replay they show the recorded pictures; cameras that were not recorded stay live and are marked.
 
 import { $, duration, h, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
@@ -14,7 +14,7 @@ class CameraView {
     this.note = h("span", { class: "num" }, "waiting");
     this.origin = h("span", { class: "origin" });
     this.replay = null;
-    this.state = h("span", { class: "waiting" }, "No picture yet. Cameras send while physics runs live.");
+    this.state = h("span", { class: "waiting" }, "No picture yet. Cameras send pictures while physics runs live.");
     this.element = h("figure", { class: "camera", "data-camera": camera.path },
       h("div", { class: "frame", onclick: () => this.element.classList.toggle("large") }, this.image, this.state),
       h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode), this.origin,
@@ -55,7 +55,7 @@ class CameraView {
     socket?.close();
   }
 
-  /** Say whether the picture is the recording's; one that is left from a replay that has ended is covered. */
+  /** Show whether the picture is recorded; cover one that remains from a replay that has ended. */
   label() {
     const recorded = this.head?.recorded ?? false;
     const live = this.replay !== null && !this.replay.placing && !recorded && !this.replay.cameras.includes(this.camera.path);

@@ -7,7 +7,7 @@ const DASHES = [[], [6, 3], [2, 2]]; // more signals than colours
 const PAD = { left: 46, right: 6, top: 6, bottom: 16 };
 const SHOWN_AT_FIRST = 6;
 
-/** Values over time; where time goes back they begin anew. */
+/** Values over time; cleared when time goes back. */
 export class ChartData {
   constructor() {
     this.times = [];
@@ -39,7 +39,7 @@ export class ChartData {
   }
 }
 
-/** Round numbers between two, about `count` of them. */
+/** About `count` round numbers between two limits. */
 function ticks(low, high, count) {
   const raw = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(raw));

@@ -1,4 +1,4 @@
-// Making and finding elements, and writing numbers.
+// Creating and finding elements, and formatting numbers.
 
 /** Make an element: attributes, listeners (`onclick`), properties (`.value`), children. */
 export function h(tag, attributes = {}, ...children) {
@@ -13,7 +13,7 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Fill a list of choices, `[value, text]` each, and keep what is chosen; one that is the same is left alone. */
+/** Fill a select with `[value, text]` options and keep the selection; an unchanged list is left alone. */
 export function choices(select, wanted) {
   const before = [...select.options].map((option) => [option.value, option.text]);
   if (JSON.stringify(before) === JSON.stringify(wanted)) return;
@@ -24,12 +24,12 @@ export function choices(select, wanted) {
 
 export const $ = (id) => document.getElementById(id);
 
-/** Change text only when it differs: the page is written to sixty times a second. */
+/** Change text only if it differs: the page is updated sixty times a second. */
 export function text(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
 
-/** A number in at most `width` characters, with the sign's place kept. */
+/** Format a number with `digits` decimals and room for a sign. */
 export function number(value, digits = 3) {
   if (value == null || !Number.isFinite(value)) return "–";
   const shown = Math.abs(value) < 0.5 * 10 ** -digits ? 0 : value;
@@ -43,8 +43,8 @@ export function duration(ms) {
 }
 
 /**
- * Make a button that does something which cannot be taken back: it asks first, in its own place, and the second press
- * within a few seconds does it.
+ * Make a button for an irreversible action: the first press shows a question in its place, and a second press within a
+ * few seconds confirms it.
  */
 export function confirmed(attributes, label, question, act) {
   const ASKED_MS = 4000;

@@ -1,4 +1,4 @@
-// The connection to the console: one WebSocket that comes back by itself, and calls over HTTP.
+// The connection to the console: one WebSocket that reconnects by itself, and calls over HTTP.
 
 import { toast } from "./dom.js";
 
@@ -11,9 +11,9 @@ const PING_MS = 2000;
 const SILENT_MS = 6000;
 let socket = null;
 let pause = 250;
-let asked = null; // when the first ping was sent that nothing has come after
+let asked = null; // when the first ping was sent since the last message arrived
 
-/** Call `listener` with each message of that type; `open` and `closed` are the connection's own. */
+/** Call `listener` with each message of this type; `open` and `closed` report the connection itself. */
 export function on(type, listener) {
   if (!listeners.has(type)) listeners.set(type, []);
   listeners.get(type).push(listener);
@@ -42,7 +42,7 @@ export function connect() {
     asked = null;
     const message = JSON.parse(event.data);
     if (message.type === "state") {
-      // The console sends the next state once this one was drawn: a slow browser sees fewer, not older ones.
+      // The console sends the next state once this one is drawn: a slow browser sees fewer states, not older ones.
       requestAnimationFrame(() => send({ type: "ack" }));
     } else if (message.type === "you") {
       me.viewer = message.viewer;
@@ -70,7 +70,7 @@ export function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
-/** Ask whether the console is still there: a process that stands still closes no socket. */
+/** Check that the console is alive: a stopped process closes no socket. */
 function ping() {
   if (socket?.readyState !== WebSocket.OPEN) return;
   if (asked !== null && performance.now() - asked > SILENT_MS) {
@@ -83,7 +83,7 @@ function ping() {
 }
 setInterval(ping, PING_MS);
 
-/** Ask over HTTP, with a file or with JSON; a failure becomes a toast and null. */
+/** Send an HTTP request with a file or JSON; a failure shows a toast and returns null. */
 export async function ask(method, path, body, { quiet = false } = {}) {
   let answer;
   try {
@@ -102,7 +102,7 @@ export async function ask(method, path, body, { quiet = false } = {}) {
   return null;
 }
 
-/** Put a file there, and tell how much of it is on its way, 0 to 1; a failure becomes a toast and null. */
+/** Upload a file; `told` is called with the progress, 0 to 1. A failure shows a toast and resolves to null. */
 export function upload(path, file, told) {
   return new Promise((done) => {
     const request = new XMLHttpRequest();
@@ -126,7 +126,7 @@ export const op = (name, body = {}, options) => ask("POST", `api/ops/${name}`, b
 const pending = new Map();
 let scheduled = false;
 
-/** Set a set-point; the newest of each goes out with the next picture of the screen. */
+/** Set a set-point; the newest of each is sent with the next animation frame. */
 export function setPoint(articulation, actuator, value) {
   if (!pending.has(articulation)) pending.set(articulation, {});
   pending.get(articulation)[actuator] = value;

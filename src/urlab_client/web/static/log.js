@@ -1,4 +1,4 @@
-// The log of calls, errors and events, in words; what happens again at once is counted.
+// The log of calls, errors and events, in words; immediate repetitions are counted.
 
 import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
@@ -6,16 +6,16 @@ import { on } from "./link.js";
 const KEPT = 300;
 const plural = (names) => names.join(", ");
 
-/** What an event of the connection says to people; null keeps it out. */
+/** The text of each connection event. */
 const EVENTS = {
   connected: () => "The console is connected to the server.",
-  session_opened: (text) => `A session is open${/mujoco_version ([^,]+)/.test(text) ? `; MuJoCo ${/mujoco_version ([^,]+)/.exec(text)[1]}` : ""}.`,
+  session_opened: (text) => `A session was opened${/mujoco_version ([^,]+)/.test(text) ? `; MuJoCo ${/mujoco_version ([^,]+)/.exec(text)[1]}` : ""}.`,
   play_started: (text) => `Play began${/\[(.*)\]/.test(text) ? ` with ${/\[(.*)\]/.exec(text)[1].replaceAll("'", "")}` : ""}.`,
   play_ended: () => "Play ended.",
-  server_lost: () => "The server cannot be reached.",
-  server_reconnected: () => "The server can be reached again.",
-  server_silent: () => "The server does not answer.",
-  server_answers: () => "The server answers again.",
+  server_lost: () => "The server is unreachable.",
+  server_reconnected: () => "The server is reachable again.",
+  server_silent: () => "The server is not answering.",
+  server_answers: () => "The server is answering again.",
   session_lost: () => "Another program took the session over.",
 };
 
@@ -34,7 +34,7 @@ export function makeLog() {
   const only = h("input", { type: "checkbox", onchange: () => list.classList.toggle("errors", only.checked) });
   $("log").append(h("h2", {}, "Log", h("span", { class: "space" }), h("label", { class: "check hint" }, only, " errors only")), list);
   let newest = -1;
-  let last = null; // the latest line: what it says, and how often
+  let last = null; // the latest line: its text and count
   on("closed", () => { newest = -1; last = null; list.replaceChildren(); });
 
   function add(entry) {

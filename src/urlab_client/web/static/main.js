@@ -1,4 +1,4 @@
-// The console: puts the page together and listens to the keyboard.
+// The console: builds the page and handles the keyboard.
 
 import { drive, makeBar, now, reset, step, stop, toggleRun } from "./bar.js";
 import { makeCameras } from "./cameras.js";
@@ -16,18 +16,18 @@ import { makeView } from "./view.js";
 const KEYS = [
   [" ", "space", "play or pause", toggleRun],
   ["Escape", "esc", "stop", stop],
-  [".", ".", "step (mode direct)", () => now.status?.mode === "direct" && step(+$("steps").value || 1)],
+  [".", ".", "step (direct mode)", () => now.status?.mode === "direct" && step(+$("steps").value || 1)],
   ["r", "r", "reset", () => reset($("keyframe").value)],
-  ["d", "d", "take the controls, or give them back", drive],
-  ["?", "?", "this", () => $("help").showModal()],
+  ["d", "d", "take or release the controls", drive],
+  ["?", "?", "show this help", () => $("help").showModal()],
 ];
 
 for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeTeleop, makeScene, makeRecording, makeReplay, makeContacts, makeLog]) make();
 
 $("help").append(h("h2", {}, "Keys"),
   h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),
-    h("dt", {}, h("kbd", {}, "← →")), h("dd", {}, "move the slider that has the focus"),
-    h("dt", {}, h("kbd", {}, "w a s d")), h("dd", {}, "twist, while the pad has the focus")),
+    h("dt", {}, h("kbd", {}, "← →")), h("dd", {}, "move the focused slider"),
+    h("dt", {}, h("kbd", {}, "w a s d")), h("dd", {}, "command a twist while the pad has focus")),
   h("form", { method: "dialog" }, h("button", {}, "Close")));
 
 document.addEventListener("keydown", (event) => {
@@ -41,7 +41,7 @@ document.addEventListener("keydown", (event) => {
   found[3]();
 });
 
-// A list keeps the keyboard after a choice was made in it, and would swallow the keys above.
+// A list keeps the focus after a choice and would swallow the keys above.
 document.addEventListener("change", (event) => event.target.matches("select, input[type=file]") && event.target.blur());
 
 connect();

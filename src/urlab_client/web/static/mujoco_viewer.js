@@ -1,14 +1,14 @@
 // Runs in MuJoCo's web viewer before its own code, and fits it into the console.
 //
-// - It asks for its model and state at the root of a host of its own; here they lie beside the page.
-// - It asks for a model once and then gives up; here it asks again until there is one, and when it is another one.
-// - It covers the picture with "DISCONNECTED" when a socket is down, or no state comes for a while; here a socket comes
-//   back by itself, the newest state is told again, and the page around says what is wrong, once.
-// - It draws whenever it can; here not while it is out of sight, and where drawing is slow, only half of the time:
-//   the page around it shares the thread.
-// - It neither tells where its camera is nor takes another one. Here the camera is ours (viewer_pointer.js), and is
-//   written over its own before each frame. So are the selection and the overlays, into each state.
-// - It takes the keyboard once it was clicked; here the page around it gets the keys, which are the console's.
+// - It requests its model and state at the root of its host; here they are beside the page.
+// - It requests a model once and then gives up; here it retries until there is one, and again when the model changes.
+// - It covers the picture with "DISCONNECTED" when a socket is down or no state arrives for a while; here a socket
+//   reconnects by itself, the newest state is repeated, and the surrounding page reports the problem once.
+// - It draws whenever it can; here not while it is out of sight, and only half of the time if drawing is slow:
+//   the surrounding page shares the thread.
+// - It neither exposes its camera nor accepts another one. Here the camera is ours (viewer_pointer.js) and overwrites
+//   the viewer's before each frame. The selection and the overlays are written into each state likewise.
+// - It takes the keyboard once it is clicked; here the keys go to the surrounding page, the console.
 
 {
   const beside = new URL(".", location.href);
@@ -17,7 +17,7 @@
   const AGAIN_MS = 1000;
   const SHOWN = "state_ack";
   const LAYOUT = "layout=";
-  const TAKEN = 4001; // "somebody else has MuJoCo's own panels"
+  const TAKEN = 4001; // "another page has MuJoCo's own panels"
   const CRC_AT = 8; // bytes into a state: the number of the model that it belongs to
   let wanted = 0; // the model that the newest state belongs to
 
@@ -37,7 +37,7 @@
   const Real = window.WebSocket;
   const sockets = new Set();
 
-  /** What the viewer takes for a socket. `name` is the last part of its address. */
+  /** Stands in for the viewer's WebSocket. `name` is the last part of its address. */
   class Socket extends EventTarget {
     constructor(address) {
       super();
@@ -49,11 +49,11 @@
       else this.join();
       this.newest = null;
       this.toldAt = 0;
-      this.repeats = 0; // states that were told again, and not yet acknowledged
+      this.repeats = 0; // repeated states that are not yet acknowledged
       sockets.add(this);
     }
 
-    /** Tell the newest state again before a frame that would else find none for a while, however long that took. */
+    /** Repeat the newest state before a frame if none has arrived for a while, however long that took. */
     repeat() {
       if (this.newest === null || (!viewerPointer.undressed && performance.now() - this.toldAt < AGAIN_MS)) return;
       viewerPointer.dress(this.newest);
@@ -62,7 +62,7 @@
       this.tell("message", { data: this.newest });
     }
 
-    /** MuJoCo's own panels are somebody else's, always. */
+    /** Report that another page has MuJoCo's own panels. */
     refuse() {
       this.readyState = Real.CLOSED;
       sockets.delete(this);
@@ -115,7 +115,7 @@
 
   let tried = 0;
   setInterval(() => {
-    const started = typeof loadGeneration === "number" && loadGeneration > 0; // it has asked once
+    const started = typeof loadGeneration === "number" && loadGeneration > 0; // it has requested the model once
     const shown = started && currentModelCrc > 0 && (!wanted || currentModelCrc === wanted);
     if (started && !shown && foregroundLoads === 0 && performance.now() - tried > AGAIN_MS) {
       tried = performance.now();

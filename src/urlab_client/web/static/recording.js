@@ -1,4 +1,4 @@
-// Recordings: making them, and the files: download in several kinds, replay, upload, removal.
+// Recordings: start and stop, and the files: download in several formats, replay, upload, deletion.
 
 import { $, confirmed, h, number, text, toast } from "./dom.js";
 import { ask, on, upload } from "./link.js";
@@ -19,7 +19,7 @@ export function bytes(count) {
   return `${(count / 1024 ** power).toFixed(power ? 1 : 0)} ${units[power]}`;
 }
 
-/** Seconds for people: 12.34 s, 3:05.1 min, 7:59:59 h. */
+/** Format seconds: 12.34 s, 3:05.1 min, 7:59:59 h. */
 export function clockTime(seconds) {
   if (seconds < 60) return `${seconds.toFixed(2)} s`;
   const tenths = Math.floor(seconds * 10);
@@ -45,7 +45,7 @@ async function open() {
   if (!chosen) return;
   opener.disabled = true;
   const made = await upload(at(chosen.name), chosen, (share) => text(opener, `Opening … ${Math.floor(share * 100)} %`));
-  if (made) toast(`${chosen.name} is here.`, "good");
+  if (made) toast(`${chosen.name} was added.`, "good");
   file.value = "";
   opener.disabled = false;
   text(opener, OPEN);
@@ -97,7 +97,7 @@ async function refresh() {
   if (now === shown) return;
   shown = now;
   list.replaceChildren(...answer.recordings.map(row));
-  if (!answer.recordings.length) list.append(h("p", { class: "hint" }, `Recordings are kept in the folder “${folder}” of the console’s machine.`));
+  if (!answer.recordings.length) list.append(h("p", { class: "hint" }, `Recordings are stored in the folder “${folder}” on the console’s machine.`));
 }
 
 export function makeRecording() {

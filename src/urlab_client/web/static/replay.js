@@ -1,4 +1,4 @@
-// The strip that a replay is steered with: place and pace, in seconds of the recording's clock.
+// The controls of a replay: position, in seconds of the recording's clock, and pace.
 
 import { $, h, text } from "./dom.js";
 import { ask, on } from "./link.js";
@@ -6,14 +6,14 @@ import { clockTime } from "./recording.js";
 
 const PACES = [0.1, 0.25, 0.5, 1, 2, 4];
 const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: "any", value: 0, oninput: () => seek(+line.value),
-  onkeydown: keys, "aria-label": "Place in the recording, seconds", title: "← → by 0.1 s, with Shift by 10 s" });
+  onkeydown: keys, "aria-label": "Position in the recording, seconds", title: "← → by 0.1 s, with Shift by 10 s" });
 const name = h("b", { class: "name" });
 const where = h("span", { class: "num", id: "replay-time" });
 const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
 const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
   PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
-const placing = h("button", { class: "quiet", id: "placing", title: "Place the robots of the simulation, too: its cameras follow, its mode is puppet meanwhile",
-  onclick: () => ask("POST", "api/replay", { ...replay, placing: !replay.placing }) }, "Move the simulation, too");
+const placing = h("button", { class: "quiet", id: "placing", title: "Also place the simulation's robots: its cameras follow, and its mode is puppet meanwhile",
+  onclick: () => ask("POST", "api/replay", { ...replay, placing: !replay.placing }) }, "Also move the simulation");
 let replay = null;
 let wanted = null;
 let seeking = false;
@@ -26,7 +26,7 @@ export function pauseReplay() {
   return ask("POST", "api/replay", { playing: false });
 }
 
-/** Go to a place; of those asked for while one is on its way, the newest. */
+/** Seek to a time; of the seeks requested while one is in flight, only the newest is sent. */
 async function seek(to) {
   wanted = to;
   if (seeking) return;
@@ -39,7 +39,7 @@ async function seek(to) {
   seeking = false;
 }
 
-/** A browser's own step would be a hundredth of the recording, which is minutes in a long one. */
+/** Handle arrow keys: the browser's own step is a hundredth of the recording, which is minutes in a long one. */
 function keys(event) {
   const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
   if (way === undefined) return;
@@ -51,7 +51,7 @@ function keys(event) {
 export function makeReplay() {
   $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing,
     h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live"));
-  // Below the bar where that stays in sight, so that both are there while cameras and curves are looked at.
+  // Stick below the bar if that is sticky, so that both stay visible while the user scrolls.
   new ResizeObserver(() => {
     $("replay").style.top = getComputedStyle($("bar")).position === "sticky" ? `${$("bar").offsetHeight}px` : "0";
   }).observe($("bar"));
@@ -59,7 +59,7 @@ export function makeReplay() {
     replay = status.replay;
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
-    // What drives the simulation would do so unseen.
+    // Controls of the simulation would act unseen.
     for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = replay !== null;
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));

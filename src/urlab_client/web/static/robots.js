@@ -17,7 +17,7 @@ class Robot {
     const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
     this.still = h("p", { class: "still", hidden: true });
-    const why = h("button", { class: "quiet", title: "Look from the sockets inwards why it might not move", onclick: () => explain(art.key) }, "Why does it not move?");
+    const why = h("button", { class: "quiet", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
     const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
       h("h2", {}, art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
@@ -76,7 +76,7 @@ class Robot {
 
   twist() {
     const knob = h("i", {});
-    const pad = h("div", { class: "pad", tabindex: 0, title: "Drag: forward and turn. W A S D while it has the focus" }, knob);
+    const pad = h("div", { class: "pad", tabindex: 0, title: "Drag to command forward speed and turn rate, or use W A S D while focused" }, knob);
     const shown = h("span", { class: "num" }, "0 m/s · 0 rad/s");
     let waiting = false;
     let next = null;
@@ -106,10 +106,10 @@ class Robot {
     pad.addEventListener("keydown", (event) => { if (keys[event.key] && !event.repeat) { event.stopPropagation(); push(...keys[event.key]); } });
     pad.addEventListener("keyup", (event) => keys[event.key] && push(0, 0));
     return h("div", { class: "twist" }, pad, h("div", {}, shown, h("p", { class: "hint" },
-      "What a policy on the server reads as its command. It moves nothing by itself.")));
+      "The command that a policy on the server reads. It moves nothing by itself.")));
   }
 
-  /** Take over what may change while the robot stays the same; not what somebody is typing. */
+  /** Update values that may change while the robot stays the same, except a field that the user edits. */
   update(art) {
     this.art = art;
     for (const take of this.boxes) take(art.controller?.params ?? {});
@@ -125,14 +125,14 @@ class Robot {
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 
-/** Show what the client finds out about a robot that does not move. */
+/** Show the client's diagnosis of a robot that does not move. */
 async function explain(key) {
   const answer = await ask("GET", "api/explain");
   if (!answer) return;
   const findings = answer.findings.filter((one) => one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
   $("findings").replaceChildren(h("h2", {}, `Why does ${key} not move?`),
     h("ul", {}, findings.length ? findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject), ` ${one.text}`))
-      : h("li", {}, "Nothing that would keep it from moving was found.")),
+      : h("li", {}, "Nothing was found that keeps it from moving.")),
     h("form", { method: "dialog" }, h("button", {}, "Close")));
   $("findings").showModal();
 }
@@ -157,7 +157,7 @@ export function makeRobots() {
   });
 }
 
-/** What a robot's panel is built of; the rest is values. */
+/** The structure that a robot's panel depends on, as opposed to its values. */
 function shape(art) {
   const { controller, ...rest } = art;
   return JSON.stringify([rest, controller && [controller.kind, GAINS.map((gain) => Object.keys(controller.params[gain] ?? {}))]]);

@@ -1,4 +1,4 @@
-// The level: what stands in it, spawning, moving, removing; and what touches what.
+// The level: its actors, spawning, moving and removing them; and contacts.
 
 import { $, choices, confirmed, h, number, text, toast } from "./dom.js";
 import { ask, on, op } from "./link.js";
@@ -11,11 +11,11 @@ const APART_M = 1;
 const place = xyz([0, 0, 0], "new actor");
 const yaw = h("input", { type: "number", step: 15, value: 0, "aria-label": "new actor: yaw, degrees" });
 const file = h("input", { type: "file", accept: ".xml,.zip", hidden: true, id: "model-file", onchange: importModel });
-const importing = h("button", { class: "quiet", title: "An MJCF file, or a ZIP archive with one and its meshes", onclick: () => file.click() }, "Import a model …");
+const importing = h("button", { class: "quiet", title: "An MJCF file, or a ZIP archive of an MJCF file and its meshes", onclick: () => file.click() }, "Import a model …");
 const warning = h("div", { class: "line warning", id: "no-manager", hidden: true },
-  h("span", {}, "This level has no manager, without which play cannot begin."),
+  h("span", {}, "Play cannot begin: this level has no manager."),
   h("button", { id: "add-manager", onclick: async () => done(await op("ensure_manager")) }, "Add manager"));
-/** Actors that the plugin itself needs; nobody places or removes them. */
+/** Actors that the plugin itself needs; users do not place or remove them. */
 const isManager = (actor) => /^A?Mj(Replay)?Manager$/.test(actor.class);
 const managesPlay = (actor) => /^A?MjManager$/.test(actor.class);
 
@@ -27,7 +27,7 @@ const rows = new Map();
 const read = (inputs) => inputs.map((input) => +input.value || 0);
 
 function done(answer) {
-  if (answer?.requires_pie_restart) toast("Done in the level. It shows after “Restart play”.", "good");
+  if (answer?.requires_pie_restart) toast("The level was changed. The change shows after “Restart play”.", "good");
   if (answer) refresh();
 }
 
@@ -57,7 +57,7 @@ async function refresh() {
   propose();
 }
 
-/** One actor of the list; it stays while the actor does, so that nobody loses what they are typing. */
+/** One actor of the list; the row lives as long as the actor, so that a field being edited keeps its text. */
 class Row {
   constructor(actor) {
     const name = actor.actor_id || actor.name;
@@ -68,7 +68,7 @@ class Row {
       h("span", { class: "name", title: actor.name }, name,
         h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
       h("span", { class: "acts" },
-        h("button", { class: "quiet", title: "Move there and turn", "aria-label": `Move ${name}`,
+        h("button", { class: "quiet", title: "Move to this position and yaw", "aria-label": `Move ${name}`,
           onclick: async () => done(await op("set_actor_transform", { ...target, location: read(this.where), rotation_quat: quaternion(this.yaw) })) }, "move"),
         actor.is_articulation ? h("button", { class: "quiet", title: "Spawn another one beside it", "aria-label": `Duplicate ${name}`,
           onclick: async () => done(await op("duplicate_actor", { ...target, new_actor_id: unused(name), location: free(read(this.where)) })) }, "duplicate") : null,
@@ -95,7 +95,7 @@ function quaternion(yaw) {
   return [0, 0, Math.sin(half), Math.cos(half)];
 }
 
-/** The next place along x, from there, that no actor stands in. */
+/** The next free position along x. */
 function free([x, y, z]) {
   const others = [...rows.values()].map((row) => row.location).filter(Boolean);
   const taken = (at) => others.some((other) => Math.hypot(other[0] - at, other[1] - y) < APART_M);
@@ -103,13 +103,13 @@ function free([x, y, z]) {
   return [x, y, z];
 }
 
-/** A name that no actor has: what stands before a number at its end, and the next number. */
+/** A free name: the base without its final number, and the next number. */
 function unused(name) {
   const stem = name.replace(/[_-]?\d+$/, "");
   for (let n = 2; ; n++) if (!document.querySelector(`[data-actor="${stem}_${n}"]`)) return `${stem}_${n}`;
 }
 
-/** Propose a name and a free place for what would be spawned next, where nobody has typed one. */
+/** Propose a name and a free position for the next actor, unless the user has typed one. */
 function propose() {
   const chosen = blueprint.selectedOptions[0]?.text ?? "robot";
   id.placeholder = document.querySelector(`[data-actor="${chosen}"]`) ? unused(chosen) : chosen;
@@ -166,7 +166,7 @@ export function makeContacts() {
       list.replaceChildren(...(answer?.contacts ?? []).map((contact) => h("div", { class: "line" },
         h("span", { class: "name" }, `${contact.geom1 || contact.body1} – ${contact.geom2 || contact.body2}`),
         h("span", { class: "num" }, `${number(contact.force[0], 1)} N`))));
-      if (answer && !answer.n_contacts) list.replaceChildren(h("p", { class: "hint" }, "Nothing touches anything."));
+      if (answer && !answer.n_contacts) list.replaceChildren(h("p", { class: "hint" }, "There are no contacts."));
     }
     setTimeout(look, 400);
   };

@@ -1,4 +1,4 @@
-// Curves over the last seconds of simulation time: sensors, and of each robot what joints and actuators do.
+// Curves over the last seconds of simulation time: sensors, and each robot's joints and actuators.
 
 import { Chart, ChartData, COLORS } from "./chart.js";
 import { $, h } from "./dom.js";
@@ -17,7 +17,7 @@ const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S,
   oninput: () => { view.end = view.last - (KEPT_S - back.value) * Math.min(1, (view.last - view.first) / KEPT_S); charts.forEach((chart) => chart.touch()); } });
 const probe = h("i", { hidden: true });
 
-/** What all curves show alike: up to when, or the newest while nothing is held; where somebody points. */
+/** Shared by all curves: the end of the time span (the newest state unless held), and the pointer's position. */
 const view = { held: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
 let charts = [];
 let replay = null;
@@ -45,7 +45,7 @@ function clear() {
   view.first = view.last = 0;
 }
 
-/** Show what comes before the replay's place, as if it had been watched up to there. */
+/** Fill the curves with the states before the replay's position. */
 async function fill() {
   again = true;
   if (filling) return;
@@ -60,7 +60,7 @@ async function fill() {
   filling = false;
 }
 
-/** Whether a replay went to another place, rather than on. */
+/** Whether a replay jumped to another time instead of continuing. */
 function jumped(time) {
   const due = ((performance.now() - came) / 1000) * (replay?.rate ?? 1) + 0.5;
   came = performance.now();
@@ -76,7 +76,7 @@ function hold(held) {
   charts.forEach((chart) => chart.touch());
 }
 
-/** A custom property as a colour that a canvas understands: of light and dark the one in force. */
+/** Resolve a custom property to a colour for a canvas, in the active colour scheme. */
 function resolved(name) {
   probe.style.color = `var(${name})`;
   return getComputedStyle(probe).color;
@@ -84,7 +84,7 @@ function resolved(name) {
 
 const single = (joint) => joint.kind === "hinge" || joint.kind === "slide";
 
-/** Every curve that a robot can have: what it is, its unit, the names of its signals, and where its values are. */
+/** Every curve of a robot: title, unit, names of its signals, and a function that reads its values. */
 function sources(art) {
   const found = art.sensors.map((sensor) => ({
     key: `${art.key}/${sensor.name}`, title: sensor.name, kind: sensor.kind, unit: sensor.unit, shown: true,
@@ -115,7 +115,7 @@ export function makeSensors() {
   const add = h("select", { id: "add-curve", "aria-label": "Add a curve" });
   $("sensors").append(h("h2", {}, "Curves", h("span", { class: "space" }), add, span, pause), back, grid, probe);
   let all = [];
-  const chosen = new Map(JSON.parse(localStorage.getItem("urlab-curves") ?? "[]")); // key: whether somebody wants it
+  const chosen = new Map(JSON.parse(localStorage.getItem("urlab-curves") ?? "[]")); // key: whether it is shown
 
   function choose(key, wanted) {
     chosen.set(key, wanted);

@@ -1,14 +1,14 @@
-// Moving a hand with keys or a gamepad: velocities go to the console, which solves for the joints.
+// Moves a hand with keys or a gamepad: sends velocities to the console, which solves for the joints.
 
 import { now, reset } from "./bar.js";
 import { $, choices, h, text } from "./dom.js";
 import { ask, on, send } from "./link.js";
 
 const PERIOD_MS = 20;
-const DEAD = 0.15; // what a stick that nobody touches may show
+const DEAD = 0.15; // dead zone: a released stick may read this much
 const SLOW = 0.2;
 
-/** Keys by `event.code`, so that they lie where they lie on every keyboard: index of the velocity and its sign. */
+/** Index and sign of the velocity by `event.code`, which names the same physical keys on every keyboard layout. */
 const KEYS = {
   KeyW: [0, 1], KeyS: [0, -1], KeyA: [1, 1], KeyD: [1, -1], KeyR: [2, 1], KeyF: [2, -1],
   KeyC: [3, 1], KeyZ: [3, -1], KeyB: [4, 1], KeyV: [4, -1], KeyQ: [5, 1], KeyE: [5, -1],
@@ -22,9 +22,9 @@ const [LT, RT, LB, UP, DOWN, LEFT, RIGHT] = [6, 7, 4, 12, 13, 14, 15];
 
 const MAPPING = [
   ["W S · A D · R F", "left stick · right stick up, down", "along x · y · z"],
-  ["C Z · B V · Q E", "cross right, left · up, down · right stick", "about x · y · z"],
-  ["O P", "triggers LT RT", "gripper to its largest, smallest set-point"],
-  ["shift", "shoulder LB", "slowly"],
+  ["C Z · B V · Q E", "D-pad right, left · up, down · right stick", "about x · y · z"],
+  ["O P", "triggers LT RT", "gripper towards its largest, smallest set-point"],
+  ["shift", "shoulder LB", "slower"],
   ["enter", "A", "success, and reset"],
   ["N", "Y", "failure, and reset"],
   ["backspace", "B", "discard, and reset"],
@@ -38,7 +38,7 @@ let active = false;
 let moving = false;
 let sent = 0;
 
-/** What the keys ask for: velocities along and about x, y and z, and of the gripper. */
+/** The velocities that the held keys command: along and about x, y and z, and of the gripper. */
 function fromKeys() {
   const found = new Array(7).fill(0);
   for (const code of held) {
@@ -50,7 +50,7 @@ function fromKeys() {
 
 const beyond = (value) => (Math.abs(value ?? 0) < DEAD ? 0 : (value - Math.sign(value) * DEAD) / (1 - DEAD));
 
-/** What a gamepad asks for, likewise. */
+/** The velocities that a gamepad commands. */
 function fromGamepad(pad) {
   const [x, y, turn, lift] = [0, 1, 2, 3].map((axis) => beyond(pad.axes[axis]));
   const by = (index) => pad.buttons[index]?.value ?? 0;
@@ -64,7 +64,7 @@ async function judge(outcome) {
   if ((await ask("POST", "api/recording/outcome", { outcome })) !== null) reset($("keyframe").value);
 }
 
-/** Say what buttons were pressed since the last look. */
+/** Return the outcomes of the buttons pressed since the last call. */
 function newly(pad) {
   const down = new Set(Object.keys(BUTTONS).filter((index) => pad?.buttons[index]?.pressed));
   const fresh = [...down].filter((index) => !pressed.has(index));
@@ -84,7 +84,7 @@ function look() {
   const moves = asked.some((value) => value !== 0);
   const time = performance.now();
   if (!(moves || moving) || (moves && time - sent < PERIOD_MS)) return;
-  moving = moves; // one that moves nothing ends the motion
+  moving = moves; // a message with zero velocities ends the motion
   sent = time;
   send({ type: "hand", articulation: ui.robot.value, linear: asked.slice(0, 3), angular: asked.slice(3, 6), gripper: asked[6], site: ui.site.value.trim() });
 }
@@ -104,7 +104,7 @@ function toggle(wanted) {
   }
 }
 
-/** Keys are the hand's while it is driven, except where somebody writes, and for escape, which stops. */
+/** While the hand is driven, its keys take precedence, except in text fields; escape still stops. */
 function key(event) {
   shift = event.shiftKey;
   if (!active || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
@@ -120,17 +120,17 @@ function key(event) {
 
 export function makeTeleop() {
   ui.drive = h("button", { id: "drive-hand", "aria-pressed": "false", onclick: () => { toggle(!active); ui.drive.blur(); } }, "Drive the hand");
-  ui.robot = h("select", { id: "hand-robot", "aria-label": "Robot whose hand is driven" });
-  ui.site = h("input", { id: "hand-site", placeholder: "its only site", "aria-label": "Site that is the hand", size: 12 });
+  ui.robot = h("select", { id: "hand-robot", "aria-label": "Robot whose hand to drive" });
+  ui.site = h("input", { id: "hand-site", placeholder: "its only site", "aria-label": "Site of the hand", size: 12 });
   ui.pad = h("p", { class: "hint", id: "gamepad" });
   const outcomes = [["success", "Success"], ["failure", "Failure"], ["discarded", "Discard"]].map(([outcome, label]) =>
     h("button", { class: "quiet", "data-outcome": outcome, disabled: true, onclick: () => judge(outcome) }, label));
   $("teleop").append(h("h2", {}, "Hand"),
     h("div", { class: "line" }, ui.drive, ui.robot, h("label", {}, "site ", ui.site)),
     ui.pad,
-    h("div", { class: "line" }, h("span", { class: "hint" }, "The recorded episode is a"), ...outcomes),
+    h("div", { class: "line" }, h("span", { class: "hint" }, "Mark the recorded episode:"), ...outcomes),
     h("details", {}, h("summary", {}, "Keys and buttons"),
-      h("table", { class: "mapping" }, h("tr", {}, ...["keys", "gamepad", "world frame: x ahead, y left, z up"].map((head) => h("th", {}, head))),
+      h("table", { class: "mapping" }, h("tr", {}, ...["keys", "gamepad", "world frame: x forward, y left, z up"].map((head) => h("th", {}, head))),
         ...MAPPING.map((row) => h("tr", {}, ...row.map((cell) => h("td", {}, cell)))))));
   on("world", ({ world }) => {
     const robots = world.articulations.filter((art) => art.actuators.some((actuator) => actuator.takes === "position"));

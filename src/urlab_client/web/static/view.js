@@ -1,5 +1,5 @@
-// The 3-D view: MuJoCo's web viewer in a frame. It is loaded once there is a model and somebody looks, and let go when
-// it is closed. What covers it says what it waits for.
+// The 3-D view: MuJoCo's web viewer in a frame. The frame is loaded once there is a model and the view is open, and
+// removed when the view is closed. Its cover shows what it waits for.
 
 import { makeBodies } from "./bodies.js";
 import { $, h, text } from "./dom.js";
@@ -8,12 +8,12 @@ import { on } from "./link.js";
 const OPEN = "urlab-view";
 const TOUCH = window.matchMedia("(pointer: coarse)");
 const UPRIGHT = window.matchMedia("(orientation: portrait)");
-const WITH_MOUSE = "Drag to turn, with the right button or Shift to move, scroll for the distance. Click a body to select it; Push, or Ctrl, and drag to push it.";
-const WITH_FINGERS = "Drag to turn, with two fingers to move and for the distance. Tap a body to select it; Push and drag to push it.";
+const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it; press Push, or hold Ctrl, and drag to push it.";
+const WITH_FINGERS = "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it; press Push and drag to push it.";
 
-/** Why this browser cannot show it, or nothing. */
+/** The reason why this browser cannot show the view, or an empty string. */
 function lacking() {
-  if (!window.crossOriginIsolated) return "Browsers show the 3-D view on this machine and over https only.";
+  if (!window.crossOriginIsolated) return "Browsers show the 3-D view only on this machine or over HTTPS.";
   if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3-D view needs.";
   return "";
 }
@@ -29,7 +29,7 @@ export function makeView() {
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
 
-  /** What stands in the way of a picture, or nothing. */
+  /** The reason why there is no picture yet, or an empty string. */
   function waiting() {
     if (unable) return unable;
     if (!here.socket) return "Waiting for the console.";
@@ -40,7 +40,7 @@ export function makeView() {
   function show() {
     const why = waiting();
     let frame = stage.querySelector("iframe");
-    // A frame that shows something stays while a connection is lost: what it shows is the last that came.
+    // A loaded frame stays while the connection is lost: it shows the last state.
     const wanted = box.open && !unable && (frame ? !here.missing : !why);
     if (wanted && !frame) {
       here.shown = false;

@@ -1,10 +1,10 @@
-// Runs in MuJoCo's web viewer, before mujoco_viewer.js: its camera, selection, overlays and what the pointer does.
+// Runs in MuJoCo's web viewer, before mujoco_viewer.js: its camera, selection, overlays and pointer input.
 //
-// The viewer keeps its camera to itself. It begins with the camera of the first state, so its places in memory are
-// found by that value; where they are not found, the viewer's own mouse control stays, and nothing can be picked.
+// The viewer does not expose its camera. It starts with the camera of the first state, so this finds its copies in
+// memory by that value; if it finds none, the viewer's own mouse control stays, and nothing can be picked.
 
 const viewerPointer = (() => {
-  const STATIC_BYTES = 8 * 1024 * 1024; // where a program keeps what lives as long as itself
+  const STATIC_BYTES = 8 * 1024 * 1024; // where a program keeps its static data
   const CLICK_PIXELS = 4;
   const TURN = 180; // degrees for a drag over the whole height
   const camera = { lookat: [0, 0, 0], distance: 3, azimuth: 90, elevation: -45 };
@@ -20,7 +20,7 @@ const viewerPointer = (() => {
   const tell = (message) => window.parent.postMessage(message, location.origin);
   const numbers = () => [...camera.lookat, camera.distance, camera.azimuth, camera.elevation];
 
-  /** Find the viewer's cameras: all copies of the one that a state brought. */
+  /** Find the viewer's cameras: all copies in memory of the first state's camera. */
   function seek(model) {
     if (soughtIn === model || !first || !layout) return;
     soughtIn = model;
@@ -35,7 +35,7 @@ const viewerPointer = (() => {
     pointer.found = places.length > 0 && layout.camera !== undefined;
   }
 
-  /** Write our camera over the viewer's. */
+  /** Overwrite the viewer's camera with ours. */
   function aim() {
     if (!pointer.found) return;
     const memory = new Float64Array(wasmMemory.buffer, 0, STATIC_BYTES / 8);
@@ -74,7 +74,7 @@ const viewerPointer = (() => {
   const half = () => Math.tan(((layout?.fovy ?? 45) * Math.PI) / 360);
   const origin = () => sum([1, camera.lookat], [-camera.distance, axes().forward]);
 
-  /** The ray through a place of the picture. */
+  /** The ray through a point of the picture. */
   function ray(x, y) {
     const { forward, right, up } = axes();
     const v = (1 - (2 * y) / window.innerHeight) * half();
@@ -82,7 +82,7 @@ const viewerPointer = (() => {
     return { origin: origin(), direction: sum([1, forward], [u, right], [v, up]) };
   }
 
-  /** Where a ray meets the plane through a point that faces the camera. */
+  /** The intersection of a ray with the plane through a point that faces the camera. */
   function onPlane(point, { origin: from, direction }) {
     const { forward } = axes();
     return sum([1, from], [dot(sum([1, point], [-1, from]), forward) / dot(direction, forward), direction]);
@@ -159,7 +159,7 @@ const viewerPointer = (() => {
     if (!pointers.size || drag.kind !== "pinch") drag = null;
   }
 
-  /** The page found what is gripped: a point of the body, in its frame and in the world. */
+  /** The page has found the gripped point of the body, in the body's frame and in the world. */
   function gripped(grip) {
     if (drag?.kind !== "push") return;
     drag.grip = grip;
