@@ -88,8 +88,8 @@ def add_parser(commands: Commands) -> None:
         "--step-mode",
         type=one_of(StepMode.LIVE, StepMode.DIRECT),
         metavar="MODE",
-        help="direct: time passes only while a tool steps; live: physics runs by itself (default: direct with "
-        "--allow-drive, otherwise unchanged)",
+        help="direct: time passes only while a tool steps; live: physics runs by itself (default: with --allow-drive "
+        "direct, otherwise unchanged)",
     )
     allowed.add_argument(
         "--models",
