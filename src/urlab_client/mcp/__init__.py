@@ -1,6 +1,6 @@
 """Tools for agents over the Model Context Protocol: a server on the async client and the console's controls.
 
-Needs the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs that bring their own client or transport.
+Requires the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs with their own client or transport.
 """
 
 from urlab_client._extras import need

@@ -1,4 +1,4 @@
-"""The MCP server: the tools and resources that one agent gets."""
+"""The MCP server: the tools and resources of an agent."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _RESOURCES = {
 }
 _TOOLS = declared(looking, moving, editing)
 _LARGE = 1e3
-_MOST_CALLERS = 100  # clients of the older protocol open a session each, and need not say when it ends
+_MOST_CALLERS = 100  # each client of the older protocol opens a session, and may not report its end
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
 _NO_PLAY = "No play session runs, so there are no robots. Call play with action='start'."
 _METHODS = {
@@ -58,7 +58,7 @@ _METHODS = {
     "waiting for step()": "waiting for run",
     "Call reset()": "Call reset",
 }
-"""What the client's advice calls methods, and which tools do that."""
+"""Methods in the client's hints, and the tools that correspond to them."""
 
 
 class Agent:
@@ -66,8 +66,8 @@ class Agent:
 
     Args:
         console: The console application of `urlab_client.web.app()`, or its session.
-        limits: What the agent may do.
-        models: MJCF files that the agent may import, by the names that it sees.
+        limits: Permissions and limits of the agent.
+        models: MJCF files that the agent may import, by the names shown to it.
 
     Attributes:
         server: The server of the MCP SDK, for a transport of your choice. Serve it while the console's lifespan runs.
@@ -141,10 +141,11 @@ class Agent:
         return answer
 
     def _caller(self, context: ServerRequestContext[Any]) -> Caller:
-        """Return who calls: whoever brought this token, within it this session if there are any, of this program.
+        """Return the caller, identified by token, session, if any, and program.
 
-        Present clients open no session, so two alike that share a token are one. Whoever has not called for the
-        longest is forgotten where there are many, unless they have the controls: they come back under another name.
+        Current clients open no session, so two of the same program that share a token count as one. If there are too
+        many callers, the one that has been idle longest is forgotten unless it has the controls; it returns under
+        another name.
         """
         client = context.session.client_params
         request = context.request
@@ -153,7 +154,7 @@ class Agent:
         session = "" if request is None else request.headers.get("mcp-session-id", "")
         who = name, token, session
         caller = self._callers.pop(who, None) or Caller(self._console.new_agent_name(name))
-        self._callers[who] = caller  # after those that have not called for longer
+        self._callers[who] = caller  # moves it to the end of the order of idleness
         if len(self._callers) > _MOST_CALLERS:
             holder = self._console.lease.holder
             del self._callers[next(known for known, one in self._callers.items() if one is not holder)]
@@ -168,10 +169,10 @@ class Agent:
         raise LookupError(f"No tool is called {name!r}. There are: {', '.join(self._offered)}.")
 
     def _answer(self, result: Struct | tuple[Struct, bytes]) -> types.CallToolResult:
-        """Return a result with its structure, its text, and its picture if there is one.
+        """Return a result with its structured content, its text, and its picture, if any.
 
         Raises:
-            ValueError: A number in it is not finite.
+            ValueError: A number in the result is not finite.
         """
         shown, jpeg = result if isinstance(result, tuple) else (result, None)
         client = self._console.client
@@ -206,10 +207,10 @@ class Agent:
 
 
 def _short(value: Any) -> Any:
-    """Return what a result is made of with six digits of each number, and tools where it speaks of methods."""
+    """Return the parts of a result with numbers rounded to six digits, and names of tools instead of methods."""
     match value:
         case float() if math.isfinite(value):
-            return float(f"{value:.6g}") if abs(value) < _LARGE else round(value, 3)  # such as times
+            return float(f"{value:.6g}") if abs(value) < _LARGE else round(value, 3)  # for example times
         case float():
             raise ValueError("The simulation has diverged: some values are not finite. Call reset.")
         case str():

@@ -1,4 +1,4 @@
-"""One call of a tool: who makes it, on which session, within which limits."""
+"""One call of a tool: its caller, session and limits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["RESTARTED", "TAKEN_OVER", "Call", "Caller", "Limits", "Progress", "S
 
 T = TypeVar("T")
 Progress = Callable[[float, float], Awaitable[None]]
-"""Told how much simulation time has passed, and how much may pass."""
+"""Progress callback: simulation time passed, and its limit."""
 
 TAKEN_OVER = "Another program has taken the server over. Ask a person to take it back in the console."
 
@@ -33,17 +33,17 @@ RESTARTED = "The server was started again, and its simulation has begun anew. Ca
 _CONNECT_S = 10.0
 _REPORT_S = 0.1
 _REST_S = 5.0
-_THINKS_S = 60.0  # between two calls; people need not wait for that
+_THINKS_S = 60.0  # idle time after which an agent loses the controls; people can take them earlier
 
 
 class Limits(Struct, frozen=True, kw_only=True):
-    """What an agent may do.
+    """Permissions and limits of an agent.
 
     Attributes:
         drive: Whether it may move robots, reset, pause and record.
         edit: Whether it may change the scene.
         sim_seconds: Simulation time that one call may take, seconds.
-        wall_seconds: Time on the wall that one call may take, seconds.
+        wall_seconds: Wall time that one call may take, seconds.
     """
 
     drive: bool = False
@@ -53,14 +53,14 @@ class Limits(Struct, frozen=True, kw_only=True):
 
 
 class Stopped(Exception):
-    """A call was broken off; the text says why, and what to do."""
+    """A call was aborted; the message says why, and what to do."""
 
 
 class Caller(Viewer):
-    """An agent. People take the controls from it by acting; other agents wait until it leaves them alone.
+    """An agent. People take the controls from it by acting; other agents wait until it is idle.
 
     Attributes:
-        told: Number of the last entry of the log that it has read.
+        told: Number of the last log entry that it has read.
     """
 
     def __init__(self, name: str) -> None:
@@ -73,10 +73,10 @@ class Call:
 
     Args:
         console: The session, which people may watch.
-        caller: Who calls.
-        limits: What the agent may do.
-        models: Files that can be imported, by the names that the agent sees.
-        progress: Told how far the call is.
+        caller: The caller.
+        limits: Permissions and limits of the agent.
+        models: Files that can be imported, by the names shown to the agent.
+        progress: Progress callback.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Call:
         """Return a robot.
 
         Raises:
-            LookupError: There is none of that name; the text says which there are.
+            LookupError: No robot has this name; the message lists the robots.
         """
         return self.client.articulations[name]
 
@@ -108,12 +108,12 @@ class Call:
         """Return a duration of simulation time that the call may take.
 
         Raises:
-            ValueError: It is above the limit.
+            ValueError: The duration exceeds the limit.
         """
         if seconds > self.limits.sim_seconds:
             raise ValueError(
                 f"A call may take up to {self.limits.sim_seconds:g} s of simulation time, got {seconds:g}. "
-                "Call again to go on."
+                "Call again to continue."
             )
         self._seconds = seconds
         return seconds
@@ -122,7 +122,7 @@ class Call:
         """Wait until the console's session is open.
 
         Raises:
-            URLabConnectionError: It is not, and why.
+            URLabConnectionError: The session did not open; the message says why.
         """
         with self.console.bell() as changed, anyio.move_on_after(_CONNECT_S):
             while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
@@ -134,15 +134,16 @@ class Call:
         if link.state != "connected":
             raise URLabConnectionError(
                 f"There is no connection to {self.client.address}: {(link.reason or link.state).rstrip('.?')}.",
-                hint="It is tried again all the time. Call again later.",
+                hint="The connection is retried automatically. Call again later.",
             )
 
     async def drive(self, work: Callable[[], Awaitable[T]]) -> T:
         """Do something that changes the simulation, through the console's controls.
 
         Raises:
-            NotDriving: Somebody else has the controls; nothing was done.
-            Stopped: Somebody took the controls meanwhile, or it took too long; says whether the simulation is at rest.
+            NotDriving: Another caller has the controls; nothing was done.
+            Stopped: The controls were taken over during the call, or it took too long; the message says whether the
+                simulation is at rest.
         """
         began = False
         why = f"It took longer than {self.limits.wall_seconds:g} s on the wall."
@@ -156,20 +157,20 @@ class Call:
                 if not began:
                     raise NotDriving(f"{why} Nothing was done. Call again later, or ask.") from None
         rests = "and the simulation is at rest" if self._rests else "but the simulation may still move"
-        raise Stopped(f"{why} The call was broken off, {rests}. Call state before going on.")
+        raise Stopped(f"{why} The call was aborted, {rests}. Call state before you continue.")
 
     async def _reported(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Do something, report its progress, and leave the simulation at rest if it is broken off."""
+        """Do something, report its progress, and leave the simulation at rest if it is aborted."""
         reporting = asyncio.create_task(self._report())
         try:
-            if self.console.controls.running:  # stepped along with the clock, for somebody who has left
+            if self.console.controls.running:  # real-time stepping, started by a caller that has left
                 await self.console.controls.run(self.caller, running=False)
             return await work()
         except (OutcomeUnknown, URLabTimeoutError):
             with contextlib.suppress(URLabError):
                 await self.client.resync()
             raise
-        except asyncio.CancelledError:  # by the agent's host, too
+        except asyncio.CancelledError:  # also by the agent's host
             with anyio.CancelScope(shield=True):
                 await self._rest()
             raise
@@ -185,7 +186,7 @@ class Call:
                 await self._progress(min(max(self.client.sim_time - start, 0.0), self._seconds), self._seconds)
 
     async def _rest(self) -> None:
-        """Leave the simulation at rest: nothing in doubt, and paused where time passes by itself."""
+        """Leave the simulation at rest: no request in doubt, and paused in live mode."""
         self._rests = False
         with anyio.move_on_after(_REST_S), contextlib.suppress(URLabError):
             await self.client.resync()

@@ -1,4 +1,4 @@
-"""Declaring a tool: a function, whose signature becomes the input schema, whose docstring what agents read of it."""
+"""Declaring tools: the signature of a function becomes the input schema, its docstring the description for agents."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Function = Callable[..., Awaitable[Any]]
 
 
 class Needs(Enum):
-    """What an agent must be given: the command's option for it."""
+    """A permission: the command's option that grants it."""
 
     NOTHING = ""
     SESSION = "--take-over"
@@ -34,14 +34,14 @@ class Declared:
     """One tool.
 
     Args:
-        function: What it does, given a `Call` and what the agent passes.
-        needs: What an agent must be given.
-        play: Whether a play session must run.
-        hints: What hosts get to know of it.
+        function: Implementation, called with a `Call` and the agent's arguments.
+        needs: Permission that it requires.
+        play: Whether a play session must be running.
+        hints: Annotations for hosts.
 
     Attributes:
-        name: Its name.
-        drives: Whether it changes something, and so takes the controls.
+        name: Name of the tool.
+        drives: Whether it changes something, and therefore takes the controls.
     """
 
     def __init__(self, function: _Function, needs: Needs, hints: ToolAnnotations, *, play: bool) -> None:
@@ -66,7 +66,7 @@ class Declared:
         )
 
     def described(self) -> Tool:
-        """Return what an agent gets to know."""
+        """Return the description for agents."""
         arguments, result = self._arguments(), get_type_hints(self.function)["return"]
         output, when = _schema(result.__args__[0] if hasattr(result, "__args__") else result), _schema(Moment)
         output["properties"] |= when["properties"]
@@ -84,7 +84,7 @@ class Declared:
         """Return the arguments of a call.
 
         Raises:
-            ValueError: They do not fit; the text says which does not, and which there are.
+            ValueError: An argument is invalid; the message names it and lists the parameters.
         """
         plain = {name: _from_text(value) for name, value in given.items()}
         try:
@@ -101,10 +101,10 @@ def tool(
     """Declare a function as a tool.
 
     Args:
-        needs: What an agent must be given.
-        play: Whether a play session must run.
-        destructive: Whether it may undo what was there.
-        idempotent: Whether a second call with the same arguments changes nothing more.
+        needs: Permission that the tool requires.
+        play: Whether a play session must be running.
+        destructive: Whether it may destroy existing state.
+        idempotent: Whether a second call with the same arguments has no further effect.
     """
 
     def declare(function: _Function) -> Declared:
@@ -125,14 +125,14 @@ def declared(*modules: ModuleType) -> dict[str, Declared]:
 
 
 def _schema(struct: type[Struct]) -> dict[str, Any]:
-    """Return a JSON schema with an object at its root, as the protocol wants it."""
+    """Return a JSON schema with an object at its root, as the protocol requires."""
     parts = schemas([struct], "#/$defs/{name}")
     root = parts.pop(struct.__name__)
     return {**root, "$defs": parts} if parts else root
 
 
 def _from_text(value: Any) -> Any:
-    """Return what a text contains if that is a JSON object or array: some hosts send those as text."""
+    """Parse a text if it is a JSON object or array; some hosts send these as text."""
     if isinstance(value, str) and value[:1] in {"{", "["}:
         try:
             return json.loads(value)

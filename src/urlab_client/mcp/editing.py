@@ -1,4 +1,4 @@
-"""Tools that change the scene. Play begins anew after each, as the simulation is compiled again."""
+"""Tools that change the scene. Play restarts after each, because the simulation is compiled again."""
 
 from __future__ import annotations
 
@@ -36,26 +36,27 @@ async def import_model(call: Call, model: str) -> Edited:
     except ImportFailed:
         if not call.client.server.features.uploads:
             raise
-        blueprint = await scene.upload_model(file)  # the server has no such file, or may not read it
+        blueprint = await scene.upload_model(file)  # the server does not have the file, or may not read it
     return _edited(call, f"The blueprint {blueprint.short_name!r} is there; spawn places it.")
 
 
 @tool(Needs.EDIT, play=False)
 async def spawn(call: Call, blueprint: str, actor_id: NewId, position: Position, yaw: Degrees = 0.0) -> Edited:
-    """Place a robot or body. Restarts play: the simulation begins anew, with all robots at their start.
+    """Place a robot or body. Restarts play: the simulation starts from the beginning, with all robots at their initial
+    state.
 
     Args:
         blueprint: One of `blueprints`, as `look` lists them; `import_model` makes more.
-        actor_id: Id of the new actor, of your choice: letters, digits and `_`.
-        position: Where its origin goes: (x, y, z) in the world, metres.
-        yaw: Turn about the vertical, degrees.
+        actor_id: Id of your choice for the new actor: letters, digits and `_`.
+        position: Position of its origin: (x, y, z) in the world, metres.
+        yaw: Rotation about the vertical axis, degrees.
     """
     known = {one.short_name: one.class_path for one in await call.client.outliner.list_blueprints()}
     if blueprint not in known:
         advice = "import_model makes one of it." if blueprint in call.models else "See `blueprints` in look."
         raise LookupError(f"No blueprint is called {blueprint!r}.{did_you_mean(blueprint, known)} {advice}")
     if any(row.actor_id == actor_id for row in await call.client.outliner.list_actors()):
-        raise ValueError(f"There is an actor {actor_id!r} already: move moves it, remove removes it.")
+        raise ValueError(f"There is already an actor {actor_id!r}: move moves it, remove removes it.")
     async with call.client.scene.edit():
         await call.client.scene.spawn_actor(
             known[blueprint], actor_id, location=position, rotation_euler=(0.0, 0.0, yaw)
@@ -68,7 +69,7 @@ async def spawn(call: Call, blueprint: str, actor_id: NewId, position: Position,
 
 @tool(Needs.EDIT, play=False, idempotent=True)
 async def move(call: Call, actor: Actor, position: Position) -> Edited:
-    """Put a robot or body elsewhere in the level. Restarts play: the simulation begins anew."""
+    """Move a robot or body in the level. Restarts play: the simulation starts from the beginning."""
     target = await _target(call, actor)
     async with call.client.scene.edit():
         await call.client.scene.set_actor_transform(**target, location=position)
@@ -77,7 +78,7 @@ async def move(call: Call, actor: Actor, position: Position) -> Edited:
 
 @tool(Needs.EDIT, play=False, destructive=True, idempotent=True)
 async def remove(call: Call, actor: Actor) -> Edited:
-    """Remove a robot or body from the level. Restarts play: the simulation begins anew."""
+    """Remove a robot or body from the level. Restarts play: the simulation starts from the beginning."""
     target = await _target(call, actor)
     async with call.client.scene.edit():
         await call.client.scene.destroy_actor(**target)
@@ -85,7 +86,7 @@ async def remove(call: Call, actor: Actor) -> Edited:
 
 
 async def _target(call: Call, named: str) -> dict[str, Any]:
-    """Return what ops call an actor: its id, or else the engine's name for it."""
+    """Return what ops call an actor: its id, or otherwise the engine's name."""
     listed = await call.client.outliner.list_actors()
     rows = [row for row in listed if row.actor_id or row.is_articulation or row.has_quick_convert]
     art = call.client.articulations.get(named)

@@ -37,7 +37,7 @@ async def look(call: Call) -> World:
 
 @tool(Needs.NOTHING, idempotent=True)
 async def state(call: Call, robot: Robot) -> RobotState:
-    """Read a robot: where its joints are and how fast they move, its set-points, what its sensors read."""
+    """Read a robot: joint positions and velocities, set-points and sensor readings."""
     described = call.robot(robot).describe()
     return RobotState(
         robot=described.name,
@@ -51,11 +51,11 @@ async def state(call: Call, robot: Robot) -> RobotState:
 
 @tool(Needs.NOTHING, idempotent=True)
 async def picture(call: Call, camera: str, size: Annotated[int, Meta(ge=16, le=1024)] = 512) -> tuple[Picture, bytes]:
-    """Take a picture with a camera as the world is now. No time passes. Depth is grey, near is bright.
+    """Take a picture of the current world with a camera. No time passes. Depth is grey, with near pixels bright.
 
     Args:
         camera: `ROBOT/CAMERA`, or the name of a camera of the scene; see `look`.
-        size: Longest side in pixels, at most.
+        size: Maximum length of the longer side, pixels.
     """
     sample = await call.client.camera(camera).capture()
     jpeg = await anyio.to_thread.run_sync(partial(sample.jpeg, max_size=size))
@@ -67,7 +67,7 @@ async def contacts(call: Call, most: Annotated[int, Meta(ge=1, le=200)] = 30) ->
     """List which bodies touch, where, and with what force.
 
     Args:
-        most: Return at most so many.
+        most: Maximum number of contacts to return.
     """
     found = await call.client.runtime.get_contacts(max_contacts=most)
     return Contacts(contacts=found.contacts, truncated=found.truncated)
@@ -77,17 +77,17 @@ async def contacts(call: Call, most: Annotated[int, Meta(ge=1, le=200)] = 30) ->
 async def explain(call: Call) -> Diagnosis:
     """Find out why a robot does not move: connection, play, pause, modes, controllers, set-points.
 
-    Call this when something did not move as expected. Findings with verdict `problem` come with what to do.
+    Call this when something did not move as expected. Findings with verdict `problem` say what to do.
     """
     return await call.client.explain()
 
 
 @tool(Needs.NOTHING, play=False)
 async def log(call: Call, since: int | None = None) -> Log:
-    """Read what happened: calls, errors and events, of people, too.
+    """Read the log: calls, errors and events, including those of people.
 
     Args:
-        since: Number of the last entry that you know. Without it you get what is new since your last call of `log`.
+        since: Number of the last entry that you know. Without it you get the entries since your last call of `log`.
     """
     start = call.caller.told if since is None else since
     entries = [entry for entry in call.console.entries if entry.n > start]

@@ -35,7 +35,7 @@ async def run(call: Call, seconds: Positive | None = None, steps: Annotated[int,
     if (seconds is None) == (steps is None):
         raise ValueError("run takes either `seconds` or `steps`.")
     if steps is not None and not timestep:
-        raise ValueError("In this mode time passes by itself: give `seconds` instead of `steps`.")
+        raise ValueError("In this mode time passes automatically: give `seconds` instead of `steps`.")
     left = call.within(max(timestep, seconds or 0.0) if steps is None else steps * timestep)
     # A recording has a state for each reply.
     piece = left if call.console.recordings.running is None else max(_RECORDED_S, timestep)
@@ -49,16 +49,16 @@ async def run(call: Call, seconds: Positive | None = None, steps: Annotated[int,
 async def move_to(
     call: Call, robot: Robot, joints: Targets, tolerance: Positive = 0.01, timeout: Positive = 5.0
 ) -> Done:
-    """Move joints to positions and wait until they have settled there.
+    """Move joints to positions and wait until they have settled.
 
     For joints with a position servo: `look` lists an actuator for it that takes `position`. Others are moved with
-    `set_actuators` and `run`. Refuses positions beyond a joint's limits. Fails with the reason when a joint has not
-    settled in time; it goes on towards its target when more time passes.
+    `set_actuators` and `run`. Refuses positions beyond a joint's limits. Fails with the reason if a joint has not
+    settled in time; it continues towards its target as more time passes.
 
     Args:
         joints: Joint name to position: rad or m.
-        tolerance: How near is near enough: rad or m.
-        timeout: Simulation time that it may take, seconds.
+        tolerance: Largest remaining distance: rad or m.
+        timeout: Longest simulation time, seconds.
     """
     found = call.robot(robot)
     passed = await found.move_to(joints, tolerance=tolerance, timeout=call.within(timeout))
@@ -68,7 +68,7 @@ async def move_to(
 
 @tool(Needs.DRIVE, idempotent=True)
 async def set_actuators(call: Call, robot: Robot, set_points: Targets) -> Done:
-    """Tell actuators what to do; the others keep what they were told. Acts as time passes: call `run` then.
+    """Set set-points of actuators; the others keep theirs. They take effect as time passes, so call `run` afterwards.
 
     Args:
         set_points: Actuator name to value, in the unit and within the limits that `look` shows.
@@ -76,13 +76,13 @@ async def set_actuators(call: Call, robot: Robot, set_points: Targets) -> Done:
     found = call.robot(robot)
     found.set_ctrl(set_points, out_of_range="error")
     if call.client.step_mode is StepMode.LIVE:
-        await call.client.step()  # hands them over
+        await call.client.step()  # sends them
     return Done(done=f"{found.name} has new set-points: {', '.join(set_points)}.")
 
 
 @tool(Needs.DRIVE, destructive=True, idempotent=True)
 async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[str, float]] | None = None) -> Done:
-    """Put the simulation back to its beginning. Set-points stay. Use it also when a simulation has diverged.
+    """Reset the simulation to its initial state. Set-points are kept. Also use it when the simulation has diverged.
 
     Args:
         keyframe: Keyframe to start from; default: the initial state.
@@ -96,7 +96,7 @@ async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[
                 takes = f"{low:g} to {high:g} {found.unit}"
                 raise ValueError(f"joint {joint!r} of {name!r} takes {takes}, got {position:g}. Nothing was reset.")
     await call.client.reset(keyframe, per_articulation_qpos=joints)
-    return Done(done="The simulation is at its beginning.")
+    return Done(done="The simulation was reset.")
 
 
 @tool(Needs.DRIVE, play=False, destructive=True, idempotent=True)
@@ -114,7 +114,7 @@ async def play(call: Call, action: Literal["start", "stop", "pause", "resume"]) 
             await call.client.sim.stop()
             return Done(done="Play has ended. There are no robots until it starts again.")
         case _ if call.client.step_mode is not StepMode.LIVE:
-            raise ValueError(f"In mode {call.client.step_mode} time passes only while a tool lets it: call run.")
+            raise ValueError(f"In mode {call.client.step_mode} time passes only while a tool steps: call run.")
         case _:
             await call.client.runtime.set_paused(action == "pause")
             return Done(done="Time stands still." if action == "pause" else "Time passes.")
@@ -126,7 +126,7 @@ async def record(call: Call, action: Literal["start", "stop"], cameras: bool = F
 
     Args:
         action: What to do.
-        cameras: Whether to record pictures of all cameras, too.
+        cameras: Whether to also record pictures of all cameras.
     """
     if action == "start":
         return Recorded(await call.console.recordings.start(cameras=cameras), running=True)

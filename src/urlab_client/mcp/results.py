@@ -1,4 +1,4 @@
-"""What the tools return, where the client has no type for it."""
+"""Return types of the tools for which the client has no type."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["Contacts", "Done", "Edited", "Log", "Moment", "Picture", "Recorded",
 
 
 class Moment(Struct):
-    """When a result was made; every result has these fields, too.
+    """Time of a result; every result also has these fields.
 
     Attributes:
         sim_time: Simulation time, seconds.
         step: Physics steps since the session began or the last reset; not counted in mode `live`.
-        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
+        mode: `direct`: time passes only while a tool steps; `live`: time passes automatically unless paused.
     """
 
     sim_time: float
@@ -26,14 +26,14 @@ class Moment(Struct):
 
 
 class World(Struct):
-    """Everything there is.
+    """The world.
 
     Attributes:
         scene: Robots with joints, actuators, sensors and cameras, and other bodies.
         blueprints: What `spawn` can place.
         models: What `import_model` can turn into a blueprint.
         keyframes: What `reset` can start from.
-        driver: Who has the controls: `you`, the name of somebody else, or None.
+        driver: Holder of the controls: `you`, another name, or None.
     """
 
     scene: SceneDescription
@@ -47,11 +47,11 @@ class RobotState(Struct):
     """One robot at one moment.
 
     Attributes:
-        robot: Its name.
-        pose: Pose of its root, or None where that is not known.
-        joints: Position of each joint that has a single one: rad or m.
-        velocities: Their velocities: rad/s or m/s.
-        set_points: What its actuators are told.
+        robot: Name of the robot.
+        pose: Pose of its root, or None if unknown.
+        joints: Positions of hinge and slide joints: rad or m.
+        velocities: Velocities of these joints: rad/s or m/s.
+        set_points: Set-points of its actuators.
         sensors: Readings by name.
     """
 
@@ -64,10 +64,10 @@ class RobotState(Struct):
 
 
 class Done(Struct):
-    """What became of a call that changed something.
+    """Result of a call that changed something.
 
     Attributes:
-        done: In words.
+        done: Description of what was done.
         passed: Simulation time that passed, seconds.
     """
 
@@ -76,7 +76,7 @@ class Done(Struct):
 
 
 class Picture(Struct):
-    """What comes beside an image.
+    """Description of an image.
 
     Attributes:
         camera: `ROBOT/CAMERA`, or a camera of the scene.
@@ -104,7 +104,7 @@ class Log(Struct):
 
     Attributes:
         entries: Newest last; `at` is Unix time.
-        next: Pass it as `since` to go on from here.
+        next: Pass this as `since` to continue from here.
     """
 
     entries: list[LogEntry]
@@ -112,15 +112,15 @@ class Log(Struct):
 
 
 class Recorded(Struct):
-    """A recording. What is in it is known when it has ended.
+    """A recording. Its contents are known when it has ended.
 
     Attributes:
         name: Name of the MCAP file in the folder for recordings.
-        running: Whether it goes on.
-        seconds: Its length, simulation time.
+        running: Whether it is in progress.
+        seconds: Duration in simulation time.
         robots: Robots in it.
         cameras: Cameras in it.
-        lost: States and pictures that came too fast to be written.
+        lost: States and pictures that arrived too fast to be written.
     """
 
     name: str
@@ -132,12 +132,12 @@ class Recorded(Struct):
 
 
 class Edited(Struct):
-    """A scene after an edit; play began anew.
+    """The scene after an edit, which restarted play.
 
     Attributes:
-        done: In words.
-        robots: Robots there are now.
-        bodies: Other bodies there are now.
+        done: Description of what was done.
+        robots: Robots in the scene.
+        bodies: Other bodies in the scene.
     """
 
     done: str

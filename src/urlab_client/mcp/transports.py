@@ -1,4 +1,4 @@
-"""How agents reach the server: standard input and output, or HTTP with a token."""
+"""Transports of the MCP server: standard input and output, or HTTP with a token."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHUNK_BYTES = 65536
 
 async def serve_stdio(agent: Agent) -> None:
     """Serve one agent on standard input and output until its input ends."""
-    lines = cast("Any", _Lines(sys.stdin.fileno()))  # the SDK iterates over it, and does nothing else
+    lines = cast("Any", _Lines(sys.stdin.fileno()))  # the SDK only iterates over it
     async with stdio_server(stdin=lines) as (reader, writer):
         await agent.server.run(reader, writer, agent.server.create_initialization_options())
 
@@ -34,7 +34,8 @@ async def serve_stdio(agent: Agent) -> None:
 class _Lines:
     """Lines of text from a file.
 
-    Nothing interrupts a thread that reads. This one ends with the process, so that Ctrl-C ends the server at once.
+    A thread that reads cannot be interrupted. This one ends with the process, so that Ctrl-C ends the server
+    immediately.
     """
 
     def __init__(self, file: int) -> None:
@@ -58,16 +59,16 @@ class _Lines:
 
 
 def http_application(agent: Agent, console: ASGIApp | None, access: Access) -> Starlette:
-    """Make an application with the agent's server at `/mcp`, and the console at all other paths.
+    """Create an application with the agent's server at `/mcp` and the console at all other paths.
 
     Args:
         agent: The agent.
-        console: The console, if it is shown. Its lifespan is the caller's.
-        access: Under which host names agents come, and with which key. Not the console's, which allows more.
+        console: The console, if any. The caller runs its lifespan.
+        access: Host names and token for agents. Separate from the console's access, which allows more.
     """
     inner = agent.server.streamable_http_app(
         streamable_http_path=_PATH,
-        transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `access` looks at that
+        transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `access` checks that
     )
     guarded = Guarded(inner, access, advice="Send the token that `urlab mcp` printed: `Authorization: Bearer TOKEN`.")
 
