@@ -1,4 +1,4 @@
-"""The AsyncAPI document of the two WebSockets, made of the declarations of their messages."""
+"""The AsyncAPI document of the two WebSockets, generated from the declarations of their messages."""
 
 from __future__ import annotations
 

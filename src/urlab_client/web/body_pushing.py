@@ -1,8 +1,8 @@
-"""Bodies in the 3-D view: which there are, which one a ray meets, and pushing one with the mouse.
+"""Bodies in the 3-D view: listing them, picking one with a ray, and pushing one with the mouse.
 
-A push is a spring between a point of the body and the pointer. In mode direct it is a force in every step that the
-console makes; in mode puppet the robot is moved. A browser renews its push while the button is held, so that one that
-vanishes lets go.
+A push is a spring between a point of the body and the pointer. In direct mode it is a force in every step that the
+console makes; in puppet mode the robot is moved. A browser renews its push while the button is held, so the push ends
+if the browser disappears.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Push(Struct):
 
 
 class Console(Protocol):
-    """What pushing needs of the session that all viewers share."""
+    """The part of the console session that pushing uses."""
 
     client: URLabClient
     lease: DrivingLease
@@ -81,10 +81,10 @@ class Console(Protocol):
 
 
 class BodyPushing:
-    """The bodies of one console and the one push there is at a time.
+    """The bodies of one console, and at most one push at a time.
 
     Args:
-        console: Whose.
+        console: The console session.
     """
 
     def __init__(self, console: Console) -> None:
@@ -112,7 +112,7 @@ class BodyPushing:
         return _view(shown, _checked(shown, body))
 
     async def pick(self, ray: Pick) -> Picked:
-        """Return what a ray meets.
+        """Return the first hit of a ray.
 
         Raises:
             ValueError: The ray has no direction or is not finite, or no model or state has arrived.
@@ -135,11 +135,11 @@ class BodyPushing:
         return Picked(_view(shown, body), local.tolist(), point.tolist())
 
     async def push(self, viewer: Viewer, push: Push) -> None:
-        """Push, or go on pushing, for as long as that is renewed.
+        """Start or renew a push.
 
         Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: The body cannot be pushed, or not now.
+            NotDriving: Another viewer has the controls.
+            ValueError: The body cannot be pushed, or not at present.
             URLabError: As `step` raises.
         """
         shown = await self._now()
@@ -160,12 +160,12 @@ class BodyPushing:
         self._push, self._by, self._until = push, viewer, time.monotonic() + _HELD_S
 
     def release(self, viewer: Viewer) -> None:
-        """Let go of what this viewer pushes."""
+        """End this viewer's push."""
         if self._by is not None and self._by.key == viewer.key:
             self._push = self._by = None
 
     def apply(self) -> None:
-        """Give the next step of mode direct the force of the push."""
+        """Add the force of the push to the next step of direct mode."""
         import mujoco  # noqa: PLC0415
 
         viewer = self._console.mujoco_viewer

@@ -1,4 +1,4 @@
-"""The part of the HTTP API that tells of bodies and pushes them."""
+"""Bodies in the HTTP API: listing, picking and pushing them."""
 
 from __future__ import annotations
 

@@ -62,11 +62,11 @@ _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
 class Audience:
-    """One viewer who is watching right now.
+    """A viewer who is watching.
 
     Attributes:
-        viewer: Who it is.
-        changed: Set when there is something new.
+        viewer: The viewer.
+        changed: Event that is set on each change.
     """
 
     def __init__(self, viewer: Viewer) -> None:
@@ -81,7 +81,7 @@ class ConsoleSession:
         client: The client; the console opens its session and keeps it.
         lease: The controls.
         recordings: Folder for recordings.
-        handshake: Returns what a read-only client discovers with; None for one that opens the session.
+        handshake: Callback that returns the handshake of a read-only client; None for a client that opens the session.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class ConsoleSession:
 
     @contextlib.asynccontextmanager
     async def open(self) -> AsyncGenerator[None]:
-        """Keep the session and receive state while the body runs."""
+        """Keep the session and receive state while the block runs."""
         async with anyio.create_task_group() as tasks:
             controls = self.controls
             jobs = (
@@ -145,7 +145,7 @@ class ConsoleSession:
                     await self.recordings.end()
 
     async def _keep(self) -> None:
-        """Open the session, and again whenever it is needed."""
+        """Open the session, and reopen it whenever necessary."""
         events = self.client.events()
         while True:
             if self._want is not None:
@@ -197,7 +197,7 @@ class ConsoleSession:
             self._adopted = given
 
     def _take(self, event: ClientEvent) -> None:
-        """Act on what happened to the connection."""
+        """Handle an event of the connection."""
         text = ", ".join(f"{name} {value}" for name, value in _said(event).items() if value)
         self.note("event", "server", str(event.__struct_config__.tag), text)
         match event:
@@ -225,7 +225,7 @@ class ConsoleSession:
                 pass
 
     def drive(self, viewer: Viewer, order: Ctrl | Hand) -> None:
-        """Do what a viewer's message orders.
+        """Carry out a viewer's order.
 
         Raises:
             NotDriving: Another viewer has the controls.
@@ -238,12 +238,12 @@ class ConsoleSession:
             self.controls.set_points(viewer, order.values)
 
     def new_agent_name(self, program: str) -> str:
-        """Return what an agent is called that has not called before: people and other agents see it."""
+        """Return a name for a new agent, which people and other agents see."""
         self._agents += 1
         return f"agent {self._agents}" + (f" ({program[:_AGENT_NAME]})" if program else "")
 
     def take_back(self) -> None:
-        """Open a session again, after another program took the server over."""
+        """Open a new session after another program has taken the server over."""
         self._want = "discover"
         self._wake.set()
 
@@ -253,13 +253,13 @@ class ConsoleSession:
             self.tell()
 
     def _begin_anew(self) -> None:
-        """Forget what belonged to the play before."""
+        """Discard the state of the previous play session."""
         self.controls.begin_anew()
         self._feeds = {path: one for path, one in self._feeds.items() if one.watched or self.camera(path) is one.view}
         self.redescribe()
 
     def redescribe(self) -> None:
-        """Describe the world anew: something in it is another."""
+        """Describe the world again after a change."""
         self.world = describe(self.client, self.world.version + 1, self.mujoco_viewer.missing)
         self.world_json = encode(World(self.world))
         self.tell()
@@ -276,11 +276,11 @@ class ConsoleSession:
                         snapshot = await states.receive(timeout=None)
                         self._note_time(snapshot.time)
                         if self._handshake is not None and not self.client.matches(snapshot):
-                            self.take_back()  # play began anew, and the driver has said so, or will
+                            self.take_back()  # play has restarted; the driver provides a new handshake
                             await anyio.sleep(_RETRY_S)
                         elif not self.replay.open:
                             self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
-                        # By the clock and not by when it woke up, else each late awakening makes the rate lower.
+                        # By the clock, not by the wake-up time: otherwise each late wake-up would lower the rate.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
                         await anyio.sleep(max(0.0, due - time.monotonic()))
             except ClientClosed:
@@ -290,7 +290,7 @@ class ConsoleSession:
                 await anyio.sleep(_RETRY_S)
 
     def _note_time(self, sim_time: float) -> None:
-        """Follow the time of the simulation, also while a recording is shown in its place."""
+        """Track simulation time, also while a recording is shown."""
         now = time.monotonic()
         if sim_time == self._sim_time:
             return
@@ -303,7 +303,7 @@ class ConsoleSession:
             self._rate_from = (now, sim_time)
 
     def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
-        """Show a state to everybody in place of the server's."""
+        """Show a state to all viewers in place of the server's."""
         self._publish(snapshot, targets)
 
     def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
@@ -323,7 +323,7 @@ class ConsoleSession:
         return self.link.state == "connected" and time.monotonic() - self._moved_at < _MOVING_S
 
     def status(self, viewer: Viewer) -> Status:
-        """Return what one viewer is told besides the state."""
+        """Return the status message for one viewer."""
         holder = self.lease.holder
         return Status(
             link=self.link,
@@ -347,7 +347,7 @@ class ConsoleSession:
         )
 
     def tell(self) -> None:
-        """Let everybody look again."""
+        """Notify all viewers of a change."""
         for one in self.audience:
             one.changed.set()
         for bell in self._bells:
@@ -355,7 +355,7 @@ class ConsoleSession:
 
     @contextlib.contextmanager
     def bell(self) -> Generator[asyncio.Event]:
-        """Yield an event that is set whenever there is something new."""
+        """Yield an event that is set on each change."""
         bell = asyncio.Event()
         bell.set()
         self._bells.add(bell)
@@ -378,11 +378,11 @@ class ConsoleSession:
     # Cameras
 
     def watched_cameras(self) -> list[str]:
-        """Return the cameras that somebody watches, by the names that `step` takes."""
+        """Return the cameras that viewers watch, by the names that `step` takes."""
         return [path.removeprefix("-/") for path, feed in self._feeds.items() if feed.watched]
 
     async def renew_pictures(self) -> None:
-        """Show pictures of another source, a recording's or the simulation's."""
+        """Switch the source of pictures between a recording and the simulation."""
         for feed in [*self._feeds.values()]:
             await feed.renew()
 

@@ -1,4 +1,4 @@
-"""What viewers do to the simulation: ops, set-points, steps. Those who change something need the lease."""
+"""Viewers' control of the simulation: ops, set-points, steps. Changes require the lease."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _PERIOD_S = 1 / 60
 
 
 class Console(Protocol):
-    """What the controls need of the session that all viewers share."""
+    """The part of the console session that the controls use."""
 
     client: URLabClient
     lease: DrivingLease
@@ -45,27 +45,27 @@ class Console(Protocol):
         ...
 
     def tell(self) -> None:
-        """Let everybody look again."""
+        """Notify all viewers of a change."""
         ...
 
     def redescribe(self) -> None:
-        """Describe the world anew."""
+        """Describe the world again."""
         ...
 
     def watched_cameras(self) -> list[str]:
-        """Return the cameras that somebody watches."""
+        """Return the cameras that viewers watch."""
         ...
 
 
 class Controls:
-    """The controls of one console, and what the server does not tell again.
+    """The controls of one console, and settings that the server does not report.
 
     Attributes:
-        running: Whether direct mode is stepped along with the clock.
-        speed: Pacing of live mode that somebody set, percent.
-        source: Who drives the actuators, if somebody chose.
-        twists: Velocities that were asked for, by articulation: x, y, yaw.
-        before_step: Called before each step of mode direct that the console makes.
+        running: Whether direct mode is stepped in real time.
+        speed: Pacing of live mode, percent, if a viewer has set it.
+        source: The control source, if a viewer has chosen it.
+        twists: Commanded velocities by articulation: x, y, yaw.
+        before_step: Callback invoked before each step that the console makes in direct mode.
     """
 
     def __init__(self, console: Console) -> None:
@@ -83,24 +83,24 @@ class Controls:
         self._commanded = asyncio.Event()
 
     def begin_anew(self) -> None:
-        """Forget what belonged to the play before."""
+        """Discard the state of the previous play session."""
         self._seeded.clear()
         self.twists.clear()
 
     def commands(self, key: str) -> bool:
-        """Return whether somebody has commanded this articulation since play began."""
+        """Return whether a viewer has commanded this articulation since play began."""
         return key in self._seeded
 
     async def do(self, viewer: Viewer, request: Request[Any]) -> object:
         """Perform an op for a viewer.
 
         Raises:
-            NotDriving: It changes something, and somebody else has the controls.
+            NotDriving: The op changes something, and another viewer has the controls.
             URLabError: As the client raises.
         """
         op = op_of(request)
         if isinstance(request, SetPaused) and request.paused:
-            self._lease.interrupt(viewer)  # everybody may stop
+            self._lease.interrupt(viewer)  # any viewer may stop
         elif op.effect is not Effect.READ:
             self._lease.use(viewer)
         began = time.perf_counter()
@@ -116,7 +116,7 @@ class Controls:
         return reply
 
     def _follow(self, request: Request[Any], reply: Any) -> None:
-        """Remember what the server does not tell again."""
+        """Remember settings that the server does not report."""
         match request:
             case SetSimSpeed():
                 self.speed = reply.percent
@@ -130,10 +130,10 @@ class Controls:
             self._console.redescribe()
 
     def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
-        """Set set-points by articulation and actuator. In live mode they are sent at once, the newest only.
+        """Set set-points by articulation and actuator. In live mode the newest are sent immediately.
 
         Raises:
-            NotDriving: Somebody else has the controls.
+            NotDriving: Another viewer has the controls.
             KeyError: An articulation or actuator is unknown; nothing was set.
             ValueError: A value is not a finite number; nothing was set.
         """
@@ -151,7 +151,7 @@ class Controls:
         self._commanded.set()
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
-        """Before a first set-point, hold still: the others of the articulation are sent along with it."""
+        """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
         if key in self._seeded:
             return
         self._seeded.add(key)
@@ -204,7 +204,7 @@ class Controls:
         return {"time": reply.time, "step": reply.step}
 
     async def run(self, viewer: Viewer, running: bool) -> None:
-        """Let physics run, or stop it, in whatever mode; everybody may stop it.
+        """Run or stop physics in any mode; any viewer may stop it.
 
         Raises:
             NotDriving: It was to run, and somebody else has the controls.
@@ -222,7 +222,7 @@ class Controls:
         self._console.tell()
 
     async def keep_stepping(self) -> None:
-        """In direct mode step along with the clock while that is wanted; what is missed is not made up for."""
+        """Step in real time in direct mode while `running`; missed steps are not made up for."""
         while True:
             if not self.running or self._client.step_mode is not StepMode.DIRECT:
                 self._wake_runner.clear()

@@ -1,4 +1,4 @@
-"""What there is in the simulation, as the page and programs get to know it."""
+"""Description of the simulation's contents, for the page and programs."""
 
 from __future__ import annotations
 

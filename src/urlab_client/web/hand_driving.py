@@ -1,6 +1,6 @@
-"""Hands that viewers move by velocities, with keys or a gamepad: `HandControl` for whoever has the controls.
+"""Hands that viewers move by velocities, with keys or a gamepad: `HandControl` for the viewer who has the controls.
 
-A velocity lasts for a moment only, so that a hand stops when its viewer's page does.
+A velocity lasts only a moment, so that a hand stops if its viewer's page stops.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FAR_M = 0.15  # from the target: something else has moved the hand
 
 
 class Console(Protocol):
-    """What is needed of the session that all viewers share."""
+    """The part of the console session that hand driving uses."""
 
     client: URLabClient
     lease: DrivingLease
@@ -58,11 +58,11 @@ class HandDriving:
         self._ordered = asyncio.Event()
 
     def command(self, viewer: Viewer, order: Hand) -> None:
-        """Move a hand from now on, for a moment.
+        """Move a hand for a moment.
 
         Raises:
-            NotDriving: Somebody else has the controls.
-            KeyError: There is no such articulation, or site.
+            NotDriving: Another viewer has the controls.
+            KeyError: There is no such articulation or site.
             ValueError: A number is not finite, the robot has no hand that can be moved, or the extra is missing.
         """
         for what, values in (("linear", order.linear), ("angular", order.angular), ("gripper", (order.gripper,))):
@@ -77,7 +77,7 @@ class HandDriving:
             self._orders.pop(order.articulation, None)
 
     async def keep_driving(self) -> None:
-        """Move the hands that somebody moves."""
+        """Move the hands that have orders."""
         began = time.monotonic()
         while True:
             if not self._orders:

@@ -1,4 +1,4 @@
-"""What Prometheus reads at `/metrics`."""
+"""Metrics for Prometheus at `/metrics`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["showing"]
 
 
 def showing(registry: CollectorRegistry) -> Callable[[Request], Response]:
-    """Return what answers with the metrics of a registry, in the format that is asked for."""
+    """Return a handler that serves the metrics of a registry in the requested format."""
     from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
 
     def show(request: Request) -> Response:

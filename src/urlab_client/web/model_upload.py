@@ -1,4 +1,4 @@
-"""The part of the HTTP API that takes models in: an MJCF file, or a ZIP archive with one and its meshes."""
+"""Model uploads in the HTTP API: an MJCF file, or a ZIP archive of an MJCF file and its meshes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ModelRoutes(RouteGroup):
 async def take_model(client: URLabClient, name: str, chunks: AsyncIterator[bytes]) -> URLabBlueprint:
     """Receive a model and make a blueprint of it.
 
-    Servers that take models over the wire get it so; others read it from this machine's disk, if it is theirs.
+    Servers that accept uploads receive it over the wire; others read it from this machine's disk, if they run here.
 
     Args:
         client: The client.

@@ -61,7 +61,7 @@ class Files(NamedTuple):
 
 @cache
 def files() -> Files | None:
-    """Return what is shipped, None if this MuJoCo comes without its web viewer."""
+    """Return the shipped files, or None if this MuJoCo has no web viewer."""
     payload = _payload()
     if payload is None:
         return None
@@ -156,7 +156,7 @@ class MujocoViewer:
         return self._shown
 
     def follow(self, snapshot: StateSnapshot) -> None:
-        """Take the newest state; it costs nothing until somebody looks."""
+        """Take the newest state; it costs nothing until a viewer asks for it."""
         self._snapshot = snapshot
 
     def latest(self) -> Shown | None:

@@ -37,7 +37,7 @@ class EncodedPicture:
         seq: Number among the pictures of its feed.
         received_ns: When it reached this process, UTC in nanoseconds.
         jpeg: The encoded bytes.
-        head: What the browser is told about it.
+        head: Header for the browser, JSON.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class EncodedPicture:
 
 
 class PictureRecording(Protocol):
-    """What a camera's pictures come from while a recording of them is replayed."""
+    """Source of a camera's pictures while a recording of them is replayed."""
 
     @property
     def at(self) -> float:
-        """Where it is, seconds."""
+        """The replay's position, seconds."""
         ...
 
     def has_pictures(self, camera: str) -> bool:
@@ -71,13 +71,13 @@ class PictureRecording(Protocol):
 
 
 class Feed:
-    """The newest picture of one camera, encoded once; receives only while somebody watches.
+    """The newest picture of one camera, encoded once; receives only while a viewer watches.
 
     Args:
         client: The client.
         view: The camera.
         path: Its name, as `ARTICULATION/CAMERA`.
-        recording: What is replayed, if anything is.
+        recording: The replay, which may be inactive.
 
     Attributes:
         newest: The newest picture, or None.
@@ -98,12 +98,12 @@ class Feed:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody watches."""
+        """Whether a viewer watches."""
         return self._watchers > 0
 
     @contextlib.asynccontextmanager
     async def watch(self) -> AsyncGenerator[Feed]:
-        """Keep it going while somebody watches."""
+        """Keep the feed running while the block runs."""
         self._watchers += 1
         if self._task is None:
             self._task = asyncio.create_task(self._run(), name="urlab-web-camera")

@@ -57,20 +57,20 @@ class ReplayView(Struct):
 
 
 class Publisher(Protocol):
-    """What a replay needs of the session that all viewers share."""
+    """The part of the console session that a replay uses."""
 
     client: URLabClient
 
     def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
-        """Show a state to everybody in place of the server's."""
+        """Show a state to all viewers in place of the server's."""
         ...
 
     async def renew_pictures(self) -> None:
-        """Show pictures of another source, the recording's or the simulation's."""
+        """Switch the source of pictures between the recording and the simulation."""
         ...
 
     def watched_cameras(self) -> list[str]:
-        """Return the cameras that somebody watches, by the names that `step` takes."""
+        """Return the cameras that viewers watch, by the names that `step` takes."""
         ...
 
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
@@ -78,12 +78,12 @@ class Publisher(Protocol):
         ...
 
     def tell(self) -> None:
-        """Let everybody look again."""
+        """Notify all viewers of a change."""
         ...
 
 
 class _Before(Struct):
-    """What a simulation is put back to."""
+    """The simulation's state and mode before a replay, to be restored."""
 
     mode: StepMode
     qpos: Any
@@ -91,7 +91,7 @@ class _Before(Struct):
 
 
 class _Robot(Struct):
-    """Where a robot's joint positions are: in an articulation of the recording, of which they may be a part."""
+    """The location of a robot's joint positions: all or part of an articulation of the recording."""
 
     source: str
     size: int
@@ -123,7 +123,7 @@ class Replay:
 
     @property
     def view(self) -> ReplayView | None:
-        """Where it is, or None when nothing is replayed."""
+        """The replay's position and options, or None if nothing is replayed."""
         if self._run is None:
             return None
         return ReplayView(
@@ -138,17 +138,17 @@ class Replay:
 
     @property
     def open(self) -> bool:
-        """Whether what is seen comes from a recording."""
+        """Whether a recording is shown."""
         return self._run is not None
 
     @property
     def rate(self) -> float:
-        """Seconds of the recording per second; 0 while it stands."""
+        """Seconds of the recording per second; 0 while paused."""
         return self._rate if self._playing else 0.0
 
     @property
     def at(self) -> float:
-        """Where it is, seconds from the recording's start."""
+        """The position, seconds from the recording's start."""
         return self._at
 
     def has_pictures(self, camera: str) -> bool:
@@ -156,11 +156,11 @@ class Replay:
         return self._run is not None and self._before is None and camera in self._cameras
 
     async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
-        """Return a camera's picture where the replay is, and its time in seconds from the recording's start.
+        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start.
 
         Raises:
-            URLabError: The file is damaged there.
-            OSError: It cannot be read.
+            URLabError: The file is damaged at this position.
+            OSError: The file cannot be read.
         """
         run, at = self._run, self._start + self._at
         if run is None or not self.has_pictures(camera):
@@ -169,11 +169,11 @@ class Replay:
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
-        """Return states of the last seconds before where it is, evenly spaced, the oldest first.
+        """Return states of the last seconds before the replay's position, evenly spaced, oldest first.
 
         Raises:
-            ValueError: Nothing is replayed.
-            URLabError: The file is damaged there.
+            ValueError: No recording is replayed.
+            URLabError: The file is damaged at this position.
         """
         run, robots, start, at = self._run, self._robots, self._start, self._at
         if run is None:
@@ -258,7 +258,7 @@ class Replay:
             await self._client.runtime.set_mode(before.mode)
 
     async def keep_playing(self) -> None:
-        """Play whenever that is wanted."""
+        """Advance the replay while it plays."""
         while True:
             if not self._playing:
                 self._wake.clear()
@@ -306,7 +306,7 @@ class Replay:
         self._before = _Before(mode, data.qpos.copy(), data.qvel.copy())
 
     async def _place(self) -> None:
-        """Put the simulation's robots where the recording has them."""
+        """Place the simulation's robots as recorded."""
         model, data = self._client.model, self._client.data
         if self._before is None or model is None or data is None or time.monotonic() - self._placed_at < _PLACED_S:
             return

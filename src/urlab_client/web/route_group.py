@@ -14,7 +14,7 @@ from urlab_client.web.driving_lease import Viewer
 __all__ = ["JOB", "Handler", "RouteGroup"]
 
 JOB = "urlab_job"
-"""In the scope of a request that may take long: what it does, in words, for who ends the server meanwhile."""
+"""Key in the scope of a long request: its description, for the warning if the server ends meanwhile."""
 
 Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 

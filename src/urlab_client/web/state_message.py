@@ -1,4 +1,4 @@
-"""A state as browsers are told of it."""
+"""The state message for browsers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long work in a thread that ends when nobody wants it any more, and before what it writes to is removed."""
+"""Long jobs in a thread that stop when cancelled, and before their output is removed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _T = TypeVar("_T")
 
 
 async def stoppable(job: Callable[[Progress], _T], progress: Progress = lambda _: None) -> _T:
-    """Run a job in a thread. Cancelled, it ends when it next says how far it is, and this does not end before it.
+    """Run a job in a thread. If cancelled, the job stops at its next progress report, and this waits for that.
 
     Args:
-        job: Says how far it is, often.
-        progress: Told of it, in that thread.
+        job: Function that reports its progress often, through the callback that it is called with.
+        progress: Callback invoked with the progress, in that thread.
     """
     stopped = threading.Event()
 
@@ -41,4 +41,4 @@ async def stoppable(job: Callable[[Progress], _T], progress: Progress = lambda _
 
 
 class _Stopped(Exception):
-    """A job was told to stop."""
+    """Stops a cancelled job."""
