@@ -231,7 +231,7 @@ def _load(name: str) -> Any:
     try:
         return next(getattr(module, name) for module in map(import_module, _HOMES) if hasattr(module, name))
     except (ImportError, StopIteration) as error:
-        # A file is missing or is somebody else's; the message of a dependency's own failure stands.
+        # A file is missing or belongs to another package. Failures of a dependency are raised unchanged.
         if found := import_module("urlab_client._installation").conflict():
             raise ImportError(f"cannot load urlab_client.{name}: {found}") from error
         raise

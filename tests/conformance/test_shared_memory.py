@@ -104,7 +104,7 @@ async def test_a_server_without_it_is_a_clear_error(connect: Any, dialect: Diale
 
     with SimulatedServer("ball", play=True, dialect=dialect) as server:
         client = connect(server, transport="shm")
-        with pytest.raises(URLabConnectionError, match="names no directory of shared memory"):
+        with pytest.raises(URLabConnectionError, match="reports no shared-memory directory"):
             await client.discover()
 
 

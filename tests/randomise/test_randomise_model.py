@@ -176,7 +176,7 @@ def test_toml_json_and_python_say_the_same(tmp_path: Path) -> None:
         ('[[vary]]\nwhat = "inertia"\nadd = [1, 2]', "inertia takes scale, not add"),
         ('[[vary]]\nwhat = "mass"\nscale = [-1, 2]', "a factor is at least 0"),
         ('[[vary]]\nwhat = "mass"\nscale = [0, 2]\ndistribution = "log-uniform"', "log-uniform is for"),
-        ('[[vary]]\nwhat = "gravity"\non = "box"\nscale = [1, 2]', "gravity is that of the whole scene"),
+        ('[[vary]]\nwhat = "gravity"\non = "box"\nscale = [1, 2]', "gravity applies to the whole scene"),
         ('[[push]]\nbody = "a/b"\nforce = [0, 1]\nevery = [2, 1]', "push: every takes two numbers"),
         ('[[push]]\nbody = "a/b"\nforce = [0, 1]\nevery = [1, 2]\nlasts = 0', "push: lasts must be at least 1"),
         ('[[noise]]\nfield = "qpos"\nstd = -1', "noise on qpos: std must be 0 or more"),

@@ -76,8 +76,8 @@ def test_pictures_need_the_key_as_well(guarded: SimulatedServer) -> None:
     [
         ({}, "does not know this client's key"),
         ({"client_key": "stranger.key_secret"}, "does not know this client's key"),
-        ({"server_key": "stranger.key", "client_key": "clients/me.key_secret"}, "does not have the key it should have"),
-        ({"server_key": ""}, "demands CURVE keys"),
+        ({"server_key": "stranger.key", "client_key": "clients/me.key_secret"}, "does not have the expected key"),
+        ({"server_key": ""}, "requires CURVE keys"),
     ],
 )
 def test_a_wrong_key_is_said_before_any_deadline(
@@ -103,7 +103,7 @@ def test_keys_for_a_server_without(keys: Path) -> None:
     with (
         SimulatedServer() as server,
         URLabClient(**server.client_options(), server_key=keys / "server.key", rcv_timeout_ms=3_600_000) as client,
-        pytest.raises(AuthenticationFailed, match="uses no CURVE keys"),
+        pytest.raises(AuthenticationFailed, match="does not use CURVE keys"),
     ):
         client.discover()
 

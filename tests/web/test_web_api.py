@@ -571,7 +571,7 @@ def test_a_body_is_found_by_a_ray_and_pushed_by_who_drives(http: TestClient) -> 
         up = {"body": hand["id"], "local": [0, 0, 0], "target": [hand["position"][0], 0.0, hand["position"][2] + 0.5]}
         refused = http.post("/api/push", json=up)
         assert refused.status_code == 400
-        assert "mode direct" in refused.json()["error"]["message"]
+        assert "direct mode" in refused.json()["error"]["message"]
         http.post("/api/ops/set_mode", json={"mode": "direct"})
         try:
             began = http.post("/api/step", json={"n_steps": 10}).json()["time"]

@@ -32,7 +32,7 @@ __all__ = ["Motion"]
 _CHECK_S = 0.01  # simulation time between two checks of a predicate
 _SLICE_S = 0.1  # simulation time per request without a predicate: a slow scene still finishes it within its deadline
 _MOVING = 0.01  # rad/s or m/s: a joint that is slower than this is stuck
-_AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for so long
+_AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for this long
 
 
 class Simulation(Protocol):

@@ -118,7 +118,7 @@ class Lease:
         if now - self._renewed < self._ttl / 3:
             return
         if not _ask(self._book.renew.remote(self._holder), _REPLY_S):
-            raise LeaseLost(f"The lease of {self.address} ran out.", hint="Give the pool a longer ttl.")
+            raise LeaseLost(f"The lease of {self.address} expired.", hint="Give the pool a longer ttl.")
         self._renewed = now
 
     @contextmanager
@@ -172,7 +172,7 @@ class LeasePool:
             URLabError: Ray is not initialised.
         """
         if not addresses or len(set(addresses)) != len(addresses):
-            raise ValueError(f"addresses must be one or more, each once, not {list(addresses)!r}")
+            raise ValueError(f"addresses must contain at least one address and no duplicates, not {list(addresses)!r}")
         if not ttl > 0:
             raise ValueError(f"ttl must be above 0 seconds, not {ttl}")
         if not _ray.is_initialized():

@@ -146,7 +146,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
     def _turn(self) -> None:
         """Assign work, wait briefly for results, and handle failures."""
         if self._reading:
-            raise RuntimeError("Rollouts are read by one reader at a time")
+            raise RuntimeError("another reader is already iterating over these rollouts")
         self._reading = True
         try:
             self._hand_out()
@@ -300,16 +300,16 @@ def rollouts(
     if not names or (leases is None and not all(name.startswith("sim://") for name in names)):
         raise ValueError(f"scenes must be one or more sim:// addresses, or a LeasePool of others, not {names!r}")
     if n < 0 or seed < 0 or n_workers < 0 or retries < 0 or max_episode_steps < 1:
-        raise ValueError("n, seed, n_workers and retries are 0 or more, and max_episode_steps is at least 1")
+        raise ValueError("n, seed, n_workers and retries must be 0 or more, and max_episode_steps at least 1")
     if min(episode_timeout, start_timeout, lease_timeout) <= 0:
-        raise ValueError("episode_timeout, start_timeout and lease_timeout are above 0 seconds")
+        raise ValueError("episode_timeout, start_timeout and lease_timeout must be above 0 seconds")
     if workers is not None and (n_workers or worker_options):
-        raise ValueError("n_workers and worker_options belong to the WorkerPool, not beside workers")
+        raise ValueError("n_workers and worker_options cannot be used with workers: pass them to the WorkerPool")
     if reserved := {"client", "max_episode_steps", "owns_client", "render_camera", "render_mode"} & env_options.keys():
         raise ValueError(f"env_options cannot have {', '.join(sorted(reserved))}")
     chosen = list(range(n)) if ids is None else sorted(ids)
     if len(set(chosen)) != len(chosen) or (chosen and not 0 <= chosen[0] <= chosen[-1] < n):
-        raise ValueError(f"ids must be of the episodes 0 to {n - 1}, each once")
+        raise ValueError(f"ids must be unique and from 0 to {n - 1}")
     pool = WorkerPool(n_workers, worker_options=worker_options) if workers is None else workers
     run = uuid.uuid4().hex
     jobs = [

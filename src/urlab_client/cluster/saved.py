@@ -92,7 +92,7 @@ def missing_ids(folder: str | os.PathLike[str], n: int, *, seed: int = 0) -> lis
         file.close()
         i = int(about["id"])
         if i >= n or about["seed"] != seed_of(seed, i):
-            raise ValueError(f"{path} is not of a run of {n} episodes with seed {seed}: use another folder")
+            raise ValueError(f"{path} does not belong to a run of {n} episodes with seed {seed}: use another folder")
         saved.add(i)
     return [i for i in range(n) if i not in saved]
 
@@ -113,7 +113,7 @@ def _opened(path: Path) -> tuple[dict[str, Any], Any]:
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         if file is not None:
             file.close()
-        raise ValueError(f"{path} holds no episode: {error}") from error
+        raise ValueError(f"{path} does not contain an episode: {error}") from error
 
 
 def _leaves(values: Any, place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], NDArray[Any]]]:

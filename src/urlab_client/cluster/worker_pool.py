@@ -36,7 +36,7 @@ class WorkerPool:
             URLabError: Ray is not initialised.
         """
         if n_workers < 0:
-            raise ValueError(f"n_workers is 0 or more, not {n_workers}")
+            raise ValueError(f"n_workers must be 0 or more, not {n_workers}")
         if not _ray.is_initialized():
             raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
         self.n_workers = n_workers
@@ -67,9 +67,9 @@ class WorkerPool:
             URLabError: Another run has them, or the pool is closed.
         """
         if self._closed:
-            raise URLabError("The worker pool is closed.", hint="Make another one.")
+            raise URLabError("The worker pool is closed.", hint="Create a new one.")
         if self._run is not None and self._run() is not None:
-            raise URLabError("Another run uses the worker pool.", hint="Take its episodes, or close it, first.")
+            raise URLabError("Another run is using the worker pool.", hint="Finish or close that run first.")
         self._run = weakref.ref(run)
         lent, self._waiting = self._waiting, []
         return lent

@@ -159,7 +159,7 @@ class Vary(_Declared, frozen=True, kw_only=True):
         if self.by == "scale" and lowest < 0:
             raise ValueError(f"{self.what}: a factor is at least 0, not {lowest}")
         if self.what == "gravity" and self.on != "*":
-            raise ValueError("gravity is that of the whole scene: leave `on` out")
+            raise ValueError("gravity applies to the whole scene: omit `on`")
 
     @property
     def by(self) -> Literal["scale", "add", "set"]:

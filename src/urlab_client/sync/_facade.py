@@ -43,7 +43,7 @@ class Facade:
         self._portal = portal
         self._maps = {}
 
-    # None is an object, too; the first match wins.
+    # None is also an object; the first match wins.
     @overload
     def _wrap(self, cls: type[F], aio: None) -> None: ...  # type: ignore[overload-overlap]  # pyright: ignore[reportOverlappingOverload]
     @overload

@@ -1,4 +1,4 @@
-"""Who may reach the console: one-time tokens, and checks of what a browser says where a request comes from."""
+"""Access to the console: one-time tokens, and checks of a request's host and origin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["LOOPBACK", "Access", "Guarded"]
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """Names of this machine for itself."""
 
-_MOST = 1000  # invitations that nobody used, and browsers of which one is soon closed, come without end
+_MOST = 1000  # unused invitations and keys of closed browsers would accumulate
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
@@ -33,23 +33,23 @@ _HEADERS = {
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>URLab console</title><body><h1>{title}</h1><p>{text}</p></body></html>"""
 
-_ADVICE = "Open the link that `urlab console` printed; it is good for one browser."
+_ADVICE = "Open the link that `urlab console` printed; it works for one browser."
 
 _Refusal: TypeAlias = tuple[int, str, str]
 
 
 class Access:
-    """What a request must bring.
+    """Rules for access to the application.
 
-    A token is spent by the first browser or program that shows it, and gives that one a key: a cookie, or what
-    `POST /api/session` answers for use as `Authorization: Bearer KEY`. The latest thousand tokens and the thousand keys
-    that were used last are good.
+    The first browser or program that presents a token exchanges it for a key: a cookie, or the reply to
+    `POST /api/session`, for use as `Authorization: Bearer KEY`. The newest thousand tokens and the thousand most
+    recently used keys are valid.
 
     Args:
-        hosts: Host names under which the application is reached, in lower case. Others are refused, so that a page
-            elsewhere cannot reach it under a name of its own (DNS rebinding).
-        tokens: Whether a key is needed. False is for applications that let in only whom they know anyway.
-        keys: Keys that are good without a token.
+        hosts: Host names by which the application is reached, in lower case. Others are refused, so that a page
+            elsewhere cannot reach it by its own name (DNS rebinding).
+        tokens: Whether a key is required. False is for applications that authenticate users themselves.
+        keys: Keys that are valid without a token.
     """
 
     def __init__(self, *, hosts: Collection[str] = LOOPBACK, tokens: bool = True, keys: Collection[str] = ()) -> None:
@@ -61,13 +61,13 @@ class Access:
         self._keys: dict[str, None] = {}
 
     def invite(self) -> str:
-        """Return a new token, good for one use."""
+        """Return a new token, valid for one use."""
         token = secrets.token_urlsafe(24)
         _keep(self._tokens, token)
         return token
 
     def admit(self, token: str) -> str | None:
-        """Spend a token: return a key, or None for one that is unknown or spent."""
+        """Exchange a token for a key; return None if the token is unknown or has been used."""
         found = _among(token, self._tokens)
         if found is None:
             return None
@@ -96,11 +96,15 @@ class Access:
         return found
 
     def refusal(self, scope: Scope) -> _Refusal | None:
-        """Return status, code and reason for refusing a request whatever its key, or None."""
+        """Return status, code and reason if a request is refused regardless of its key, otherwise None."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         if _name(host) not in self.hosts:
-            return 403, "bad_host", f"This console is not reached as {host!r}, only as {', '.join(sorted(self.hosts))}."
+            return (
+                403,
+                "bad_host",
+                f"This console does not serve the host {host!r}, only {', '.join(sorted(self.hosts))}.",
+            )
         origin = headers.get("origin")
         changes = scope["type"] == "websocket" or scope["method"] not in _SAFE
         if origin is not None and changes and urlsplit(origin).netloc.lower() != host.lower():
@@ -109,12 +113,12 @@ class Access:
 
 
 class Guarded:
-    """Lets through to an application what `Access` allows.
+    """Middleware that passes only the requests that `Access` allows.
 
     Args:
         app: The application.
-        access: What a request must bring.
-        advice: What those are told who bring no key.
+        access: The access rules.
+        advice: Message for requests without a key.
     """
 
     def __init__(self, app: ASGIApp, access: Access, *, advice: str = _ADVICE) -> None:
@@ -123,7 +127,7 @@ class Guarded:
         self._advice = advice
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request, or let the application do so."""
+        """Refuse a request, or pass it to the application."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
@@ -145,7 +149,7 @@ class Guarded:
             await _said(scope, refused)(scope, receive, _with_headers(send))
 
     def _enter(self, scope: Scope) -> Response | None:
-        """Return what a browser that shows a token gets, None for any other request."""
+        """Return the response to a browser that presents a token, or None for any other request."""
         if scope["type"] != "http" or scope["method"] != "GET" or _path(scope) not in {"", "/"}:
             return None
         token = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token")
@@ -153,7 +157,7 @@ class Guarded:
             return None
         key = self._access.admit(token[0])
         if key is None and self._access.key_of(Headers(scope=scope)) is None:
-            return _said(scope, (401, "bad_token", "This link was used before. Ask for another one."))
+            return _said(scope, (401, "bad_token", "This link has been used. Ask for another one."))
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(
@@ -163,7 +167,7 @@ class Guarded:
 
 
 def _keep(values: dict[str, None], value: str) -> None:
-    """Add a value as the newest, or make it so, and let the oldest go where there are too many."""
+    """Add a value as the newest, or make it the newest, and drop the oldest if there are too many."""
     values.pop(value, None)
     values[value] = None
     if len(values) > _MOST:

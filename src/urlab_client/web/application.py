@@ -46,9 +46,9 @@ __all__ = ["app", "entrance"]
 
 _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
-_AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
+_AHEAD = 2  # states or pictures sent to a browser that it has not acknowledged
 _VIEWER = "x-urlab-viewer"
-_GONE = 499  # as servers note that a client closed its request
+_GONE = 499  # what servers log if a client closes its request
 
 
 def app(
@@ -60,26 +60,28 @@ def app(
     metrics: CollectorRegistry | None = None,
     recordings: str | os.PathLike[str] = "recordings",
 ) -> Starlette:
-    """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
+    """Make the application. It keeps the client's session open during its lifespan, and leaves closing it to you.
 
-    To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
+    To mount it in another application, enter `site.router.lifespan_context(site)` in that application's lifespan.
 
     Args:
-        client: An async client of the loop that serves. The application reads set-points and state from it as any
-            other part of a program may.
-        access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
-        handshake: For a client with `read_only=True`: returns what `handshake()` of the client that drives returns,
-            as `Path("…").read_bytes` does. Called in a thread, again whenever play has begun anew.
+        client: An async client that belongs to the serving event loop. The application reads set-points and state from
+            it, as any other part of a program may.
+        access: Access rules. By default, requests reach the application on this machine, with a token of
+            `site.state.access.invite()`.
+        handshake: For a client with `read_only=True`: callback that returns the result of the driving client's
+            `handshake()`, for example `Path("…").read_bytes`. Called in a thread, and again whenever play restarts.
         lease_seconds: How long a viewer keeps the controls without using them.
-        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
-            requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
-        recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
+        metrics: Registry that `/metrics` serves to Prometheus, behind the same access rules; None leaves the path out.
+            It includes the client's requests if the client was made with `observe=PrometheusObserver(metrics)`.
+        recordings: Folder of the recordings that viewers make, download and replay; created with the first one.
 
     Raises:
-        ValueError: The client is read-only, and there is no `handshake`, or the other way round.
+        ValueError: The client is read-only and `handshake` is missing, or the client is not read-only and `handshake`
+            is given.
     """
     if client.config.read_only != (handshake is not None):
-        raise ValueError("app: a client with read_only=True takes `handshake`, and no other does")
+        raise ValueError("app: pass `handshake` for a client with read_only=True, and for no other client")
     access = access or Access()
     session = ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings), handshake)
     site = _Site(session, access, metrics)
@@ -96,12 +98,12 @@ def app(
 
 
 def entrance(access: Access) -> Handler:
-    """Return what answers `POST /api/session`: it spends a token for a key."""
+    """Return the handler of `POST /api/session`, which exchanges a token for a key."""
 
     async def enter(request: Request) -> Response:
         key = access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
         if key is None:
-            return _error(401, "bad_token", "This token is unknown, or was used before.")
+            return _error(401, "bad_token", "This token is unknown or has been used.")
         return _json(encode({"key": key}))
 
     return _answering(enter)
@@ -261,7 +263,7 @@ class _Site:
             await socket.send_text(encode(You(viewer.key, viewer.name)).decode())
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send, socket, one, flow)
-                with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, maybe while it is answered
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, perhaps during a reply
                     await self._listen(socket, one, flow)
                 tasks.cancel_scope.cancel()
         finally:
@@ -349,17 +351,17 @@ class _Site:
     # The 3-D view
 
     async def _model(self, request: Request) -> Response:
-        """Answer with the model, its size, or a part of it, as the viewer's page asks."""
+        """Return the model, its size, or a part of it, as the viewer's page requests."""
         shown = await self.console.mujoco_viewer.shown()
         query = request.query_params
         if shown is None or query.get("crc32", str(shown.crc)) != str(shown.crc):
-            return _error(404, "no_model", self.console.mujoco_viewer.missing or "The model is another one now.")
+            return _error(404, "no_model", self.console.mujoco_viewer.missing or "The model has changed.")
         if "total_bytes" in query:
             return _json(encode({"total_bytes": len(shown.bundle)}))
         start = int(query.get("offset_bytes", 0))
         length = int(query.get("size_bytes", len(shown.bundle)))
         if start < 0 or length < 0:
-            return _error(400, "bad_request", "There is no part before the first byte.")
+            return _error(400, "bad_request", "The offset and the size of a part must not be negative.")
         return Response(shown.bundle[start : start + length], media_type="application/octet-stream")
 
     async def _poses(self, socket: WebSocket) -> None:
@@ -387,7 +389,7 @@ class _Site:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(send)
                 while (said := await socket.receive())["type"] == "websocket.receive":
-                    # Besides this it asks for control of MuJoCo's own panels, which there are none of here.
+                    # The page also asks for control of MuJoCo's own panels, which the console does not have.
                     if said.get("text") == mujoco_viewer.SHOWN:
                         flow.acknowledged += 1
                         changed.set()
@@ -401,7 +403,7 @@ class _Site:
     # Viewers
 
     def _viewer(self, request: HTTPConnection) -> Viewer:
-        """Return who asks: a page that watches, or whoever has the key."""
+        """Return the viewer that sent a request: a page that watches, or a program with a key."""
         found = self._viewers.get(request.headers.get(_VIEWER, ""))
         return found or Viewer(f"key:{request.scope.get('urlab_key')}", "a program")
 
@@ -411,7 +413,7 @@ class _Site:
 
 
 class _Checked(StaticFiles):
-    """Files that a browser keeps, and asks each time whether they are still the same: they are large."""
+    """Large files that a browser caches and revalidates on each use."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)
@@ -423,7 +425,7 @@ async def _said(socket: WebSocket) -> str:
     """Return the next text that a browser sends.
 
     Raises:
-        WebSocketDisconnect: It is gone, or it sent a binary frame, and the socket is closed for that.
+        WebSocketDisconnect: The browser is gone, or it sent a binary frame, for which the socket is closed.
     """
     message = await socket.receive()
     if message["type"] == "websocket.disconnect":
@@ -436,7 +438,7 @@ async def _said(socket: WebSocket) -> str:
 
 
 class _Flow:
-    """How much is on its way to a browser."""
+    """Counts messages that a browser has not acknowledged."""
 
     def __init__(self) -> None:
         self.sent = self.acknowledged = 0
@@ -448,13 +450,13 @@ def _now_ms() -> float:
 
 
 def _answering(handler: Handler) -> Handler:
-    """Turn what a handler raises into an answer."""
+    """Turn a handler's exceptions into responses."""
 
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
         except ClientDisconnect:
-            return Response(status_code=_GONE)  # which nobody reads
+            return Response(status_code=_GONE)  # the client is gone
         except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = explain_error(error)
             return _json(encode({"error": said}), status)

@@ -56,7 +56,7 @@ class Pick(Struct):
 
 
 class Picked(Struct):
-    """What a ray meets first: the body, None for nothing or the ground, and the point in the body's frame and world."""
+    """The first hit of a ray: the body, None for nothing or the ground, and the point in the body's and world frame."""
 
     body: BodyView | None
     local: list[float]
@@ -123,7 +123,7 @@ class BodyPushing:
         origin, direction = np.array(ray.origin, np.float64), np.array(ray.direction, np.float64)
         length = float(np.linalg.norm(direction))
         if not (np.isfinite(origin).all() and np.isfinite(length) and length > 0.0):
-            raise ValueError("a ray has a finite origin and a direction other than zero")
+            raise ValueError("a ray needs a finite origin and a direction other than zero")
         direction /= length
         geom = np.full(1, -1, np.int32)
         far = mujoco.mj_ray(shown.model, shown.data, origin, direction, _VISIBLE_GROUPS, 1, -1, geom)
@@ -151,7 +151,7 @@ class BodyPushing:
         client = self._console.client
         if client.step_mode is StepMode.LIVE:
             raise ValueError(
-                "In mode live a force lasts one physics step at most. To push, choose mode direct and Play, or puppet."
+                "In live mode a force lasts one physics step at most. To push, choose direct mode and Play, or puppet."
             )
         self._console.lease.use(viewer)
         if client.step_mode is StepMode.PUPPET:
@@ -210,7 +210,7 @@ class BodyPushing:
         joint = int(model.body_jntadr[_root(model, push.body)])
         free = joint >= 0 and int(model.jnt_type[joint]) == 0
         if not free or data is None:
-            raise ValueError(f"{robot.prefix} is fixed to the world: in mode puppet its joints move it, not the mouse.")
+            raise ValueError(f"{robot.prefix} is fixed to the world: in puppet mode its joints move it, not the mouse.")
         at = int(model.jnt_qposadr[joint])
         point = shown.data.xpos[push.body] + shown.data.xmat[push.body].reshape(3, 3) @ np.array(push.local)
         data.qpos[at : at + 3] = shown.data.qpos[at : at + 3] + np.array(push.target) - point

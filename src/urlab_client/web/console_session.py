@@ -1,6 +1,6 @@
-"""What all viewers share: the session that is kept, the newest state, the log.
+"""The state that all viewers share: the session, the newest state, the log.
 
-Nothing is queued for anybody. A viewer is told that something changed and takes what is newest when they are ready.
+Nothing is queued. A viewer is notified of changes and takes the newest state when it is ready.
 """
 
 from __future__ import annotations
@@ -228,9 +228,9 @@ class ConsoleSession:
         """Do what a viewer's message orders.
 
         Raises:
-            NotDriving: Somebody else has the controls.
+            NotDriving: Another viewer has the controls.
             KeyError: A name is unknown; nothing was set.
-            ValueError: It cannot be done; nothing was set.
+            ValueError: The order cannot be carried out; nothing was set.
         """
         if isinstance(order, Hand):
             self.hands.command(viewer, order)

@@ -191,7 +191,7 @@ class Controls:
             ValueError: The mode is another one.
         """
         if self._client.step_mode is not StepMode.DIRECT:
-            raise ValueError(f"stepping needs mode direct, not {self._client.step_mode}")
+            raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
         return await self._step(n_steps)
 

@@ -1,4 +1,4 @@
-"""Who drives: one viewer at a time, for as long as they go on driving."""
+"""The controls: one viewer drives at a time, for as long as they keep acting."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _LOOK_S = 0.1
 
 
 class Viewer:
-    """Somebody who watches.
+    """A viewer: a person with a browser, or a program.
 
     Attributes:
-        key: What proves who they are; known to nobody else.
-        name: What the others see.
-        yields: Whether those who do not yield may take the controls from them at once, as people may from an agent.
-        keeps: Seconds for which they keep the controls without acting; None: as the lease says.
+        key: Secret that identifies the viewer.
+        name: Name that other viewers see.
+        yields: Whether viewers that do not yield may take the controls immediately, as people may from an agent.
+        keeps: Seconds for which the viewer keeps the controls without acting; None for the lease's default.
     """
 
     def __init__(self, key: str, name: str, *, yields: bool = False, keeps: float | None = None) -> None:
@@ -32,14 +32,14 @@ class Viewer:
 
 
 class NotDriving(Exception):
-    """Somebody else has the controls, or took them; the text says who."""
+    """Another viewer has or took the controls; the text names the viewer."""
 
 
 class DrivingLease:
-    """The controls. Whoever acts while nobody has them gets them; they are lost by not acting for a while.
+    """The controls. The first viewer who acts while they are free gets them, and loses them by not acting for a while.
 
     Args:
-        seconds: How long they are kept without acting.
+        seconds: How long a viewer keeps them without acting.
         clock: Monotonic time, seconds.
     """
 
@@ -52,24 +52,24 @@ class DrivingLease:
 
     @property
     def holder(self) -> Viewer | None:
-        """Who has the controls, or None."""
+        """The viewer who has the controls, or None."""
         return self._holder if self.left > 0 else None
 
     @property
     def held(self) -> bool:
-        """Whether a body of `hold()` runs, or winds up."""
+        """Whether a block of `hold()` is running or cleaning up."""
         return self._one.locked()
 
     @property
     def left(self) -> float:
-        """Seconds until they are free unless the holder acts."""
+        """Seconds until the controls are free unless the holder acts."""
         return 0.0 if self._holder is None else max(0.0, self._until - self._clock())
 
     def use(self, viewer: Viewer) -> None:
-        """Take the controls, or keep them.
+        """Take or keep the controls.
 
         Raises:
-            NotDriving: Somebody else has them.
+            NotDriving: Another viewer has them.
         """
         holder = self.holder
         if holder is not None and holder.key != viewer.key and not _gives_way(holder, viewer):
@@ -78,18 +78,18 @@ class DrivingLease:
         self._holder, self._until = viewer, self._clock() + kept
 
     def interrupt(self, viewer: Viewer) -> None:
-        """Take the controls from somebody who yields them; nothing happens to anybody else's."""
+        """Take the controls from a holder that yields; otherwise do nothing."""
         if (holder := self.holder) is not None and _gives_way(holder, viewer):
             self.use(viewer)
 
     @contextlib.asynccontextmanager
     async def hold(self, viewer: Viewer) -> AsyncGenerator[None]:
-        """Keep the controls as long as the body runs, which is cancelled when somebody takes them.
+        """Keep the controls while the block runs, and cancel it if another viewer takes them.
 
-        One body runs at a time: it begins when an earlier one, whosever it was, has wound up.
+        One block runs at a time: it starts after an earlier one, of any viewer, has finished.
 
         Raises:
-            NotDriving: Somebody else has the controls, and the body did not run; or they took them meanwhile.
+            NotDriving: Another viewer has the controls and the block did not run, or took them meanwhile.
         """
         self.use(viewer)
         async with self._one:
@@ -113,7 +113,7 @@ class DrivingLease:
             await anyio.sleep(_LOOK_S)
 
     def release(self, viewer: Viewer) -> None:
-        """Give the controls back; nothing happens to somebody else's."""
+        """Release the controls if this viewer has them."""
         if self._holder is not None and self._holder.key == viewer.key:
             self._holder = None
 

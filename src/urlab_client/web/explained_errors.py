@@ -1,4 +1,4 @@
-"""What HTTP answers and refusals say of an error."""
+"""Status and body of HTTP error responses and refusals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["explain_error"]
 
 
 def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:
-    """Return the status and what is said of an error."""
+    """Return the HTTP status and the description of an error."""
     hint = (getattr(error, "hint", None) or "") if isinstance(error, URLabError) else ""
     text = error.args[0] if isinstance(error, URLabError) and error.args else str(error)
     match error:

@@ -1,4 +1,4 @@
-"""What goes over the WebSockets: one declaration per message, from which the AsyncAPI document is made, too."""
+"""Messages of the WebSockets: one declaration per message, from which the AsyncAPI document is also generated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 Numbers: TypeAlias = list[float | None]
-"""Numbers of five digits; null for one that is not finite."""
+"""Numbers with five digits; null for a number that is not finite."""
 
 
 class Link(Struct):
@@ -57,20 +57,20 @@ class LogEntry(Struct):
 
 
 class You(Struct, tag_field="type", tag="you"):
-    """The first message: `viewer` is for the header `X-URLab-Viewer`, `name` is what the others see."""
+    """The first message: `viewer` is the value for the header `X-URLab-Viewer`, `name` is shown to other viewers."""
 
     viewer: str
     name: str
 
 
 class World(Struct, tag_field="type", tag="world"):
-    """What there is: at first, and whenever it changes."""
+    """The description of the world: sent first, and whenever it changes."""
 
     world: WorldDescription
 
 
 class ArticulationSample(Struct):
-    """One robot: positions, velocities, controls, readings, and what viewers have commanded."""
+    """One robot: positions, velocities, controls, sensor readings, and the set-points that viewers commanded."""
 
     qpos: Numbers
     qvel: Numbers
@@ -86,7 +86,7 @@ class EntitySample(Struct):
 
 
 class State(Struct, tag_field="type", tag="state"):
-    """The newest state, at most 60 in a second. `time` is simulation time in seconds, `made` Unix time in ms."""
+    """The newest state, at most 60 per second. `time` is simulation time in seconds, `made` Unix time in ms."""
 
     seq: int
     time: float
@@ -97,10 +97,10 @@ class State(Struct, tag_field="type", tag="state"):
 
 
 class Status(Struct, tag_field="type", tag="status"):
-    """Connection, play, time, recording and replay, and who drives, as one viewer is told whenever it changes.
+    """Connection, play, time, recording, replay and driver, from one viewer's view; sent whenever it changes.
 
-    `rate` is simulation time per real time, `speed` the pacing of live mode in percent, `mine` whether this viewer
-    drives, `lease_left` how many seconds the controls stay the driver's without use.
+    `rate` is simulation time relative to real time, `speed` the pacing of live mode in percent, `mine` whether this
+    viewer drives, and `lease_left` for how many seconds the driver keeps the controls without using them.
     """
 
     link: Link
@@ -124,26 +124,26 @@ class Status(Struct, tag_field="type", tag="status"):
 
 
 class Log(Struct, tag_field="type", tag="log"):
-    """New entries of the log, the newest last."""
+    """New entries of the log, newest last."""
 
     entries: list[LogEntry]
 
 
 class Refused(Struct, tag_field="type", tag="refused"):
-    """A message was refused: `code`, `message` and `hint`, as HTTP answers have them."""
+    """A message was refused: `code`, `message` and `hint`, as in HTTP responses."""
 
     error: dict[str, Any]
 
 
 class Pong(Struct, tag_field="type", tag="pong"):
-    """The answer to `ping`: its `at`, and the console's Unix time in ms."""
+    """The reply to `ping`: its `at`, and the console's Unix time in ms."""
 
     at: float
     now: float
 
 
 class Ack(Struct, tag_field="type", tag="ack"):
-    """A state was shown. No more than two are sent without it."""
+    """A state was shown. At most two states are sent without an acknowledgement."""
 
 
 class Ping(Struct, tag_field="type", tag="ping"):
@@ -153,22 +153,23 @@ class Ping(Struct, tag_field="type", tag="ping"):
 
 
 class Name(Struct, tag_field="type", tag="name"):
-    """The name that the others see."""
+    """The name that other viewers see."""
 
     name: str = ""
 
 
 class Ctrl(Struct, tag_field="type", tag="ctrl"):
-    """Set-points by articulation and actuator. Needs the controls."""
+    """Set-points by articulation and actuator. Requires the controls."""
 
     values: Annotated[dict[str, dict[str, float]], Meta(description="Articulation to actuator to set-point.")] = {}
 
 
 class Hand(Struct, tag_field="type", tag="hand"):
-    """Velocities of a robot's hand for a quarter of a second, or until the next one. Needs the controls.
+    """Velocities of a robot's hand for a quarter of a second, or until the next message. Requires the controls.
 
-    Linear ones are shares of 0.25 m/s along the world's axes, angular ones of 1 rad/s about them. `gripper` is towards
-    its largest set-point (1) or its smallest (-1), and `site` names the hand where the robot has several sites.
+    Linear velocities are shares of 0.25 m/s along the world's axes, angular ones shares of 1 rad/s about them.
+    `gripper` moves it towards its largest (1) or smallest (-1) set-point. `site` names the hand if the robot has
+    several sites.
     """
 
     articulation: str
@@ -179,13 +180,13 @@ class Hand(Struct, tag_field="type", tag="hand"):
 
 
 FromViewer: TypeAlias = Ack | Ping | Name | Ctrl | Hand
-"""What a viewer says."""
+"""Messages from a viewer."""
 
 
 class PictureHead(Struct):
-    """What comes before a picture: `received` is Unix time in ms, `sim_time` seconds.
+    """Header of a picture: `received` is Unix time in ms, `sim_time` is in seconds.
 
-    With `recorded` it belongs to the recording that is replayed, and `sim_time` to that one's clock.
+    If `recorded` is true, the picture is part of the replayed recording, and `sim_time` is on that recording's clock.
     """
 
     seq: int

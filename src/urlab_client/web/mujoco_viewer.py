@@ -1,7 +1,7 @@
-"""The 3-D view: MuJoCo's own web viewer, fed with the state that everybody sees and served through the console's door.
+"""The 3-D view: MuJoCo's own web viewer, fed with the state that all viewers see and served under the console's access.
 
-MuJoCo ships the page, which draws a compiled model with WebGL. Its server is not used: that one listens on a port of
-its own, for everybody. Here a page only watches; of what it can ask for it gets the model and the newest state.
+MuJoCo ships the page, which draws a compiled model with WebGL. Its server is not used, because it listens on its own
+port and admits everyone. Here a page only watches: it gets the model and the newest state.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class MujocoViewer:
 
     @property
     def missing(self) -> str:
-        """Why there is no view; empty when there is one."""
+        """The reason why there is no view; empty if there is one."""
         if files() is None:
             import mujoco  # noqa: PLC0415
 
@@ -137,12 +137,12 @@ class MujocoViewer:
 
     @property
     def no_model(self) -> str:
-        """Why there is no model to show; empty when there is one."""
+        """The reason why there is no model to show; empty if there is one."""
         if self._client.model is not None:
             return ""
         if not self._client.manager_present:
             return "Waiting for a play session: begin play to see the robots."
-        return "There is no compiled model here, without which the 3-D view has nothing to draw."
+        return "The 3-D view needs a compiled model, and the console has none."
 
     async def shown(self) -> Shown | None:
         """Return the client's model, made ready for browsers where MuJoCo has a viewer for them, or None."""

@@ -37,7 +37,7 @@ __all__ = ["encode", "openapi", "parse", "perform", "served"]
 
 _UNSERVED = frozenset({Hello})  # the application holds the session
 
-# The handshake in it is the application's, too.
+# Without the handshake, which belongs to the application as well.
 _STARTED = msgspec.defstruct(
     BeginPieOk.__name__,
     [(one.name, one.type) for one in msgspec.structs.fields(BeginPieOk) if one.name != "handshake_payload"],
@@ -58,21 +58,21 @@ _encoder = msgspec.json.Encoder(enc_hook=_plain)
 
 
 def encode(value: object) -> bytes:
-    """Return JSON; arrays become lists, binary values base64 text."""
+    """Return JSON; arrays become lists, and binary values base64 text."""
     return _encoder.encode(value)
 
 
 def served(name: str) -> Op | None:
-    """Return the op of that name, None if it is not served."""
+    """Return the op of this name, or None if it is not served."""
     op = OPS.get(name)
     return None if op is None or op.request in _UNSERVED else op
 
 
 def parse(op: Op, body: bytes) -> Request[Any]:
-    """Make a request of its JSON.
+    """Decode a request from JSON.
 
     Raises:
-        ValueError: It does not fit the op's declaration.
+        ValueError: The JSON does not match the op's declaration.
     """
     try:
         request = msgspec.json.decode(body or b"{}", type=op.request, dec_hook=from_wire_array)
@@ -83,7 +83,7 @@ def parse(op: Op, body: bytes) -> Request[Any]:
 
 
 async def perform(client: URLabClient, request: Request[Any]) -> object:
-    """Send a request, through the client's own method where that also takes over what follows from the reply."""
+    """Send a request, through the client's own method if that also updates state from the reply."""
     reply: object
     match request:
         case SetMode(mode=mode):
@@ -123,8 +123,8 @@ def openapi(root: str = "", *, metrics: bool = False) -> bytes:
     """Return the OpenAPI 3.1 document of the whole HTTP API.
 
     Args:
-        root: The path under which the application is mounted, or a proxy shows it.
-        metrics: Whether it serves `/metrics`.
+        root: Path under which the application is mounted or a proxy serves it.
+        metrics: Whether the application serves `/metrics`.
     """
     ops = [op for op in OPS.values() if op.request not in _UNSERVED]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
@@ -161,14 +161,14 @@ def openapi(root: str = "", *, metrics: bool = False) -> bytes:
 def _operation(op: Op) -> dict[str, Any]:
     doc = (op.request.__doc__ or "").strip()
     drives = op.effect is not Effect.READ
-    note = "\n\nNeeds the controls: 423 while another viewer has them." if drives else ""
+    note = "\n\nRequires the controls: status 423 while another viewer has them." if drives else ""
     return {
         "operationId": op.name,
         "tags": [op.ns or "client"],
         "summary": doc.partition("\n")[0],
         "description": doc + note + (f"\n\nOwn error codes: {', '.join(op.errors)}." if op.errors else ""),
         "requestBody": {"content": {"application/json": {"schema": _ref(op.request.__name__)}}},
-        "responses": {"200": _answer(op.reply.__name__, "Success."), "default": _answer("Error", "What went wrong.")},
+        "responses": {"200": _answer(op.reply.__name__, "Success."), "default": _answer("Error", "The error.")},
     }
 
 
@@ -203,7 +203,7 @@ def _path(method: str, name: str, summary: str, **more: Any) -> dict[str, Any]:
             "operationId": name,
             "tags": ["console"],
             "summary": summary,
-            "responses": {"200": {"description": "Success."}, "default": _answer("Error", "What went wrong.")},
+            "responses": {"200": {"description": "Success."}, "default": _answer("Error", "The error.")},
             **more,
         }
     }
@@ -213,56 +213,64 @@ _METRICS: dict[str, Any] = {
     "/metrics": _path(
         "get",
         "metrics",
-        "What this program measures of the client's requests, in Prometheus' text format.",
+        "Metrics of the client's requests, in Prometheus' text format.",
         responses={
             "200": {"description": "Success.", "content": {"text/plain": {"schema": {"type": "string"}}}},
-            "default": _answer("Error", "What went wrong."),
+            "default": _answer("Error", "The error."),
         },
     )
 }
 
 _PATHS: dict[str, Any] = {
     "/api/world": _path("get", "world", "Articulations, joints with ranges, actuators, sensors, cameras."),
-    "/api/status": _path("get", "status", "Connection, play, modes, who drives."),
-    "/api/handshake": _path("get", "handshake", "What a client with `read_only=True` passes to `discover()`: bytes."),
+    "/api/status": _path("get", "status", "Connection, play, modes and driver."),
+    "/api/handshake": _path(
+        "get", "handshake", "The bytes that a client with `read_only=True` passes to `discover()`."
+    ),
     "/api/state": _path("get", "state", "The newest state."),
     "/api/log": _path("get", "log", "The latest calls, errors and events."),
     "/api/events": _path(
-        "get", "events", "Server-sent events `log`, `world` and `status`; `Last-Event-ID` goes on in the log."
+        "get", "events", "Server-sent events `log`, `world` and `status`; `Last-Event-ID` resumes the log."
     ),
     "/api/asyncapi.json": _path("get", "asyncapi", "The WebSockets, described as AsyncAPI 3.0."),
-    "/api/explain": _path("get", "explain", "Why does a robot not move? What the client finds out, in sentences."),
-    "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
-    "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
-    "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
+    "/api/explain": _path("get", "explain", "Why does a robot not move? The client's diagnosis, in sentences."),
+    "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Requires the controls."),
+    "/api/run": _path("post", "run", "Run or stop physics: `{running: bool}`. Anyone may stop it."),
+    "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Requires the controls."),
     "/api/models/{name}": _path(
-        "put", "import_model", "Make a blueprint of a model: the bytes of an .xml or .zip file. Needs the controls."
+        "put", "import_model", "Import a model: the bytes of an .xml or .zip file. Requires the controls."
     ),
     "/api/recording": {
-        **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
-        **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),
+        **_path("post", "record", "Record to an MCAP file: `{cameras: bool}`. Requires the controls."),
+        **_path("delete", "stop_recording", "Stop the recording and describe it. Requires the controls."),
     },
     "/api/recording/outcome": _path(
-        "post", "mark_episode", "Note `{outcome}` of the episode: success, failure, discarded. Needs the controls."
+        "post", "mark_episode", "Mark the episode: `{outcome}` success, failure or discarded. Requires the controls."
     ),
-    "/api/recordings": _path("get", "recordings", "The recordings, the newest first."),
+    "/api/recordings": _path("get", "recordings", "The recordings, newest first."),
     "/api/recordings/{name}": {
-        **_path("get", "download", "A recording, `?as=csv`, `npz` or `mp4&camera=…`; `?as=about` describes it."),
-        **_path("put", "upload", "Take a recording in that was made elsewhere: its bytes. Needs the controls."),
-        **_path("delete", "remove_recording", "Delete a recording. Needs the controls."),
+        **_path(
+            "get", "download", "A recording; `?as=csv`, `npz` or `mp4&camera=…` converts it, `?as=about` describes it."
+        ),
+        **_path("put", "upload", "Add a recording that was made elsewhere: its bytes. Requires the controls."),
+        **_path("delete", "remove_recording", "Delete a recording. Requires the controls."),
     },
     "/api/replay": {
-        **_path("post", "replay", "Replay `{name, placing}`, or go on with `{time, playing, rate}`, seconds."),
-        **_path("delete", "end_replay", "Show what the server sends again. Needs the controls."),
+        **_path(
+            "post",
+            "replay",
+            "Start a replay with `{name, placing}`, or change it with `{time, playing, rate}`, seconds.",
+        ),
+        **_path("delete", "end_replay", "End the replay and show the server's state again. Requires the controls."),
     },
-    "/api/replay/states": _path("get", "replayed", "States of the last `?seconds` before the replay's place."),
+    "/api/replay/states": _path("get", "replayed", "States of the last `?seconds` before the replay's position."),
     "/api/lease": {
-        **_path("post", "take_controls", "Take the controls, or keep them."),
-        **_path("delete", "release_controls", "Give the controls back."),
+        **_path("post", "take_controls", "Take or keep the controls."),
+        **_path("delete", "release_controls", "Release the controls."),
     },
-    "/api/connection": _path("post", "connect", "Open a session again, after another program took the server over."),
+    "/api/connection": _path("post", "connect", "Open a new session after another program has taken the server over."),
     "/api/invitations": _path("post", "invite", "Make a token for one more browser or program."),
-    "/api/session": _path("post", "enter", "Spend a token for a key: `{token: str}`.", security=[]),
+    "/api/session": _path("post", "enter", "Exchange a token for a key: `{token: str}`.", security=[]),
     "/api/cameras/{articulation}/{camera}.jpg": _path("get", "picture", "The newest picture of a camera."),
-    "/api/cameras/{articulation}/{camera}.png": _path("get", "png", "A picture without loss, taken now, in any mode."),
+    "/api/cameras/{articulation}/{camera}.png": _path("get", "png", "A lossless picture, captured now, in any mode."),
 }

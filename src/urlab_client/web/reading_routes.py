@@ -1,4 +1,4 @@
-"""The part of the HTTP API that only tells: pictures, a diagnosis, and what happens as server-sent events."""
+"""The read-only part of the HTTP API: pictures, a diagnosis, and server-sent events."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["ReadingRoutes"]
 
 _FLOWING_S = 5.0
 _ALIVE_S = 15.0
-"""How long an event stream may be silent: proxies take longer silence for a dead connection."""
+"""How long an event stream may be silent, seconds: proxies close connections that are silent for longer."""
 
 
 class ReadingRoutes(RouteGroup):
@@ -45,7 +45,7 @@ class ReadingRoutes(RouteGroup):
         return Response(encode(found), media_type="application/json")
 
     async def _jpeg(self, request: Request) -> Response:
-        """Answer with the newest picture of the stream that viewers share, or where none flows take one."""
+        """Return the newest picture of the stream that viewers share, or capture one if nothing is streaming."""
         feed = self._console.feed(request.path_params["path"])
         if feed is None:
             return _no_camera(request)
@@ -66,7 +66,7 @@ class ReadingRoutes(RouteGroup):
         return Response(await anyio.to_thread.run_sync(sample.png), media_type="image/png")
 
     async def _events(self, request: Request) -> Response:
-        """Stream the log, the world and the status; a browser that comes again gets what it missed of the log."""
+        """Stream the log, the world and the status; a browser that reconnects gets the log entries it missed."""
         last = request.headers.get("last-event-id", "")
         known = int(last) if last.isdecimal() else -1
         stream = self._told(self._viewer(request), known)

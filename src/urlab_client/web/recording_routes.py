@@ -1,4 +1,4 @@
-"""The part of the HTTP API that is about recordings and replays."""
+"""Recordings and replays in the HTTP API."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class RecordingRoutes(RouteGroup):
 
 
 class _Converted(FileResponse):
-    """A converted recording, which goes away with the answer, sent or not."""
+    """A converted recording, which is deleted after the response, sent or not."""
 
     def __init__(self, path: Path, made: contextlib.AsyncExitStack) -> None:
         super().__init__(path, filename=path.name)
@@ -136,10 +136,10 @@ class _Converted(FileResponse):
 
 
 async def _while_present(request: Request, job: Coroutine[Any, Any, _T]) -> _T:
-    """Return what a job does, and break it off when nobody waits for its answer any more.
+    """Return the result of a job, and cancel it if the client disconnects.
 
     Raises:
-        ClientDisconnect: Nobody does.
+        ClientDisconnect: The client has disconnected.
     """
 
     async def leaving() -> None:

@@ -74,7 +74,7 @@ class Recordings:
 
     Args:
         client: The client.
-        folder: Where they are kept; made with the first one.
+        folder: Folder of the files; created with the first one.
     """
 
     def __init__(self, client: URLabClient, folder: Path) -> None:
@@ -89,7 +89,7 @@ class Recordings:
 
     @property
     def running(self) -> RunningRecording | None:
-        """The recording that is under way, if one is."""
+        """The running recording, or None."""
         if self._recorder is None:
             return None
         stats = self._recorder.stats
@@ -104,12 +104,12 @@ class Recordings:
         )
 
     async def start(self, *, cameras: bool) -> str:
-        """Begin a recording and return its file's name.
+        """Start a recording and return its file's name.
 
         Raises:
-            ValueError: One is under way.
-            URLabError: The client has no session, or no play session runs.
-            OSError: The file cannot be made.
+            ValueError: A recording is running.
+            URLabError: The client has no session, or no play session is running.
+            OSError: The file cannot be created.
         """
         if self._task is not None:
             raise ValueError("a recording runs already: stop it first")
@@ -152,21 +152,21 @@ class Recordings:
             self._recorder = None
 
     async def mark(self, outcome: EpisodeOutcome) -> None:
-        """Note what became of the present episode.
+        """Record the outcome of the current episode.
 
         Raises:
-            ValueError: No recording is under way.
+            ValueError: No recording is running.
         """
         if self._recorder is None:
-            raise ValueError("no recording runs that could note the outcome of an episode: start one first")
+            raise ValueError("no recording runs, so the outcome of an episode cannot be recorded: start one first")
         await self._recorder.mark(outcome)
 
     async def stop(self) -> dict[str, Any]:
         """End the recording and describe it.
 
         Raises:
-            ValueError: None is under way.
-            URLabError: It could not be written.
+            ValueError: No recording is running.
+            URLabError: The recording could not be written.
         """
         recorder = self._recorder
         if recorder is None:
@@ -184,13 +184,13 @@ class Recordings:
                 self._task = None
 
     async def end(self) -> None:
-        """End a recording that is under way, so that its file is whole."""
+        """End a running recording, so that its file is complete."""
         if self._task is not None:
-            with contextlib.suppress(URLabError):  # which the recorder has logged
+            with contextlib.suppress(URLabError):  # the recorder has logged it
                 await self._finish()
 
     def list(self) -> list[RecordingView]:
-        """Return the recordings of the folder, the newest first."""
+        """Return the recordings of the folder, newest first."""
         if not self.folder.is_dir():
             return []
         running = self._recorder.path.name if self._recorder is not None else ""
@@ -210,9 +210,9 @@ class Recordings:
         return file
 
     async def describe(self, name: str) -> dict[str, Any]:
-        """Return name, size, length in seconds, robots, cameras, and why the file is not whole, if so.
+        """Return name, size, length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
-        `unavailable` has the kinds that it cannot be converted to here, each with what is missing.
+        `unavailable` holds the formats that it cannot be converted to here, each with what is missing.
 
         Raises:
             KeyError: There is none of that name.
@@ -227,12 +227,12 @@ class Recordings:
 
     @contextlib.asynccontextmanager
     async def converted(self, name: str, kind: str, camera: str = "") -> AsyncGenerator[Path]:
-        """Yield a recording as a file of another kind, which goes away afterwards.
+        """Yield a recording as a file of another format, which is deleted afterwards.
 
         Raises:
             KeyError: There is no such recording, or no such camera in it.
-            ValueError: There is no such kind.
-            URLabError: The file is not a recording, or what is needed for that kind is not installed.
+            ValueError: There is no such format.
+            URLabError: The file is not a recording, or a library for that format is not installed.
         """
         file = self.path(name)
         if kind not in KINDS:
@@ -254,19 +254,19 @@ class Recordings:
             yield target
 
     async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Keep a recording that was made elsewhere, and describe it.
+        """Add a recording that was made elsewhere, and describe it.
 
         Raises:
-            ValueError: The name is not one of a recording, or is taken, or the file is too large.
+            ValueError: The name is not that of a recording or is taken, or the file is too large.
             URLabError: The file is not a recording; it is not kept.
         """
         if not _NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is not the name of a recording: it ends with .mcap or .json")
+            raise ValueError(f"{name!r} is not a valid name of a recording: it must end in .mcap or .json")
         self.folder.mkdir(parents=True, exist_ok=True)
         target = self.folder / name
         if target.exists():
             raise ValueError(f"there is a recording {name!r} already")
-        partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # several may send one name
+        partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # concurrent uploads may have the same name
         try:
             size = 0
             with partial.open("xb") as file:
@@ -288,7 +288,7 @@ class Recordings:
 
         Raises:
             KeyError: There is none of that name.
-            ValueError: It is under way.
+            ValueError: It is being recorded.
         """
         if self._recorder is not None and self._recorder.path.name == name:
             raise ValueError(f"{name} is being recorded: stop that first")
@@ -300,7 +300,7 @@ def open_run(file: Path) -> Run:
     """Open a recording.
 
     Raises:
-        URLabError: It is not one.
+        URLabError: The file is not a recording.
     """
     from urlab_client.integrations.record import read_run  # noqa: PLC0415
 

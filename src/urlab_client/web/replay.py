@@ -1,8 +1,8 @@
-"""A recording played back for all viewers: states of its file in place of the server's, at the pace of its clock.
+"""A recording replayed for all viewers: its states replace the server's, at the pace of its clock.
 
-The server is not asked for anything, so that a replay works with any server and any recording, stands at any place at
-once, and says where it is in seconds. Only the present moment is in memory, however long the recording is. If wanted,
-it also places the robots of the simulation, in mode puppet.
+The replay sends no requests to the server, so it works with any server and any recording, seeks immediately, and has a
+position in seconds. Only the current moment is in memory, however long the recording is. On request, it also places the
+robots of the simulation, in puppet mode.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _PAST_STATES = 200
 
 
 class ReplayView(Struct):
-    """Where a replay is: seconds of the recording's clock. `placing`: whether the simulation's robots follow.
+    """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
 
-    `cameras` are those whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+    `cameras` lists the cameras whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
     """
 
     name: str
@@ -194,10 +194,10 @@ class Replay:
 
         Args:
             file: The recording.
-            placing: Place the robots of the simulation, too: its mode is puppet meanwhile.
+            placing: Whether to place the simulation's robots, too; its mode is puppet meanwhile.
 
         Raises:
-            URLabError: The file is not a recording, or not of the robots that there are; or as the client raises.
+            URLabError: The file is not a recording, or not one of the current robots; or as the client raises.
         """
         run, (start, end), names, cameras = await _read(lambda: _opened(file))
         if not names:
@@ -205,7 +205,7 @@ class Replay:
         robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
         if not robots:
             there = ", ".join(self._client.articulations) or "none"
-            raise URLabError(f"{file.name} is a recording of other robots than there are ({there}).")
+            raise URLabError(f"{file.name} is a recording of other robots than the current ones ({there}).")
         await self.end()
         self._run, self._robots, self._cameras = run, robots, cameras
         self._start, self._seconds = start, end - start
@@ -220,16 +220,16 @@ class Replay:
     async def change(
         self, *, at: float | None = None, playing: bool | None = None, rate: float | None = None
     ) -> ReplayView:
-        """Go to a place, let it play or stand, set its pace; what is None stays.
+        """Seek, play or pause, and set the pace; None leaves a value unchanged.
 
         Raises:
-            ValueError: Nothing is replayed, or a number makes no sense.
+            ValueError: No recording is replayed, or a number is out of range.
         """
         if self._run is None:
             raise ValueError("no recording is replayed")
         if rate is not None:
             if not 0.05 <= rate <= 20:
-                raise ValueError(f"a pace is from 0.05 to 20, not {rate}")
+                raise ValueError(f"the pace must be from 0.05 to 20, not {rate}")
             self._rate = rate
         if at is not None:
             self._at = min(max(at, 0.0), self._seconds)
@@ -244,7 +244,7 @@ class Replay:
         return cast("ReplayView", self.view)
 
     async def end(self) -> None:
-        """Go back to what the server sends, and put the simulation back to where it was."""
+        """Show the server's state again, and restore the simulation's state and mode."""
         if self._run is None:
             return
         self._run, self._playing = None, False
@@ -300,7 +300,7 @@ class Replay:
     async def _take_over(self) -> None:
         data = self._client.data
         if data is None:
-            raise URLabError("There is no local model, without which no robot can be placed.")
+            raise URLabError("Robots cannot be placed without a local model.")
         mode = self._client.step_mode
         await self._client.runtime.set_mode(StepMode.PUPPET)
         self._before = _Before(mode, data.qpos.copy(), data.qvel.copy())

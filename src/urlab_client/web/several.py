@@ -1,4 +1,4 @@
-"""Several servers behind one application: a console for each, one door for all."""
+"""Several servers behind one application: a console for each, with shared access rules."""
 
 from __future__ import annotations
 
@@ -42,22 +42,23 @@ def apps(
     metrics: CollectorRegistry | None = None,
     recordings: str | os.PathLike[str] = "recordings",
 ) -> Starlette:
-    """Make one application of the consoles of several servers.
+    """Make one application with a console for each of several servers.
 
     Each console is at `/NAME/`, with its own controls, and `/` links to them; `GET /api/servers` lists them with the
-    state of their connections. A token or key of `access` is good for all. As with `app`, enter the lifespan of the
+    state of their connections. A token or key of `access` is valid for all. As with `app`, enter the lifespan of the
     application when you mount it, and close the clients yourself.
 
     Args:
-        clients: An async client of the loop that serves for each server, by the name in its path: letters, digits,
+        clients: An async client of the serving event loop for each server, by the name in its path: letters, digits,
             `_` and `-`.
-        access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
+        access: Access rules. By default, requests reach the application on this machine, with a token of
+            `site.state.access.invite()`.
         lease_seconds: How long a viewer keeps the controls of a server without using them.
-        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out.
+        metrics: Registry that `/metrics` serves to Prometheus, behind the same access rules; None leaves the path out.
         recordings: Folder of the recordings, with a folder in it for each server.
 
     Raises:
-        ValueError: There is no client, or a name cannot stand in a path.
+        ValueError: There is no client, or a name cannot be part of a path.
     """
     for name in clients:
         if not _NAME.fullmatch(name) or name in _TAKEN:
@@ -65,7 +66,7 @@ def apps(
                 f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not 'api' or 'metrics'"
             )
     if not clients:
-        raise ValueError("apps takes one client or more")
+        raise ValueError("apps: pass at least one client")
     door = access or Access()
     consoles = {
         name: app(client, access=door, lease_seconds=lease_seconds, recordings=Path(recordings) / name)
@@ -99,7 +100,7 @@ def apps(
         ]
         return Response(encode(found), media_type="application/json")
 
-    # The door is asked once for each path: here, and by each console for its own.
+    # Access is checked once for each path: here, and by each console for its own paths.
     index = Starlette(
         routes=[
             Route("/", page),

@@ -237,8 +237,10 @@ class RuntimeNamespace(RuntimeOps):
         switch = self._state.publishers.camera_switch
         if switch is None or not self._session.features.camera_switch:
             return {name: self._always_on(name, how) for name, how in wanted.items()}
-        told = await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}
-        return {name: told[topic] for name, topic in topics.items() if topic in told}
+        states = (
+            await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}
+        )
+        return {name: states[topic] for name, topic in topics.items() if topic in states}
 
     async def set_camera_delay(
         self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
@@ -264,8 +266,8 @@ class RuntimeNamespace(RuntimeOps):
         wanted = {name: _latency(name, delay) for name, delay in given.items()}
         topics = {name: self._camera_topic("set_camera_delay", name) for name in wanted}
         request = SetCameraDelay(cameras={topics[name]: delay for name, delay in wanted.items()})
-        told = (await self._call(request, timeout)).cameras if wanted else {}
-        return {name: told[topic] for name, topic in topics.items() if topic in told}
+        delays = (await self._call(request, timeout)).cameras if wanted else {}
+        return {name: delays[topic] for name, topic in topics.items() if topic in delays}
 
     def _camera_topic(self, op: str, name: str) -> str:
         self._state.require_handshake(op)

@@ -1,1 +1,1 @@
-"""How requests travel."""
+"""Transports for requests and published messages."""

@@ -1,4 +1,4 @@
-"""What a session needs from a transport."""
+"""The interface between a session and its transport."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from urlab_client.protocol.messages.streams import ClientEvent
 __all__ = ["LateReply", "RequestTransport", "TransportStats"]
 
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
-"""Told of a request that left and whose caller gave up: the future gets the reply, or is cancelled when none can come.
+"""Callback invoked with a future when the caller abandons a request that was sent. The future receives the late reply,
+or is cancelled if none can arrive.
 """
 
 
@@ -25,10 +26,10 @@ class TransportStats(Struct):
     Attributes:
         sent: Requests handed to the transport.
         received: Replies matched to a request.
-        late: Replies that came after their request had given up; dropped.
-        connects: Connections made; more than one means the server was lost and found again.
-        over_shm: Requests among those sent that went over shared memory.
-        over_zmq: With `transport="shm"`, how many requests that went over ZMQ all the same, by reason.
+        late: Replies that arrived after their request was abandoned; dropped.
+        connects: Connections opened; more than one means that the server was lost and found again.
+        over_shm: Requests sent over shared memory.
+        over_zmq: With `transport="shm"`, number of requests sent over ZMQ instead, by reason.
     """
 
     sent: int = 0
@@ -40,25 +41,25 @@ class TransportStats(Struct):
 
 
 class RequestTransport(Protocol):
-    """One request at a time goes out, one reply comes back. Used from one event loop."""
+    """Sends requests and returns their replies. Use from one event loop."""
 
     stats: TransportStats
     on_event: Callable[[ClientEvent], None] | None
-    """Told when the connection is made, lost and restored."""
+    """Callback invoked when the connection is opened, lost or restored."""
 
     @property
     def state_port(self) -> int | None:
-        """Port of the state stream where the transport knows it, None where that is a matter of configuration."""
+        """Port of the state stream if the transport knows it; None if it is configured separately."""
         ...
 
     @property
     def endpoint(self) -> str:
-        """Where requests go, for messages."""
+        """Address that requests go to, for messages."""
         ...
 
     @property
     def connected(self) -> bool:
-        """Whether a server is on the line."""
+        """Whether a server is connected."""
         ...
 
     async def request(
@@ -68,14 +69,15 @@ class RequestTransport(Protocol):
 
         Args:
             frame: The encoded request.
-            op: Its op: named in errors, and decides what a lost reply means.
-            deadline: Loop time at which to give up; None waits.
-            connect_by: Loop time by which a connection must stand; None waits.
-            late: Told, when this is cancelled or times out after sending, where the reply will be; None drops it.
+            op: Its op, which errors name and which determines the meaning of a lost reply.
+            deadline: Loop time at which to give up; None waits without limit.
+            connect_by: Loop time by which a connection must be open; None waits without limit.
+            late: Callback invoked with a future for the reply when this call is cancelled or times out after sending;
+                None drops the reply.
 
         Raises:
-            ServerUnreachable: No connection by `connect_by`; nothing was sent.
-            URLabTimeoutError: Sent, but no reply by `deadline`.
+            ServerUnreachable: No connection was open by `connect_by`; nothing was sent.
+            URLabTimeoutError: The request was sent, but no reply arrived by `deadline`.
             ConnectionLost: The connection broke after sending; the op changes nothing.
             OutcomeUnknown: The connection broke after sending; the op may have been executed.
             ClientClosed: The client was closed.
@@ -83,13 +85,13 @@ class RequestTransport(Protocol):
         ...
 
     async def follow(self, hello: HelloOk) -> None:
-        """Take over what a handshake says about other ways to the server.
+        """Adopt the alternative transports that a handshake describes.
 
         Raises:
-            URLabConnectionError: The way that was asked for is not there.
+            URLabConnectionError: The requested transport is not available.
         """
         ...
 
     async def aclose(self) -> None:
-        """Fail what is waiting and release everything. Idempotent."""
+        """Fail all pending requests and release all resources. Idempotent."""
         ...

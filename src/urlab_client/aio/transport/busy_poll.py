@@ -1,9 +1,9 @@
-"""Looking for a reply again and again before the event loop goes to sleep for it.
+"""Busy polling for a reply before the event loop sleeps.
 
-A processor that has gone idle takes tens of microseconds to come back, as long as a server that answers at once takes
-altogether. One that something else keeps busy is back at once, and looking would only take its time. So the loop stays
-awake where that has proved quicker than sleeping, by a margin; now and then it does the other thing, to find out. All
-other tasks have their turns between two looks.
+An idle processor takes tens of microseconds to wake up, which is as long as a fast server takes for a whole reply. A
+processor that other work keeps busy responds immediately, and polling would only waste its time. So the loop polls if
+that has proved faster than sleeping by a margin. Occasionally it tries the alternative to measure it again. Other tasks
+run between two polls.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from urlab_client._processors import crowded
 __all__ = ["BusyPoll"]
 
 _MISSES = 4
-_FIRST = 8  # requests of an op before sleeping is tried
-_OFTEN, _RARELY = 64, 1024  # one of so many does the other thing: the more often it was no better, the more rarely
-_MARGIN = 0.85  # waiting awake takes a processor: it has to be quicker by this
+_FIRST = 8  # requests of an op before the first trial of sleeping
+_OFTEN, _RARELY = 64, 1024  # interval of trials of the alternative, which grows while the alternative is no better
+_MARGIN = 0.85  # polling occupies a processor, so it must be faster by this factor
 _WEIGHT = 0.2
-# One that looks keeps the loop awake for all; several would only keep each other busy.
+# One poller keeps the loop awake for all requests; several would only delay each other.
 _looking = False
 
 
 class _Replies:
-    """How quickly the replies to one op come, in seconds, to a loop that stays awake and to one that sleeps."""
+    """Reply times of one op in seconds, with a polling loop and with a sleeping loop."""
 
     __slots__ = ("asked", "asleep", "awake", "missed", "pause", "trial")
 
@@ -41,11 +41,11 @@ class _Replies:
 
     @property
     def awake_is_better(self) -> bool:
-        """Whether staying awake has proved quicker."""
+        """Whether polling has proved faster."""
         return self.awake < _MARGIN * self.asleep
 
     def choose(self) -> bool:
-        """Return whether to stay awake for the next one."""
+        """Return whether to poll for the next reply."""
         self.asked += 1
         if self.missed >= _MISSES:
             return False
@@ -57,12 +57,12 @@ class _Replies:
         return not self.awake_is_better
 
     def longest_look(self, shortest: float, longest: float) -> float:
-        """Return how long to look for a reply, seconds: to find out whether that is better, no longer than it would."""
+        """Return the seconds to poll for a reply; a trial is no longer than sleeping takes."""
         usual = min(max(2 * self.awake, shortest), longest)
         return usual if self.awake_is_better or self.asleep == 0.0 else min(usual, self.asleep)
 
     def note(self, seconds: float, *, awake: bool) -> None:
-        """Learn from a reply that did not take too long."""
+        """Record the time of a reply that did not exceed the limit."""
         self.missed = 0
         before = self.awake if awake else self.asleep
         if before == 0.0:
@@ -70,11 +70,11 @@ class _Replies:
         else:
             if awake != self.awake_is_better:
                 if (seconds < _MARGIN * self.asleep) if awake else (_MARGIN * seconds <= self.awake):
-                    self.pause = _OFTEN  # perhaps things have changed: ask again soon
+                    self.pause = _OFTEN  # conditions may have changed: try again soon
                 else:
                     self.pause = min(2 * self.pause, _RARELY)
                 self.trial = self.asked + self.pause
-            # What took unusually long says more about the machine's other work than about the way of waiting.
+            # An unusually long time reflects the machine's other load rather than the way of waiting.
             after = before + _WEIGHT * (min(seconds, 2 * before) - before)
         if awake:
             self.awake = after
@@ -83,11 +83,11 @@ class _Replies:
 
 
 class BusyPoll:
-    """Knows by op how long replies take, and looks for them as long as that pays.
+    """Learns the reply time of each op and polls while that pays off.
 
     Args:
-        shortest: How long to look at least, seconds.
-        longest: How long to look at most; whose replies take longer than this again and again is not looked for.
+        shortest: Minimum polling time, seconds.
+        longest: Maximum polling time, seconds. Ops whose replies repeatedly take longer are not polled.
     """
 
     def __init__(self, shortest: float, longest: float) -> None:
@@ -96,7 +96,7 @@ class BusyPoll:
         self._ops: dict[str, _Replies] = {}
 
     def pays(self, op: str) -> bool:
-        """Whether to look for the reply to this op."""
+        """Return whether to poll for the reply to this op."""
         if _looking or crowded():
             return False
         replies = self._ops.get(op)
@@ -105,16 +105,16 @@ class BusyPoll:
         return replies.choose()
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
-        """Call `look` until it completes `reply` or that has taken too long."""
-        global _looking  # noqa: PLW0603  # about all loops of the process, as they share its interpreter
+        """Call `look` until it completes `reply` or the time limit is reached."""
+        global _looking  # noqa: PLW0603  # shared by all loops of the process, which share one interpreter
         now = time.perf_counter  # the loop's clock may tick 64 times a second
         replies = self._ops.get(op)
         give_up = now() + (self._shortest if replies is None else replies.longest_look(self._shortest, self._longest))
         _looking = True
         try:
-            while True:  # once at least: whoever is late to look first would find nobody left to wake it
+            while True:  # at least once: otherwise nothing would wake a task that is late for its first poll
                 await asyncio.sleep(0)
-                if reply.done():  # by whoever else had a turn, and took away where to look
+                if reply.done():  # another task may have completed it and closed the socket
                     break
                 look()
                 if reply.done() or now() >= give_up:
@@ -123,10 +123,10 @@ class BusyPoll:
             _looking = False
 
     def note(self, op: str, seconds: float, *, awake: bool) -> None:
-        """Learn how long a reply has taken, to a loop that was looking for it or asleep."""
+        """Record the time of a reply, with a polling or a sleeping loop."""
         replies = self._ops.get(op)
         if replies is None:
-            return  # it has never been asked for
+            return  # `pays` was never called for it
         if seconds > self._longest:
             replies.missed += 1
             return

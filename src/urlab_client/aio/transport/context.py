@@ -1,7 +1,7 @@
-"""The ZeroMQ context that all request lines of a process share.
+"""The ZeroMQ context that all request sockets of a process share.
 
-A context has two threads and a handful of descriptors. With one for each of many clients in one event loop, their
-threads, which wake up for every message, would take more of the machine than the clients.
+A context has two threads and a few descriptors. With one context for each of many clients in an event loop, these
+threads wake up for every message and would use more processor time than the clients.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["borrow", "give_back"]
 Context = zmq.Context[zmq.Socket[bytes]]
 
 _MOST_SOCKETS: Final = 16_384
-"""ZeroMQ's default is 1023, about 340 clients; the table is that of their addresses alone. Windows allows one less."""
+"""Maximum number of sockets. ZeroMQ's default of 1023 suffices for about 340 clients. Windows allows one less."""
 
 
 class _SharedContext:
@@ -38,7 +38,7 @@ class _SharedContext:
 
     def give_back(self, context: Context) -> None:
         with self._lock:
-            if context is not self._context:  # this process is a fork of the one that borrowed it
+            if context is not self._context:  # this process is a fork of the borrower
                 return
             self._users -= 1
             if self._users:
@@ -61,10 +61,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def borrow() -> Context:
-    """Return the context, made if need be; to be given back."""
+    """Return the shared context, created if needed. The caller must call `give_back`."""
     return _shared.borrow()
 
 
 def give_back(context: Context) -> None:
-    """Give it back, once all sockets in it that the borrower opened are closed. The last one back ends it."""
+    """Return a borrowed context after closing its sockets. The last call terminates the context."""
     _shared.give_back(context)

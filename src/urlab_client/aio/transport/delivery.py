@@ -1,4 +1,4 @@
-"""Giving a reply to the task that awaits it in the very callback that receives it."""
+"""Delivering a reply to the waiting task within the callback that receives it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ T = TypeVar("T")
 
 
 def deliver(reply: asyncio.Future[T], result: T) -> None:
-    """Set the result of a future and let the task that awaits it go on, before this returns.
+    """Set the result of a future and resume the task that awaits it before returning.
 
-    `set_result` alone has the task go on in the loop's next turn, which looks at all sockets and timers before: a tenth
-    of what a step takes the client.
+    With `set_result` alone, the task resumes in the loop's next iteration, which first polls all sockets and timers.
+    That costs a tenth of the client's time for a step.
 
-    Only for callbacks of the loop, as the last thing they do: a task cannot run within another one, and what the
-    callback was about to look at may have changed when this returns.
+    Call only as the last statement of a loop callback: a task cannot run within another one, and any state may have
+    changed when this returns.
     """
-    # Of asyncio's own futures, not public: unchanged from Python 3.11 to 3.14. Without it the loop wakes the task.
+    # A private attribute of asyncio's futures, unchanged from Python 3.11 to 3.14. Without it, the loop wakes the task.
     callbacks: Any = getattr(reply, "_callbacks", None)
     if not callbacks or len(callbacks) > 1:
         reply.set_result(result)

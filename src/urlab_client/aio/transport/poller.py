@@ -1,8 +1,8 @@
-"""How news of a region reaches the event loop: a doorbell where the server has one, else one thread that looks.
+"""Notifying the event loop of changes in a region: a doorbell if the server has one, otherwise a polling thread.
 
-Nothing tells of a publication on Linux and macOS: somebody has to look at the counter. The event loop's timers are no
-help, as they round up to a millisecond. So one thread per client looks at all regions that somebody waits for, and
-sleeps between rounds. It ends by itself when nobody waits any more.
+Linux and macOS do not signal a publication, so the counter must be polled. The event loop's timers are too coarse
+because they round up to a millisecond. So one thread per client polls all watched regions and sleeps between rounds. It
+ends when no watch remains.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ log: logging.Logger = logging.getLogger("urlab_client.transport")
 _LINGER_S = 1.0
 _BLOCK_S = 0.05
 
-# How long to sleep between looks, by the time that was waited already.
+# (waited less than, sleep between polls), seconds.
 _PACES = ((0.001, 50e-6), (0.05, 200e-6), (2.0, 1e-3))
 _SLOWEST_S = 5e-3
 _FASTEST_STREAM_S = 100e-6
 
 
 class RegionPoll:
-    """Something that the thread looks at.
+    """A watch that the thread polls.
 
     Args:
-        probe: Whether there is news. Called from the thread, must not block and must not raise.
-        notify: Called on the event loop when there is; not again before `resume`.
-        block: Sleeps until the server signals, at most so many seconds; None where it has no signal.
+        probe: Callback that returns whether there is news. Called on the thread; must not block or raise.
+        notify: Callback invoked on the event loop when there is news; not again before `resume`.
+        block: Function that sleeps until the server signals, for at most the given seconds; None without signals.
     """
 
     def __init__(
@@ -47,44 +47,44 @@ class RegionPoll:
         self.probe = probe
         self.notify = notify
         self.block = block
-        self.told: bool = False
+        self.notified: bool = False
         self._since = time.monotonic()
 
     def resume(self) -> None:
-        """Look again: what was there has been taken."""
+        """Poll again after the news has been consumed."""
         self._since = time.monotonic()
-        self.told = False
+        self.notified = False
 
     def pace(self, now: float) -> float:
-        """Return how long to sleep before the next look, seconds."""
+        """Return the seconds to sleep before the next poll."""
         waited = now - self._since
         return next((pace for limit, pace in _PACES if waited < limit), _SLOWEST_S)
 
 
 class ReplyPoll(RegionPoll):
-    """Waits for one reply: often at first, more seldom as it takes longer."""
+    """Waits for one reply: polls frequently at first and less often as the wait grows."""
 
 
 class StreamPoll(RegionPoll):
-    """Waits for one publication after the other: four looks between two of them."""
+    """Waits for successive publications, with four polls between two of them."""
 
     def __init__(self, probe: Callable[[], bool], notify: Callable[[], None]) -> None:
         super().__init__(probe, notify)
         self._interval = 4 * _SLOWEST_S
 
     def resume(self) -> None:
-        """Look again: what was there has been taken."""
+        """Poll again after the news has been consumed."""
         self._interval += (time.monotonic() - self._since - self._interval) / 8
         super().resume()
 
     def pace(self, now: float) -> float:
-        """Return how long to sleep before the next look, seconds."""
-        interval = max(self._interval, now - self._since)  # a stream that has stopped is not worth the effort
+        """Return the seconds to sleep before the next poll."""
+        interval = max(self._interval, now - self._since)  # poll a stopped stream less often
         return min(max(interval / 4, _FASTEST_STREAM_S), _SLOWEST_S)
 
 
 class Poller:
-    """The thread that looks. Used from one event loop.
+    """The polling thread. Use from one event loop.
 
     Args:
         loop: The event loop.
@@ -98,7 +98,7 @@ class Poller:
         self._closed = False
 
     def add(self, watch: RegionPoll) -> None:
-        """Look at `watch` from now on."""
+        """Start polling `watch`."""
         with self._changed:
             self._watches.append(watch)
             if self._thread is None and not self._closed:
@@ -107,7 +107,7 @@ class Poller:
             self._changed.notify()
 
     def remove(self, watch: RegionPoll) -> None:
-        """Look no longer. When this returns, `probe` is not running and will not be called again. Idempotent."""
+        """Stop polling `watch`. When this returns, `probe` is not running and is not called again. Idempotent."""
         with self._changed:
             if watch in self._watches:
                 self._watches.remove(watch)
@@ -137,14 +137,14 @@ class Poller:
                 block(min(pause, _BLOCK_S))
 
     def _look(self) -> tuple[float, Callable[[float], object] | None]:
-        """Look at everything once; return how long to sleep, and how."""
+        """Poll all watches once. Return how long to sleep, and how."""
         pause, block, now = _SLOWEST_S, None, time.monotonic()
         for watch in self._watches:
             pause = min(pause, watch.pace(now))
             block = block or watch.block
-            if not watch.told and watch.probe():
-                watch.told = True
-                with contextlib.suppress(RuntimeError):  # the loop is closed, and with it everybody who waits
+            if not watch.notified and watch.probe():
+                watch.notified = True
+                with contextlib.suppress(RuntimeError):  # the loop is closed, so there are no waiters
                     self._loop.call_soon_threadsafe(watch.notify)
         return pause, block
 
@@ -154,12 +154,12 @@ class Doorbell:
 
     Args:
         loop: The event loop.
-        path: The socket.
-        on_ring: What to call for each kind of ring.
-        on_lost: Called when the server is gone.
+        path: Path of the socket.
+        on_ring: Callback for each kind of ring.
+        on_lost: Callback invoked when the server is gone.
 
     Raises:
-        OSError: Nobody answers there.
+        OSError: No server accepts connections there.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class Doorbell:
         if len(str(path).encode()) > doorbell.MAX_PATH_BYTES:
             raise OSError(f"{path} is too long for a socket")
         if not hasattr(socket, "AF_UNIX"):
-            raise OSError("there are no Unix sockets here")
+            raise OSError("this system has no Unix sockets")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.setblocking(False)
         try:
@@ -189,12 +189,12 @@ class Doorbell:
         try:
             self._socket.send(message)
         except BlockingIOError:
-            pass  # it has rings waiting
+            pass  # earlier rings are still pending
         except OSError:
             self._lose()
 
     def close(self) -> None:
-        """Hang up. Idempotent."""
+        """Close the connection. Idempotent."""
         if self._socket.fileno() >= 0:
             self._readiness.close()
             self._socket.close()

@@ -1,8 +1,8 @@
 """Learning when a socket becomes readable, on every event loop.
 
-A loop with `add_reader` watches sockets itself. Others, above all Windows' default, the Proactor loop, are told by a
-thread that watches for them: one per loop, which lives as long as there is something to watch. It takes a socket off
-its list before it tells the loop, and puts it back when the loop has looked, so that it never tells twice.
+A loop with `add_reader` watches sockets itself. For other loops, above all Windows' default Proactor loop, a thread
+watches the sockets: one per loop, which runs while there are sockets to watch. It removes a socket from its list before
+it notifies the loop, and adds it again after the loop has handled it, so it never notifies twice.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import zmq
 
 __all__ = ["Readiness", "Watchable", "watch_socket"]
 
-# How often the thread looks whether the loop has been closed by somebody who left clients open.
+# Interval of the thread's checks whether the loop was closed while clients were open.
 _CHECK_MS: Final = 1000
 _JOIN_S: Final = 1.0
 
@@ -27,7 +27,7 @@ _POLLIN: Final = int(zmq.POLLIN)
 
 
 class Watchable(Protocol):
-    """A socket: ZeroMQ's or the system's."""
+    """A ZeroMQ socket or a socket of the system."""
 
     def fileno(self) -> int:
         """Return the descriptor to watch."""
@@ -35,14 +35,14 @@ class Watchable(Protocol):
 
 
 class Readiness(Protocol):
-    """What tells that one socket is readable."""
+    """The watch on one socket."""
 
     def expect(self) -> None:
-        """Watch from now on, if `awaited` had ended that."""
+        """Resume watching if `awaited` had ended it."""
         ...
 
     def close(self) -> None:
-        """Watch no longer; before the socket is closed. Idempotent."""
+        """Stop watching. Call before the socket is closed. Idempotent."""
         ...
 
 
@@ -56,12 +56,12 @@ def watch_socket(
     """Call `on_readable` on the event loop whenever a socket is readable.
 
     Args:
-        loop: The event loop, which is the running one.
+        loop: The running event loop.
         watched: The socket.
-        on_readable: What to call. It may find that there is nothing to read after all.
-        awaited: Whether anything is to come. Where a thread has to watch, it does so only from `expect` until this
-            says no: a wake-up of the thread for a reply that the loop looks for by itself would delay that. None to
-            watch always.
+        on_readable: Callback to invoke. It may find nothing to read.
+        awaited: Callback that returns whether anything is expected. A watching thread is active only from `expect`
+            until this returns False, because waking the thread would delay a reply that the loop polls for itself. None
+            to watch always.
     """
     try:
         loop.add_reader(watched.fileno(), on_readable)
@@ -117,7 +117,7 @@ class _Watched:
             self._watcher.release(self)
 
     def tell(self) -> None:
-        """Take note that it is readable; on the event loop."""
+        """Handle that the socket is readable. Called on the event loop."""
         self._armed = False
         try:
             if not self._closed:
@@ -128,9 +128,9 @@ class _Watched:
 
 
 class _Watcher:
-    """The thread of one event loop.
+    """The watching thread of one event loop.
 
-    Its poll is ZeroMQ's, which on Windows watches more than the 512 sockets of `select.select`.
+    It uses ZeroMQ's poll, which is not limited to the 512 sockets of `select.select` on Windows.
     """
 
     _of_loops: ClassVar[dict[asyncio.AbstractEventLoop, _Watcher]] = {}
@@ -138,7 +138,7 @@ class _Watcher:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._lock = threading.Lock()
-        # Weak: a client that nobody closed goes with its loop, before this thread sees that the loop is closed.
+        # Weak: an unclosed client is collected with its loop before this thread sees that the loop is closed.
         self._armed: WeakValueDictionary[int, _Watched] = WeakValueDictionary()
         self._users = 0
         self._ended = False
@@ -149,7 +149,7 @@ class _Watcher:
 
     @classmethod
     def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
-        """Return the one of `loop`, which the caller counts among its users from now on."""
+        """Return the watcher of `loop` and count the caller as a user."""
         watcher = cls._of_loops.get(loop)
         if watcher is None:
             watcher = cls._of_loops[loop] = cls(loop)
@@ -157,13 +157,13 @@ class _Watcher:
         return watcher
 
     def arm(self, watched: _Watched) -> None:
-        """Watch until it is readable."""
+        """Watch a socket until it is readable."""
         with self._lock:
             self._armed[watched.fd] = watched
             self._ring()
 
     def release(self, watched: _Watched) -> None:
-        """Watch no longer. The last user ends the thread."""
+        """Stop watching a socket. The last user ends the thread."""
         with self._lock:
             if self._armed.get(watched.fd) is watched:
                 del self._armed[watched.fd]
@@ -188,30 +188,30 @@ class _Watcher:
         while self._look():
             pass
         with self._lock:
-            self._rung = True  # nobody is to ring any more
+            self._rung = True  # suppresses any further ring
             self._armed.clear()
         self._forget()
         self._bell.close()
         self._button.close()
 
     def _look(self) -> bool:
-        """Wait for news and tell the loop; return whether to go on."""
+        """Wait for a readable socket and notify the loop. Return whether to continue."""
         with self._lock:
             if self._ended:
                 return False
             fds = [self._bell.fileno(), *self._armed]
         try:
             ready = _poll(fds, _CHECK_MS)
-        except zmq.ZMQError:  # on Windows, of a socket that was closed meanwhile
+        except zmq.ZMQError:  # on Windows, if a socket was closed meanwhile
             self._drop_closed()
             return True
         with self._lock:
             if self._bell.fileno() in ready:
                 self._bell.recv(_DRAIN_BYTES)
                 self._rung = False
-            told = [watched for fd in ready if (watched := self._armed.pop(fd, None)) is not None]
+            notified = [watched for fd in ready if (watched := self._armed.pop(fd, None)) is not None]
         try:
-            for watched in told:
+            for watched in notified:
                 self._loop.call_soon_threadsafe(watched.tell)
         except RuntimeError:  # the loop is closed
             return False
@@ -227,6 +227,6 @@ class _Watcher:
 
 
 def _poll(fds: Collection[int], timeout_ms: int) -> list[int]:
-    """Return which of these are readable, or broken."""
+    """Return the descriptors that are readable or broken."""
     poll: Callable[[list[tuple[int, int]], int], list[tuple[int, int]]] = cast("Any", zmq.zmq_poll)
     return [fd for fd, _ in poll([(fd, _POLLIN) for fd in fds], timeout_ms)]

@@ -1,4 +1,4 @@
-"""The pair of request and reply region, and the exchange that shows that no old reply is still to come."""
+"""The pair of request and reply regions, and the exchange that rules out outstanding old replies."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from urlab_client.protocol.messages.runtime import ReadMocapPose
 __all__ = ["SYNC_PREFIX", "Envelope", "RegionChannel", "envelope_of", "opening_of"]
 
 SYNC_PREFIX: Final = "sync-"
-"""How the session ids begin that no server knows, and whose refusal answers the exchange."""
+"""Prefix of session ids that no server knows; their rejection completes the exchange."""
 
 _ASK_AGAIN_S = 1.0
 
 
 class Envelope(Struct):
-    """What a reply says about itself."""
+    """The fields of a reply that identify it."""
 
     op: str = ""
     code: str = ""
@@ -37,7 +37,7 @@ _JSON = msgspec.json.Decoder(Envelope)
 
 
 def envelope_of(reply: bytes) -> Envelope:
-    """Read what a reply says about itself; empty for what is not a reply."""
+    """Return the identifying fields of a reply; empty if the bytes are not a reply."""
     try:
         return (_JSON if reply[:1] == b"{" else _MSGPACK).decode(reply)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -46,20 +46,20 @@ def envelope_of(reply: bytes) -> Envelope:
 
 @cache
 def opening_of(op: Op) -> bytes:
-    """Return how a successful msgpack reply to `op` begins, after the byte or bytes that say how long its map is."""
+    """Return the start of a successful msgpack reply to `op`, after the bytes that encode the length of its map."""
     return msgspec.msgpack.encode({"op": op.reply_name})[1:]
 
 
 class RegionChannel:
-    """The pair of request and reply region, for the one client that holds the lock.
+    """The pair of request and reply regions, for the client that holds the lock.
 
     Args:
-        requests: File of the requests.
-        replies: File of the replies.
-        events: What their events are called on Windows.
+        requests: File of the request region.
+        replies: File of the reply region.
+        events: Names of their events on Windows.
 
     Attributes:
-        limit: Largest payload that fits in both directions.
+        limit: Size of the largest payload that fits in both directions, bytes.
     """
 
     def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
@@ -73,38 +73,38 @@ class RegionChannel:
         request_event, reply_event = events
         self._request_event = NamedEvent(request_event)
         self.reply_event: NamedEvent = NamedEvent(reply_event)
-        # A client that died here may have left a request behind whose reply is still to come.
+        # A client that crashed may have left a request whose reply is still outstanding.
         self.dirty: bool = True
         self.seen: int = 0
         self._token = ""
         self._asked_at = 0.0
 
     def intact(self) -> bool:
-        """Whether both regions are mapped in full still."""
+        """Return whether both regions are still mapped completely."""
         return self.requests.intact() and self.replies.intact()
 
     def replaced(self) -> bool:
-        """Whether other files have taken the place of the two."""
+        """Return whether other files have replaced the regions."""
         return self.requests.replaced() or self.replies.replaced()
 
     def publish(self, frame: bytes) -> None:
-        """Put a request into its region, and say so."""
+        """Write a request to its region and signal it."""
         self.seen = self.replies.region.sequence
         self.requests.region.publish(frame)
         self._request_event.set()
 
     def ask_for_sync(self, now: float) -> bool:
-        """Ask, unless that was done a moment ago, for a refusal that only this question gets; return whether it was."""
+        """Send a request with a unique rejection unless one was sent recently. Return whether it was sent."""
         if self._token and now - self._asked_at < _ASK_AGAIN_S:
             return False
         self._token = SYNC_PREFIX + secrets.token_hex(8)
         self._asked_at = now
-        # Refused for its session before anything else about it is looked at.
+        # The server checks the session first and rejects the request for it.
         self.publish(encode_request(ReadMocapPose(body=""), self._token))
         return True
 
     def synchronised(self) -> bool:
-        """Take up the answer to `ask_for_sync` if it is there; from then on the channel is clean."""
+        """Consume the reply to `ask_for_sync` if it has arrived. Return whether the channel is clean."""
         found = self.replies.region.read_latest(self.seen) if self._token and self.intact() else None
         if found is not None:
             self.seen = found.sequence
@@ -115,7 +115,7 @@ class RegionChannel:
         return not self.dirty
 
     def close(self) -> None:
-        """Let go of both regions."""
+        """Release both regions."""
         self.requests.close()
         self.replies.close()
         self._request_event.close()

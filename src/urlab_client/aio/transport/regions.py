@@ -1,7 +1,7 @@
-"""Streams out of shared memory: state and pictures, with the sockets beside them for while a region is not there.
+"""Streams from shared memory: state and pictures, with sockets as a fallback while a region is missing.
 
-One reader per region serves all handlers. A region keeps the newest publication alone, so streams that want all of them
-receive from the sockets anyway.
+One reader per region serves all handlers. A region keeps only the newest publication, so streams that need all of them
+always receive from the sockets.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T")
 
-# How often to look whether regions came, went or were replaced.
+# Interval of checks whether regions were created, removed or replaced.
 _SUPERVISE_S = 0.25
 _IDLE_S = 0.5
 _SILENT_S = 1.0
@@ -47,12 +47,12 @@ _WANTS = {doorbell.STATE: doorbell.WANT_STATE, doorbell.CAMERA: doorbell.WANT_CA
 
 
 class Place(Struct, frozen=True):
-    """Where a source's publications are in shared memory.
+    """Location of a source's publications in shared memory.
 
     Attributes:
         file: Name of the region's file.
-        topic: What the handlers are told as topic.
-        ring: Which ring of the doorbell tells of them.
+        topic: Topic passed to the handlers.
+        ring: Kind of doorbell ring that announces the publications.
     """
 
     file: str
@@ -61,16 +61,16 @@ class Place(Struct, frozen=True):
 
 
 class _Wanted(Struct, frozen=True):
-    """What a handler is to have; see `Regions.attach`."""
+    """What a handler receives; see `Regions.attach`."""
 
     subscription: Callable[[], Subscription]
     place: Callable[[], Place]
 
 
 class SharedPicture:
-    """A publication that is still in its region, to be read when somebody looks at it.
+    """A publication that stays in its region until first access.
 
-    Stands for the payload: as long as one, and its source knows how to read it.
+    It takes the place of a payload: it has the same length, and its source reads it.
     """
 
     def __init__(self, reader: _RegionReader, sequence: int, size: int) -> None:
@@ -82,17 +82,17 @@ class SharedPicture:
         return self._size
 
     def read(self, take: Callable[[memoryview], T]) -> Publication[T]:
-        """Make something of this picture, or of a newer one that took its place. From any thread.
+        """Convert this picture, or a newer one that replaced it. Call from any thread.
 
         Raises:
-            MessageGone: Its region is gone.
-            ProtocolError: None could be read whole.
+            MessageGone: The region of the picture is gone.
+            ProtocolError: No picture could be read completely.
         """
         return self.reader.read(take)
 
 
 class _RegionReader:
-    """One mapped region and those it feeds."""
+    """One mapped region and its handlers."""
 
     def __init__(self, path: Path, place: Place) -> None:
         self.mapping: MappedRegion = MappedRegion(path)
@@ -102,7 +102,7 @@ class _RegionReader:
         self.silent = False
         self.seen: int = 0
         self.changed_at: float = 0.0
-        # Pictures are read from whatever thread looks at them.
+        # Pictures are read on the thread that accesses them.
         self._lock = threading.Lock()
         self._closed = False
 
@@ -111,19 +111,19 @@ class _RegionReader:
         return self.mapping.region.sequence
 
     def news(self) -> bool:
-        """Whether there is something to do. From the thread that looks."""
+        """Return whether there is something to do. Called on the polling thread."""
         return not self.mapping.intact() or self.mapping.region.sequence != self.seen
 
     def begun_anew(self) -> bool:
-        """Whether the region was laid out anew where it is, as a server does that comes after one that crashed."""
+        """Return whether a server reinitialised the region in place, as happens after a crash of its predecessor."""
         return self.region_sequence < self.seen or self.mapping.laid_out_anew()
 
     def message(self) -> BytesLike | None:
-        """Return what is there now, None if that is nothing. Raises `ProtocolError`."""
+        """Return the current publication, or None if there is none. Raises `ProtocolError`."""
         region = self.mapping.region
         if self.place.ring == doorbell.CAMERA:
             self.seen = region.sequence
-            # The handlers measure it and hand it back to their source, which knows what it is.
+            # The handlers use its length and pass it back to their source, which handles this type.
             return cast("BytesLike", SharedPicture(self, self.seen, region.max_payload)) if self.seen else None
         found = region.read_latest()
         if found is None:
@@ -142,7 +142,7 @@ class _RegionReader:
         raise MessageGone(f"{self.mapping.path}: the picture is gone.")
 
     def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
-        """Return a live view of what is there now, and what tells whether it still is."""
+        """Return a live view of the current publication and a check whether it is still valid."""
         with self._lock:
             if self._closed or not self.mapping.intact():
                 return None
@@ -160,11 +160,11 @@ class _RegionReader:
 
 
 class Regions:
-    """All that one client receives from shared memory. Used from one event loop, but for `view`.
+    """Everything that one client receives from shared memory. Except for `view`, use from one event loop.
 
     Args:
-        memory: Where the regions are.
-        subscriptions: The sockets beside them.
+        memory: Location of the regions.
+        subscriptions: Sockets used as a fallback.
     """
 
     def __init__(self, memory: SharedMemoryRegions, subscriptions: Subscriptions) -> None:
@@ -183,12 +183,12 @@ class Regions:
     def attach(
         self, handler: MessageHandler, subscription: Callable[[], Subscription], place: Callable[[], Place]
     ) -> None:
-        """Let `handler` have what is published, from the region if it is there, else from the socket.
+        """Deliver publications to `handler`, from the region if it exists, otherwise from the socket.
 
         Args:
-            handler: What takes it.
-            subscription: Tells which socket, and what there.
-            place: Tells which region. Raises `ProtocolError` where there can be none.
+            handler: Receiver of the publications.
+            subscription: Callback that returns the subscription for the socket.
+            place: Callback that returns the region. Raises `ProtocolError` if there can be none.
         """
         if self._closed:
             raise client_closed()
@@ -213,11 +213,11 @@ class Regions:
                 self._close_reader(reader)
 
     def path(self, handler: MessageHandler) -> Path | None:
-        """Return the file from which `handler` receives; None if that is a socket, or nothing."""
+        """Return the file that `handler` receives from, or None if it does not receive from a region."""
         return next((r.mapping.path for r in self._readers.values() if handler in r.handlers), None)
 
     def refresh(self) -> None:
-        """Follow a handshake: play may have begun, and the regions may be others."""
+        """Reattach after a handshake: play may have started and the regions may have changed."""
         self._away = False
         self._refused.clear()
         for reader in tuple(self._readers.values()):
@@ -226,13 +226,13 @@ class Regions:
         self._settle_all()
 
     def release(self) -> None:
-        """Let go of every region until `refresh`: play ends, or the server is gone, and with it the files."""
+        """Release every region until `refresh`, because play ends or the server and its files are gone."""
         self._away = True
         for reader in tuple(self._readers.values()):
             self._lose(reader)
 
     def view(self, place: Place) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
-        """Return a live view of the newest publication and what tells whether it still holds; None without a region."""
+        """Return a live view of the newest publication and a validity check, or None without a region."""
         reader = self._readers.get(place.file)
         return None if reader is None else reader.view()
 
@@ -253,7 +253,7 @@ class Regions:
     # Readers
 
     def _reader(self, wanted: Callable[[], Place]) -> _RegionReader | None:
-        """Return the reader of a region, opening it if there is one with something in it."""
+        """Return the reader of a region. Open it if the region exists and has a publication."""
         if self._away:
             return None
         try:
@@ -282,7 +282,7 @@ class Regions:
     def _feed(self, reader: _RegionReader, handler: MessageHandler) -> None:
         reader.handlers[handler] = None
         if self._loop is not None:
-            # What is there already counts, too; a handler that attaches is not ready for it at this very moment.
+            # Deliver an existing publication, too, but later: a handler that is attaching is not ready for it yet.
             self._loop.call_soon(self._welcome, reader, handler)
 
     def _welcome(self, reader: _RegionReader, handler: MessageHandler) -> None:
@@ -292,7 +292,7 @@ class Regions:
             self._deliver(reader, (handler,))
 
     def _rouse(self, reader: _RegionReader) -> None:
-        """See to it that news of a reader's region is noticed."""
+        """Ensure that changes in a reader's region are detected."""
         if self._memory.bell is None and reader.watch is None:
             reader.watch = StreamPoll(reader.news, lambda: self._look_at(reader))
             self._memory.waiter.add(reader.watch)
@@ -306,7 +306,7 @@ class Regions:
             self._look_at(reader)
 
     def _look_at(self, reader: _RegionReader) -> None:
-        """Hand out what is new in a region."""
+        """Deliver a new publication of a region."""
         if self._readers.get(reader.place.file) is not reader:
             return
         if not reader.mapping.intact():
@@ -342,7 +342,7 @@ class Regions:
                 handler.on_drained()
 
     def _lose(self, reader: _RegionReader) -> None:
-        """Go on without a region."""
+        """Continue without a region."""
         handlers = tuple(reader.handlers)
         self._close_reader(reader)
         for handler in handlers:
@@ -359,11 +359,11 @@ class Regions:
     def _subscribe(self, handler: MessageHandler) -> None:
         wanted = self._wanted.get(handler)
         if wanted is not None:
-            with contextlib.suppress(URLabError, ValueError):  # an invalid address is as silent as a closed port
+            with contextlib.suppress(URLabError, ValueError):  # treat an invalid address like a closed port
                 self._subscriptions.attach(handler, wanted.subscription)
 
     def _resume(self, reader: _RegionReader) -> None:
-        """Take the handlers that had to do without back to a region that has come to life again."""
+        """Move handlers back from their sockets to a region that publishes again."""
         reader.silent = False
         for handler, wanted in self._wanted.items():
             if _file_of(wanted.place) == reader.place.file:
@@ -383,7 +383,7 @@ class Regions:
                 if reader.mapping.replaced() or self._moved(reader):
                     self._lose(reader)
                 elif idle > _SILENT_S and reader.place.ring == doorbell.STATE and not reader.silent:
-                    # While play runs there is always news; a snapshot that outgrew its slot comes by socket only.
+                    # While play runs, snapshots keep coming. One that exceeds its slot arrives only by socket.
                     reader.silent = True
                     handlers = tuple(reader.handlers)
                     reader.handlers.clear()
@@ -397,7 +397,7 @@ class Regions:
                 self._close_reader(reader)
 
     def _settle_all(self) -> None:
-        """Take handlers that receive from sockets to their regions, where these are there by now."""
+        """Move handlers from sockets to their regions if these exist by now."""
         for handler, wanted in tuple(self._wanted.items()):
             if self.path(handler) is None:
                 reader = self._reader(wanted.place)
@@ -408,7 +408,7 @@ class Regions:
     def _moved(self, reader: _RegionReader) -> bool:
         try:
             return self._memory.find(reader.place.file) != reader.mapping.path
-        except (OSError, ProtocolError):  # what a server calls its directory may be anything
+        except (OSError, ProtocolError):  # the directory's name comes from the server
             return True
 
     def _now(self) -> float:
@@ -418,5 +418,5 @@ class Regions:
 def _file_of(place: Callable[[], Place]) -> str | None:
     try:
         return place().file
-    except ProtocolError:  # what a server calls its cameras may be anything
+    except ProtocolError:  # the cameras' names come from the server
         return None

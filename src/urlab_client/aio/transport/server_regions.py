@@ -1,4 +1,4 @@
-"""Where one client's server has its shared-memory regions, and how the client learns of news in them."""
+"""Location of a server's shared-memory regions, and the means to detect changes in them."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 
 class SharedMemoryRegions:
-    """Where one client's server has its regions, and how the client learns of news in them.
+    """Location of the regions of one client's server, and the doorbell or thread that detects changes in them.
 
     Args:
-        directory: Where the regions are, when it is not where the server says.
+        directory: Directory of the regions, overriding the one that the server reports.
 
     Attributes:
-        directory: Directory of `state.shm`; None while no server said so.
-        rung: Called for each ring of the doorbell, by kind.
+        directory: Directory of `state.shm`; None until a server reports it.
+        rung: Callbacks for each ring of the doorbell, by kind.
     """
 
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
-        # Replies last: whoever waits for one goes on within the call.
+        # Replies last, because the task that waits for one resumes within the callback.
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
-        self._told: dict[str, Path] = {}  # regions whose files the server names, whatever those are called
+        self._told: dict[str, Path] = {}  # files that the server names explicitly, by region
         self._events = "", ""
         self._given = None if directory is None else Path(directory).absolute()
         self._waiter: Poller | None = None
@@ -43,41 +43,41 @@ class SharedMemoryRegions:
 
     @property
     def waiter(self) -> Poller:
-        """The thread that looks, where there is no doorbell."""
+        """The polling thread, used without a doorbell."""
         if self._waiter is None:
             self._waiter = Poller(asyncio.get_running_loop())
         return self._waiter
 
     @property
     def bell(self) -> Doorbell | None:
-        """The doorbell, while there is one."""
+        """The doorbell, or None if it is not connected."""
         return self._bell
 
     def follow(self, hello: HelloOk) -> bool:
-        """Take over what a handshake says; return whether the regions are elsewhere than before.
+        """Adopt the locations in a handshake; return whether the regions have moved.
 
         Raises:
-            URLabConnectionError: The server says that play runs, and not where its regions are.
-            ProtocolError: It names a file that is not an absolute path.
+            URLabConnectionError: Play runs, but the server does not report the location of its regions.
+            ProtocolError: The server names a file without an absolute path.
         """
         before = self.directory, self._told
-        told = hello.shm_rpc
-        paths = {} if told is None else {REQUEST_FILE: told.req_path, REPLY_FILE: told.rep_path}
+        reported = hello.shm_rpc
+        paths = {} if reported is None else {REQUEST_FILE: reported.req_path, REPLY_FILE: reported.rep_path}
         self._told = {file: _checked(path) for file, path in paths.items()}
-        self._events = ("", "") if told is None else (told.req_event, told.rep_event)
+        self._events = ("", "") if reported is None else (reported.req_event, reported.rep_event)
         if self._given is not None:
             self.directory = self._given
         elif hello.shm_session_dir is not None:
             self.directory = Path(hello.shm_session_dir)
         elif hello.manager_present:
             raise URLabConnectionError(
-                "discover: transport='shm', but the server names no directory of shared memory.",
-                hint="Start it with shared memory, or use transport='zmq'.",
+                "discover: transport='shm', but the server reports no shared-memory directory.",
+                hint="Start the server with shared memory, or use transport='zmq'.",
             )
         return (self.directory, self._told) != before
 
     def candidates(self, file: str) -> list[Path]:
-        """Return where a region's file may be, best place first.
+        """Return the possible paths of a region's file, best first.
 
         Raises:
             ProtocolError: The server's directory is not absolute.
@@ -91,17 +91,17 @@ class SharedMemoryRegions:
         return [Path(directory) / file for directory in region_directories(self.directory, file)]
 
     def events(self, requests: Path) -> tuple[str, str]:
-        """Return what the events of requests and replies are called on Windows.
+        """Return the names of the request and reply events on Windows.
 
         Args:
-            requests: The region of the requests, after whose directory they are called where the server does not say.
+            requests: Path of the request region, whose directory determines the names that the server does not report.
         """
         asked, answered = self._events
         session = requests.parent.name
         return asked or f"Local\\URLab_{session}_req_ready", answered or f"Local\\URLab_{session}_rep_ready"
 
     def find(self, file: str) -> Path | None:
-        """Return where a region's file is; None when it is nowhere."""
+        """Return the path of a region's file, or None if it does not exist."""
         return next((path for path in self.candidates(file) if path.exists()), None)
 
     def connect_bell(self) -> Doorbell | None:
@@ -118,24 +118,24 @@ class SharedMemoryRegions:
                 log.debug("no doorbell: %s", error)
                 return None
             for message in self._wanted:
-                bell.ring(message)  # which may find that it is lost already
+                bell.ring(message)  # may detect that the connection is already lost
         return self._bell
 
     def want(self, message: bytes) -> None:
-        """Ask to be told of publications, too: `WANT_STATE` or `WANT_CAMERAS`."""
+        """Request rings for publications, too: `WANT_STATE` or `WANT_CAMERAS`."""
         if message not in self._wanted:
             self._wanted.add(message)
             if self._bell is not None:
                 self._bell.ring(message)
 
     def disconnect(self) -> None:
-        """Let go of the server, which is gone or elsewhere."""
+        """Disconnect from a server that has gone or moved."""
         if self._bell is not None:
             self._bell.close()
             self._bell = None
 
     def close(self) -> None:
-        """Release everything. Idempotent."""
+        """Release all resources. Idempotent."""
         self.disconnect()
         if self._waiter is not None:
             self._waiter.close()
@@ -149,12 +149,12 @@ class SharedMemoryRegions:
 
     def _lose_bell(self) -> None:
         self._bell = None
-        # Whoever waited for a ring looks once more and goes on without.
+        # Listeners that waited for a ring check once more and continue without the doorbell.
         for kind in self.rung:
             self._act(kind)()
 
 
 def _checked(path: str) -> Path:
     if not path or "\0" in path or not PurePath(path).is_absolute() or ".." in PurePath(path).parts:
-        raise ProtocolError(f"hello: shm_rpc names the file {path!r}, expected an absolute path.", op="hello")
+        raise ProtocolError(f"hello: shm_rpc names the file {path!r}; expected an absolute path.", op="hello")
     return Path(path)

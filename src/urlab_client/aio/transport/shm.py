@@ -1,8 +1,8 @@
-"""Requests over shared memory, with ZeroMQ beside it for what cannot go that way.
+"""Requests over shared memory, with ZeroMQ for those that cannot use it.
 
-The plugin loses a reply that does not fit its slot, after it has executed the request, and a reply carries no number.
-So what goes which way is decided before sending, a request is sent once, and after a request that got no reply nothing
-is sent over shared memory until an exchange without side effects has shown that no old reply is still to come.
+The plugin executes a request and then drops its reply if that does not fit its slot, and replies carry no number. So
+the transport is chosen before sending and a request is sent only once. After a request without a reply, shared memory
+stays unused until an exchange without side effects has shown that no old reply is outstanding.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ __all__ = ["ShmTransport"]
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
-# A reply may be so many times larger than the largest one of its kind seen before.
+# A reply may be this many times larger than the largest one of its kind seen before.
 _GROWTH = 8
 
 _NOT_READY_S = 0.5
 _RETRY_S = 1.0
 _SETTLE_S = 0.5
 _IDLE_S = 0.5
-# Whatever is to tell of a reply, look for it so often, too: a ring that is lost must not cost more.
+# Poll at this interval in any case, so that a lost ring delays a reply no longer.
 _GLANCE_S = 0.05
 
-# Looking from the loop before the thread is asked to; longer than the last waits took is of no use.
+# Time to poll on the loop before the thread takes over.
 _SPIN_S = 400e-6
 _LONGEST_SPIN_S = 2e-3
 
 
 class _Pending:
-    """The request under way."""
+    """The request in progress."""
 
     __slots__ = ("at", "deadline", "future", "op", "watch")
 
@@ -69,11 +69,11 @@ class _Pending:
 
 
 class ShmTransport:
-    """Transport over shared memory for what fits, and over another one for the rest.
+    """Transport over shared memory for requests that fit, and over another transport for the rest.
 
     Args:
-        inner: The other one; it also tells whether the server lives.
-        memory: Where the server's regions are.
+        inner: The other transport, which also detects whether the server is alive.
+        memory: Location of the server's regions.
     """
 
     def __init__(self, inner: RequestTransport, memory: SharedMemoryRegions) -> None:
@@ -88,8 +88,8 @@ class ShmTransport:
         self._retry_at = 0.0
         self._used_at = 0.0
         self._pending: _Pending | None = None
-        # One of each for all requests: most are answered long before, and making and cancelling a timer takes a tenth
-        # of what a step takes.
+        # One of each for all requests: most replies arrive long before, and creating and cancelling a timer takes a
+        # tenth of the time of a step.
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._glances: asyncio.TimerHandle | None = None
@@ -110,16 +110,16 @@ class ShmTransport:
 
     @property
     def connected(self) -> bool:
-        """Whether a server is on the line."""
+        """Whether a server is connected."""
         return self._inner.connected
 
     async def follow(self, hello: HelloOk) -> None:
-        """Open the regions that a handshake speaks of.
+        """Open the regions that a handshake names.
 
-        Another client may have them already: then everything goes over ZMQ until it is gone.
+        If another client uses them, all requests go over ZMQ until it has gone.
 
         Raises:
-            URLabConnectionError: They are not where they should be, or they are none.
+            URLabConnectionError: The regions do not exist or are not valid.
         """
         moved = self._memory.follow(hello)
         self._largest_state = 0
@@ -144,7 +144,7 @@ class ShmTransport:
                 self._put_off(error)
                 raise URLabConnectionError(
                     f"discover: transport='shm', but the server's shared memory cannot be used: {_reason(error)}",
-                    hint="Is the server on this machine, and this its directory? Else use transport='zmq'.",
+                    hint="Check that the server is on this machine and uses this directory, or use transport='zmq'.",
                 ) from error
         channel = self._channel
         if channel is None:
@@ -157,7 +157,7 @@ class ShmTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
+        """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
         way = way_of(op)
         pictures = way.pictures and b"include_cameras" in frame
         detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
@@ -182,14 +182,14 @@ class ShmTransport:
                     return answer
         self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if way.state and not pictures and _succeeded(answer, op):  # a refusal tells nothing about the state's size
+        if way.state and not pictures and _succeeded(answer, op):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
     async def aclose(self) -> None:
         """See `RequestTransport.aclose`."""
         self._closed = True
-        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Make a new client.")
+        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
         self._fail(lambda _: closed)
         self._drop("closed")
         for timer in (self._timer, self._glances):
@@ -201,7 +201,7 @@ class ShmTransport:
     # Which way
 
     def _usable_channel(self, now: float) -> RegionChannel | None:
-        """Return the channel if it may be used right now."""
+        """Return the channel if it can be used now."""
         if self._closed or self._pending is not None:
             self._obstacle = "busy"
             return None
@@ -226,7 +226,7 @@ class ShmTransport:
         return channel
 
     def _settling(self, channel: RegionChannel) -> bool:
-        """Whether `channel` has yet to become clean, unless it is gone or another task's request is in it by now."""
+        """Return whether `channel` is still in use, free of other tasks' requests, and not yet clean."""
         return self._channel is channel and self._pending is None and not self._is_clean(channel)
 
     def _is_clean(self, channel: RegionChannel) -> bool:
@@ -240,13 +240,13 @@ class ShmTransport:
         return not channel.dirty
 
     def _open(self) -> RegionChannel:
-        """Open the regions. Raises as `MappedRegion` does."""
+        """Open the regions. Raises the same errors as `MappedRegion`."""
         paths: list[Path] = []
         for file in (REQUEST_FILE, REPLY_FILE):
             path = self._memory.find(file)
             if path is None:
-                looked = ", ".join(map(str, self._memory.candidates(file)))
-                raise FileNotFoundError(f"there is no {looked}")
+                paths_tried = ", ".join(map(str, self._memory.candidates(file)))
+                raise FileNotFoundError(f"there is no {paths_tried}")
             paths.append(path)
         self._channel = RegionChannel(paths[0], paths[1], self._memory.events(paths[0]))
         self._memory.connect_bell()
@@ -262,11 +262,11 @@ class ShmTransport:
         log.info("shared memory: %s: %s", self._obstacle, _reason(error))
 
     def _refusal(self, answer: bytes, op: Op) -> str:
-        """Return why an answer means that the request has to go over ZMQ; empty if it is the answer."""
+        """Return why a reply requires sending the request over ZMQ; empty if the reply is final."""
         if answer.startswith(opening_of(op), 1):
             return ""
         code = envelope_of(answer).code
-        if code == "wrong_transport":  # says before anything else that it was not executed
+        if code == "wrong_transport":  # the server did not execute the request
             self._refused[op.name] = "refused by the server"
         elif code == "reply_too_large":
             self._refused[op.name] = "reply too large"
@@ -281,7 +281,7 @@ class ShmTransport:
     ) -> bytes:
         op, deadline = pending.op, pending.deadline
         self._pending = pending
-        # Until the reply is here, whatever ends the wait leaves one that is still to come.
+        # If the wait ends without the reply, that reply is still outstanding.
         channel.dirty = True
         try:
             channel.publish(frame)
@@ -316,7 +316,7 @@ class ShmTransport:
             bell.ring(doorbell.REQUEST)
 
     def _look_at(self, channel: RegionChannel) -> None:
-        # Between two looks another task may have had the loop for as long as a server takes to start again.
+        # Between two polls another task may have blocked the loop for as long as a server takes to restart.
         if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
             self._look()
 
@@ -331,7 +331,7 @@ class ShmTransport:
         self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
 
     def _watch(self) -> None:
-        """Let the thread look for the reply from now on."""
+        """Let the thread poll for the reply."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.future.done() or pending.watch is not None or channel is None:
             return
@@ -356,21 +356,21 @@ class ShmTransport:
             self._take()
 
     def _take(self) -> None:
-        """Take up the reply if it is there; whoever waits for it goes on here. A callback of the loop."""
+        """Deliver the reply if it has arrived and resume its task immediately. A callback of the loop."""
         pending = self._pending
         answer = self._found()
         if answer is not None and pending is not None:
             deliver(pending.future, answer)
 
     def _look(self) -> None:
-        """Take up the reply if it is there; whoever waits for it goes on in the loop's next turn."""
+        """Deliver the reply if it has arrived; its task resumes in the loop's next iteration."""
         pending = self._pending
         answer = self._found()
         if answer is not None and pending is not None:
             pending.future.set_result(answer)
 
     def _found(self) -> bytes | None:
-        """Return the reply to the request under way, if that waits for one still and it is there."""
+        """Return the reply to the request in progress if it has arrived and the request still waits."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.future.done() or channel is None:
             return None
@@ -387,9 +387,9 @@ class ShmTransport:
             return None
         if found is None:
             sequence = channel.replies.region.sequence
-            if sequence == 0:  # begun anew: it counts from one again
+            if sequence == 0:  # reinitialised: it counts from one again
                 channel.seen = 0
-            if sequence != channel.seen:  # it changed while it was read, again and again
+            if sequence != channel.seen:  # it kept changing while it was read
                 asyncio.get_running_loop().call_soon(self._look)
             elif pending.watch is not None:
                 pending.watch.resume()
@@ -423,7 +423,7 @@ class ShmTransport:
         pending = self._pending
         if pending is None or pending.deadline is None:
             return
-        if pending.deadline > self._due:  # and not the time: the loop may be early by its resolution
+        if pending.deadline > self._due:  # not the current time: the loop may be early by its resolution
             self._expire_at(loop, pending.deadline)
             return
         self._look()
@@ -465,10 +465,8 @@ class ShmTransport:
     def _lost(self, op: Op) -> URLabError:
         text = f"{op.name}: the server at {self.endpoint} was lost after the request was sent."
         if op.effect is Effect.READ:
-            return ConnectionLost(text, op=op.name, hint="The op changes nothing: it can be sent again.")
-        return OutcomeUnknown(
-            text, op=op.name, hint="Whether it was executed is unknown: call discover() and look at the state."
-        )
+            return ConnectionLost(text, op=op.name, hint="The op changes nothing, so it can be sent again.")
+        return OutcomeUnknown(text, op=op.name, hint="It may have been executed: call discover() and check the state.")
 
 
 def _succeeded(answer: bytes, op: Op) -> bool:

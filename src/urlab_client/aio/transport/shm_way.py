@@ -1,4 +1,4 @@
-"""Which ops can go over shared memory, as far as the op alone tells."""
+"""Which ops can use shared memory, judging by the op alone."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from urlab_client.protocol.messages.session import StateReply
 
 __all__ = ["Way", "way_of"]
 
-# Replies that grow with what happens in the scene, whatever size they had before.
+# Ops whose replies grow with the scene, regardless of their earlier size.
 _UNBOUNDED: Final = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
-# Pieces are larger than slots, and one that was executed without an answer may not be sent again.
+# Chunks are larger than slots, and a chunk that was executed without a reply must not be sent again.
 _UPLOADS: Final = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 
 
 class Way(NamedTuple):
-    """What an op alone says about the way of its requests.
+    """Properties of an op that determine the transport of its requests.
 
     Attributes:
-        detour: Why they cannot go over shared memory, whatever its state; empty if they can.
-        pictures: Whether they may ask for pictures, which do not fit.
-        state: Whether replies hold the state, which is of about one size.
+        detour: Why its requests can never use shared memory; empty if they can.
+        pictures: Whether its requests may ask for pictures, which do not fit.
+        state: Whether its replies contain the state, whose size is nearly constant.
     """
 
     detour: str
@@ -32,12 +32,12 @@ class Way(NamedTuple):
 
 @cache
 def way_of(op: Op) -> Way:
-    """Return what an op says about the way of its requests."""
+    """Return the properties of an op that determine its transport."""
     detour = ""
     if op.needs is Needs.EDITOR:
         detour = "editor op"
     elif op.ns == "scene":
-        detour = "upload"  # its chunks and its reply outgrow a slot
+        detour = "upload"  # its chunks and its reply exceed a slot
     elif op.name in _UNBOUNDED:
         detour = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
     elif op.name in _UPLOADS:

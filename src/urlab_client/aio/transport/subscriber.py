@@ -1,12 +1,12 @@
 """Receiving from the server's PUB sockets on the caller's asyncio loop.
 
-One SUB socket per publisher serves all subscriptions of a client. A second reader of the state stream thus costs no
-second copy on the wire and no second wake-up of the loop (at 1 kHz about 40 µs of processor time per snapshot, against
-100 µs with a socket of its own), and messages of different topics keep the order in which the server sent them, in
-which a snapshot closes the rows of its tick.
+One SUB socket per publisher serves all subscriptions of a client. So a second reader of the state stream needs neither
+a second copy on the wire nor a second wake-up of the loop: at 1 kHz a snapshot takes about 40 µs of processor time,
+compared to 100 µs with a separate socket. Messages of different topics also keep the order in which the server sent
+them, in which a snapshot follows the rows of its tick.
 
-The socket is read whenever the loop runs, wanted or not: what waits is bounded by what the handlers keep, never by how
-fast they are read, and a subscriber that is not read cannot fill the server's queues.
+The loop reads the socket whenever it runs, even if no reader is waiting. The handlers' buffers bound the backlog, not
+the speed of their readers, and a slow reader cannot fill the server's queues.
 """
 
 from __future__ import annotations
@@ -33,61 +33,61 @@ __all__ = ["ConnectionStatus", "MessageGone", "MessageHandler", "Subscription", 
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
-# Set before connecting. These queues fill only while the loop is blocked: a backlog of small messages is worth
-# keeping for streams that want all, and is skimmed in milliseconds by those that want the newest. Pictures are large.
+# Set before connecting. These queues fill only while the loop is blocked. Streams that need all messages use a backlog
+# of small ones, and streams that need the newest skip it in milliseconds. Pictures are large.
 _QUEUED_MESSAGES = 1000
 _QUEUED_PICTURES = 4
 _MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 
-# Other tasks get their turn after so many messages or bytes.
+# Other tasks run after this many messages or bytes.
 _BATCH_MESSAGES = 64
 _BATCH_BYTES = 8 * 1024 * 1024
 
-# A context that is collected as garbage before its sockets waits for them without end. So contexts are not garbage
-# before they are closed, whoever forgets to close a client.
+# A context that is garbage-collected before its sockets waits for them forever. This set keeps contexts alive until
+# they are closed, even if a client is never closed.
 _contexts: set[zmq.Context[zmq.Socket[bytes]]] = set()
 
-# Topics differ for ever only where a server is out of its mind; then forget them.
+# Only a malfunctioning server produces an endless number of topics; then clear the cache.
 _REMEMBERED_TOPICS = 4096
 
 
 class MessageGone(ProtocolError):
-    """A message was overwritten or removed before anybody looked at it. Nothing is wrong with either side."""
+    """A message was overwritten or removed before it was read. This is not a fault of either side."""
 
 
 class MessageHandler(ABC):
-    """Takes what a subscription brings. Called on the event loop; must not block and must not raise."""
+    """Receives the messages of a subscription. Called on the event loop; must not block or raise."""
 
     @abstractmethod
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take one message."""
+        """Handle one message."""
 
     @abstractmethod
     def on_malformed(self, problem: str) -> None:
-        """Take note of a malformed message."""
+        """Handle a malformed message."""
 
     @abstractmethod
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Take note that nothing will come any more, and why."""
+        """Handle the end of the subscription; `error` creates the reason."""
 
     def on_drained(self) -> None:  # noqa: B027 - a handler that acts on each message needs nothing here
-        """Act on the messages that just came, after the last of a batch."""
+        """Process the received messages after the last of a batch."""
 
     def on_connection(self, connected: bool) -> None:  # noqa: B027 - most handlers need not know
-        """Take note that the connection was made or lost."""
+        """Handle that the connection was opened or lost."""
 
     def on_gap(self, why: str) -> None:  # noqa: B027 - a handler that keeps only the newest misses nothing
-        """Take note that messages are missing before the next one."""
+        """Handle that messages are missing before the next one."""
 
 
 class Subscription(Struct, frozen=True):
-    """What to receive, and from where.
+    """The messages to receive and their publisher.
 
     Attributes:
         endpoint: ZMQ endpoint of the publisher.
-        filters: ZMQ's filters, which match by prefix.
-        accepts: Decides from the whole topic, once per topic.
-        pictures: Whether messages are large: then they are not copied, and few are queued.
+        filters: ZMQ's prefix filters.
+        accepts: Callback that accepts or rejects a whole topic, called once per topic.
+        pictures: Whether messages are large, so that they are not copied and only a few are queued.
     """
 
     endpoint: str
@@ -97,13 +97,13 @@ class Subscription(Struct, frozen=True):
 
 
 class ConnectionStatus(Struct, frozen=True):
-    """How the connection to a publisher stands.
+    """Status of the connection to a publisher.
 
     Attributes:
-        endpoint: Where the publisher is.
-        connected: Whether it is on the line.
-        connects: Connections made so far.
-        obstacle: What stood in the way last.
+        endpoint: Address of the publisher.
+        connected: Whether the publisher is connected.
+        connects: Number of connections opened so far.
+        obstacle: Most recent reason for a missing connection.
     """
 
     endpoint: str
@@ -139,8 +139,8 @@ class _Subscriber:
         socket = self._socket = context.socket(zmq.SUB)
         connection_status.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
-        # A full queue holds heartbeats up until the connection is given up. Without this, libzmq 4.3.5 (issue 3937)
-        # ends the whole process when the queue is read after that: the next connection would have the old one's pipe.
+        # A full queue delays heartbeats until the connection is closed. Without this option, libzmq 4.3.5 (issue 3937)
+        # aborts the process when the queue is read after that, because the next connection would reuse the old pipe.
         socket.immediate = True
         socket.maxmsgsize = _MAX_MESSAGE_BYTES
         if keys is not None:
@@ -151,21 +151,21 @@ class _Subscriber:
             socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
-            raise ValueError(f"{endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
+            raise ValueError(f"{endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
         self._watched = watch_socket(loop, self._monitor, self._on_event), watch_socket(loop, socket, self._on_readable)
         loop.call_soon(self._on_event)
 
     @property
     def idle(self) -> bool:
-        """Whether nobody listens."""
+        """Whether there are no handlers."""
         return not self._handlers
 
     def attach(self, handler: MessageHandler, subscription: Subscription) -> None:
         for prefix in subscription.filters:
-            self._socket.subscribe(prefix)  # counted by the socket: equal filters of several handlers are kept apart
+            self._socket.subscribe(prefix)  # the socket counts equal filters of several handlers
         self._handlers[handler] = subscription
         self._routes.clear()
-        # Any use of the socket may consume its descriptor's edge.
+        # Any operation on the socket may consume the edge of its descriptor.
         self._loop.call_soon(self._on_readable)
 
     def detach(self, handler: MessageHandler) -> None:
@@ -193,19 +193,19 @@ class _Subscriber:
                     break
                 topic = socket.recv(zmq.NOBLOCK)
                 if messages == 0 or not self.connected:
-                    # What tells of a new connection comes before its messages, but on another socket.
+                    # The event of a new connection precedes its messages, but arrives on another socket.
                     self._on_event()
                 messages += 1
                 size += self._take(topic, touched)
         finally:
-            # The descriptor is edge-triggered: leaving messages behind without coming back would be for good.
+            # The descriptor is edge-triggered, so remaining messages would never be read without this call.
             if not drained and not self._closed:
                 self._loop.call_soon(self._on_readable)
         for handler in touched:
             handler.on_drained()
 
     def _take(self, topic: bytes, touched: dict[MessageHandler, None]) -> int:
-        """Receive the rest of a message, all of which is there, and hand it to whom it concerns; return its size."""
+        """Receive the rest of a message, which has fully arrived, and deliver it to its handlers. Return its size."""
         socket = self._socket
         payload: BytesLike | None = None
         extra = 0
@@ -268,7 +268,7 @@ class _Subscriber:
                 f"{obstacle}. {SERVER_KEY_HINT}" if event in connection_status.FAILED_HANDSHAKES else obstacle
             )
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
-            # ZeroMQ does not try again by itself, but the server may learn the key.
+            # ZeroMQ does not retry on its own, but the server may learn the key.
             self._loop.call_later(connection_status.RECONNECT_MAX_MS / 1000, self._reconnect)
 
     def _reconnect(self) -> None:
@@ -286,10 +286,10 @@ class _Subscriber:
 
 
 class Subscriptions:
-    """All that one client receives. Sockets are made when first needed and closed when nobody listens any more.
+    """All subscriptions of one client. Sockets are opened on first use and closed when no handler remains.
 
     Attributes:
-        closed: Whether it was closed.
+        closed: Whether `close` was called.
     """
 
     def __init__(self, keys: ClientKeys | None = None) -> None:
@@ -301,11 +301,11 @@ class Subscriptions:
         self.closed: bool = False
 
     def attach(self, handler: MessageHandler, wanted: Callable[[], Subscription]) -> None:
-        """Let `handler` have what `wanted` describes, which `refresh` asks again.
+        """Deliver the subscription that `wanted` returns to `handler`; `refresh` calls `wanted` again.
 
         Raises:
             ClientClosed: The client was closed.
-            ValueError: The endpoint is not one.
+            ValueError: The endpoint is not a valid address.
         """
         if self.closed:
             raise client_closed()
@@ -337,7 +337,7 @@ class Subscriptions:
                 handler.on_gap(f"moved from {before.endpoint} to {after.endpoint}")
 
     def line(self, handler: MessageHandler) -> ConnectionStatus | None:
-        """Return how the connection stands over which `handler` receives; None if it does not receive."""
+        """Return the status of the connection that `handler` receives from, or None if it does not receive."""
         found = self._attached.get(handler)
         if found is None:
             return None
@@ -389,9 +389,9 @@ def _key(subscription: Subscription) -> tuple[str, bool]:
 
 
 def client_closed() -> ClientClosed:
-    """Return what tells a reader that its client is gone."""
-    return ClientClosed("The client was closed.", hint="Make a new client.")
+    """Return the error for readers of a closed client."""
+    return ClientClosed("The client was closed.", hint="Create a new client.")
 
 
 def _unusable(problem: str) -> Callable[[], URLabError]:
-    return lambda: URLabError(f"The publisher moved to where it cannot be followed: {problem}")
+    return lambda: URLabError(f"The publisher moved to an unusable address: {problem}")

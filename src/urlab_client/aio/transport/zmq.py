@@ -1,8 +1,8 @@
 """Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop.
 
-The server's REP socket echoes the envelope, so each request carries an id: a reply that comes after its request gave
-up is recognised and dropped, and the next request works. Replies complete futures from the reader callback; nothing
-ever cancels a receive, which could lose a frame.
+The server's REP socket echoes the envelope, so each request carries an id. A reply that arrives after its request was
+abandoned is recognised and dropped, and the next request works. The reader callback completes the futures of replies; a
+receive is never cancelled, because that could lose a frame.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ _RCVMORE = int(zmq.RCVMORE)
 _POLLIN = int(zmq.POLLIN)
 
 _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
-# Waking up costs a tenth or less of what takes longer.
+# Waking up adds at most a tenth to replies that take longer.
 _SPIN_S = 150e-6
 _LONGEST_SPIN_S = 500e-6
 
 _Send = Callable[[bytes, int], None]
 _Get = Callable[[int], int]
 
-_CERTAIN = 3  # a server that is just ending breaks a handshake off once; one with another key always does
+_CERTAIN = 3  # a server that is shutting down aborts one handshake; a server with another key aborts all
 
 
 class _Sent(Struct):
@@ -79,11 +79,11 @@ class _Sent(Struct):
 
 
 class ZmqTransport:
-    """Transport over one DEALER socket; connects when first used and reconnects by itself.
+    """Transport over one DEALER socket. It connects on first use and reconnects automatically.
 
     Attributes:
-        lost_at: Loop time at which the connection broke last.
-        refused: Whether an attempt to connect has been refused since then.
+        lost_at: Loop time at which the connection was last lost.
+        refused: Whether a connection attempt has been refused since then.
     """
 
     stats: TransportStats
@@ -121,7 +121,7 @@ class ZmqTransport:
 
     @property
     def state_port(self) -> int | None:
-        """See `Transport.state_port`."""
+        """See `RequestTransport.state_port`."""
         return None
 
     @property
@@ -131,7 +131,7 @@ class ZmqTransport:
 
     @property
     def connected(self) -> bool:
-        """Whether a server is on the line."""
+        """Whether a server is connected."""
         return self._connected
 
     async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
@@ -154,7 +154,7 @@ class ZmqTransport:
                 send(b"", _MORE)
                 send(frame, _NOBLOCK)
             except zmq.Again:
-                # Either the line went down, and the event that says so has not been read yet, or the queue is full.
+                # The connection was lost and its event has not been read yet, or the queue is full.
                 self._on_event()
                 if self._connected:
                     raise self._clogged(op) from None
@@ -171,7 +171,7 @@ class ZmqTransport:
             if awake:
                 await self._busy_poll.look(op.name, reply, self._look)
             elif get(_EVENTS) & _POLLIN:
-                # Sending may have consumed the descriptor's edge.
+                # Sending may have consumed the edge of the descriptor.
                 loop.call_soon(self._on_readable)
             if not reply.done() and self._replies is not None:
                 self._replies.expect()
@@ -186,22 +186,22 @@ class ZmqTransport:
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
-        """See `Transport.follow`: there is no other way."""
+        """See `RequestTransport.follow`: there is no alternative transport."""
 
     def fail_waiting(self, error: URLabError) -> None:
-        """Fail what waits, unsent, for a connection."""
+        """Fail the unsent requests that wait for a connection."""
         for waiter in self._waiting:
             if not waiter.done():
                 waiter.set_exception(error)
 
     async def aclose(self) -> None:
-        """See `Transport.aclose`."""
+        """See `RequestTransport.aclose`."""
         if self._closed:
             return
         self._closed = True
         self._send = self._get = None
         self._connected = False
-        closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Make a new client.")
+        closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Create a new client.")
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
         if self._loop is None or self._socket is None or self._monitor is None or self._context is None:
@@ -218,16 +218,16 @@ class ZmqTransport:
 
     def _open(self) -> tuple[asyncio.AbstractEventLoop, _Send, _Get]:
         if self._closed:
-            raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
+            raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Create a new client.")
         loop = running_loop(self._loop)
         if self._send is not None and self._get is not None:
             return loop, self._send, self._get
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         connection_status.configure(socket)
-        # A request must not wait in a queue for a server that is gone: it would reach the next one.
+        # A request must not queue for a server that is gone, because it would reach the next one.
         socket.immediate = True
-        socket.maxmsgsize = MAX_REPLY_BYTES  # refused when it is announced, before it fills the memory
+        socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
         if self._keys is not None:
             self._keys.protect(socket)
         monitor = socket.get_monitor_socket(connection_status.WATCHED)
@@ -239,19 +239,19 @@ class ZmqTransport:
             monitor.close(linger=0)
             socket.close(linger=0)
             shared_context.give_back(context)
-            raise ValueError(f"{self._endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
+            raise ValueError(f"{self._endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
         self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
         self._events = watch_socket(loop, monitor, self._on_event)
         self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
-        send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the wrapper's other arguments
+        send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
         get = self._get = cast("_Get", socket.get)
         return loop, send, get
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
-        """Return what becomes of a request that its caller no longer waits for."""
+        """Return a future for the reply to a request that its caller has abandoned."""
         if reply.done() and not reply.cancelled() and reply.exception() is None:
-            return reply  # it came in the turn of the loop in which the caller was cancelled
+            return reply  # it arrived in the loop iteration that cancelled the caller
         coming: asyncio.Future[bytes] = reply.get_loop().create_future()
         if self._connected:
             self._late[key] = coming
@@ -260,7 +260,7 @@ class ZmqTransport:
         return coming
 
     def _awaited(self) -> bool:
-        """Whether a reply is to come, perhaps to a request that has given up."""
+        """Return whether a reply is expected, possibly to an abandoned request."""
         pending = self._late or any(not entry.reply.done() for entry in self._sent.values())
         return self._silent_since is not None or bool(pending)
 
@@ -269,7 +269,7 @@ class ZmqTransport:
         started = loop.time()
         self._waiting.add(waiter)
         if self._given_up and self._socket is not None:
-            # Told why, ZeroMQ does not try again by itself; by now the server may have learnt the key.
+            # ZeroMQ does not retry after this rejection, but the server may have learnt the key by now.
             self._given_up = False
             connection_status.reconnect(self._socket, self._endpoint)
 
@@ -294,7 +294,7 @@ class ZmqTransport:
             self._waiting.discard(waiter)
 
     def _expire_at(self, loop: asyncio.AbstractEventLoop, deadline: float) -> None:
-        """See to it that what is due then expires. One timer for all: most requests are answered long before."""
+        """Schedule the expiry of requests. One timer serves all, because most replies arrive long before."""
         if self._timer is not None:
             if self._due <= deadline:
                 return
@@ -303,8 +303,8 @@ class ZmqTransport:
         self._timer = loop.call_at(deadline, self._expire, loop)
 
     def _expire(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._take()  # what came while the loop was busy counts; uvloop looks at its timers first
-        due = self._due  # and not the time: the loop may be early by its resolution
+        self._take()  # accept replies that arrived while the loop was busy; uvloop runs its timers first
+        due = self._due  # not the current time: the loop may be early by its resolution
         self._timer = None
         for entry in self._sent.values():
             if entry.deadline is not None and not entry.reply.done():
@@ -327,24 +327,24 @@ class ZmqTransport:
             self._tell(ServerSilent(endpoint=self._endpoint, op=entry.op.name, waited_s=seconds))
 
     def _look(self) -> None:
-        """Take what is there, where nothing has told that anything is."""
+        """Poll the socket for a reply."""
         if self._get is not None and self._get(_EVENTS) & _POLLIN:
             self._take()
 
     def _on_readable(self) -> None:
-        """Take what came; whoever waits for it goes on here. The loop's callback."""
+        """Receive replies and resume the last waiting task immediately. A callback of the loop."""
         answered = self._receive()
         if answered is not None:
             deliver(*answered)
 
     def _take(self) -> None:
-        """Take what came; whoever waits for it goes on in the loop's next turn."""
+        """Receive replies; the waiting tasks resume in the loop's next iteration."""
         answered = self._receive()
         if answered is not None:
             answered[0].set_result(answered[1])
 
     def _receive(self) -> tuple[asyncio.Future[bytes], bytes] | None:
-        """Read until nothing is left that anybody waits for; return the last one who waits, and the reply."""
+        """Read until no request waits. Return the future and reply of the last one, which is not completed yet."""
         socket, get = self._socket, self._get
         if socket is None or get is None:  # it has been closed
             return None
@@ -353,7 +353,7 @@ class ZmqTransport:
             try:
                 key = receive(_NOBLOCK)
                 delimiter = receive(_NOBLOCK)
-                last = receive(_NOBLOCK, copy=False)  # which says by itself whether it is the last
+                last = receive(_NOBLOCK, copy=False)  # the frame itself shows whether it is the last
             except zmq.Again:
                 return None
             if delimiter or last.more:
@@ -370,8 +370,8 @@ class ZmqTransport:
                 continue
             self.stats.received += 1
             if len(self._sent) == 1 and not self._late:
-                # What may be left is a reply that nobody waits for. Before the next wait the socket is asked what it
-                # has: its descriptor does not tell of what has been there for long.
+                # Only replies that no request waits for may remain. The socket is polled before the next wait, because
+                # its descriptor does not signal messages that arrived earlier.
                 return entry.reply, last.bytes
             entry.reply.set_result(last.bytes)
 
@@ -384,7 +384,7 @@ class ZmqTransport:
 
     def _drop_stray(self) -> None:
         self.stats.late += 1
-        log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
+        log.debug("%s: dropped a reply that no request waits for", self._endpoint)
 
     def _on_event(self) -> None:
         while self._monitor is not None and not self._closed:
@@ -412,21 +412,21 @@ class ZmqTransport:
             self._obstacle = obstacle
             if event is not zmq.Event.CONNECTED and obstacle != connection_status.UNANSWERED:
                 self.refused = True
-            if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
+            if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # means a timeout
                 self._rejections += 1
                 self._note_rejection(event, value)
 
     def _note_rejection(self, event: zmq.Event, value: int) -> None:
-        """Tell those who wait, once it is certain that trying again would not help."""
+        """Fail the waiting requests once it is certain that retrying would not help."""
         if event is zmq.Event.HANDSHAKE_FAILED_AUTH:
             why, hint = "the server does not know this client's key", "Give it the public key (--allow-client)."
         elif value == _MECHANISM_MISMATCH and self._keys is None:
-            why, hint = "the server demands CURVE keys", "Pass server_key=…, and client_key=… if it knows its clients."
+            why, hint = "the server requires CURVE keys", "Pass server_key=…, and client_key=… if it knows its clients."
         elif value == _MECHANISM_MISMATCH:
-            why, hint = "the server uses no CURVE keys", "Leave out server_key, or start the server with --server-key."
+            why, hint = "the server does not use CURVE keys", "Omit server_key, or start the server with --server-key."
         elif self._keys is not None and self._rejections >= _CERTAIN:
-            # A server without keys that is first to notice may cut the line before it can be told from one with others.
-            why = "the server does not have the key it should have, or uses no CURVE keys"
+            # A server without keys may close the connection before it can be distinguished from one with another key.
+            why = "the server does not have the expected key, or does not use CURVE keys"
             hint = "Compare with: urlab keys show FILE."
         else:
             return
@@ -435,7 +435,7 @@ class ZmqTransport:
         self.fail_waiting(AuthenticationFailed(text, hint=hint))
 
     def _lose(self) -> None:
-        self._take()  # what arrived before the line broke still counts
+        self._take()  # replies that arrived before the loss still count
         if self._connected:
             log.info("lost %s; reconnecting", self._endpoint)
             if self._loop is not None:
@@ -444,9 +444,9 @@ class ZmqTransport:
             self._obstacle = "the connection was lost and not restored"
             self._tell(ServerLost(endpoint=self._endpoint))
         else:
-            self.refused = True  # a tunnel accepts connections to a server that is not there
+            self.refused = True  # a tunnel accepts connections even if the server is down
         if self._loop is not None:
-            # Also when a handshake broke off: ZeroMQ does not try again after garbage in it.
+            # Also after an aborted handshake: ZeroMQ does not retry after invalid data in it.
             self._retrying = False
             self._loop.call_later(
                 connection_status.REVIVE_S if self._connected else connection_status.RETRY_S, self._revive
@@ -475,23 +475,23 @@ class ZmqTransport:
         name = entry.op.name
         text = f"{name}: the connection to {self._endpoint} was lost after the request was sent."
         if entry.op.effect is Effect.READ:
-            return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
+            return ConnectionLost(text, op=name, hint="The op changes nothing, so it can be sent again.")
         return OutcomeUnknown(
-            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out and recovers."
+            text, op=name, hint="It may have been executed: client.resync() determines the outcome and recovers."
         )
 
     def _clogged(self, op: Op) -> ServerUnreachable:
         return ServerUnreachable(
-            f"{op.name}: {self._endpoint} has not taken the requests before this one. Nothing was sent.",
+            f"{op.name}: {self._endpoint} has not read the previous requests. Nothing was sent.",
             op=op.name,
             hint="The connection is up, but the server does not read from it: restart it.",
         )
 
     def _too_late(self, op: Op) -> URLabTimeoutError:
         return URLabTimeoutError(
-            f"{op.name}: the deadline passed before the request could go to {self._endpoint}. Nothing was sent.",
+            f"{op.name}: the deadline passed before the request could be sent to {self._endpoint}. Nothing was sent.",
             op=op.name,
-            hint="Something kept the event loop busy, or the timeout is too short.",
+            hint="Other work kept the event loop busy, or the timeout is too short.",
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:

@@ -62,7 +62,7 @@ class ContentRoot:
     """The folder that stands for `/Game`, and the folders `import_xml` may read from."""
 
     def __init__(self, saved_dir: Path, *, model_roots: Sequence[Path] = (), limits: Limits = _DEFAULT_LIMITS) -> None:
-        """Open a content root; what was imported into it earlier is there at once.
+        """Open a content root with its earlier imports.
 
         Args:
             saved_dir: Folder of the content root; made when something is first written.
@@ -104,7 +104,7 @@ class ContentRoot:
         Args:
             path: The file: absolute, or relative to a model root, or the name of a bundled model.
             force_reimport: Import again even if the stem is known. Actors get the new model at the next play.
-            trusted: The path comes from whoever runs the server, so it may lie anywhere.
+            trusted: The path comes from the server's operator, so it may lie anywhere.
 
         Returns:
             The blueprint, and whether it was imported now.
@@ -131,7 +131,7 @@ class ContentRoot:
     def _import_file(
         self, file: Path, source: str, roots: tuple[Path, ...] | None, *, force_reimport: bool
     ) -> tuple[Blueprint, bool]:
-        """Import a file that may read others below `roots`; with None anywhere, as who runs the server named it."""
+        """Import a file that may read others below `roots`, or anywhere if `roots` is None (operator's choice)."""
         trusted = roots is None
         stem = sanitized(file.stem)
         try:
@@ -311,7 +311,7 @@ class ContentRoot:
         write_atomic(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
         blueprint = from_record(folder, record)
         self._blueprints[record.stem] = blueprint
-        # A play session under way may still read the model before this one; older ones serve nobody.
+        # A play session under way may still read the model before this one; older ones are unused.
         keep = {folder, known.folder if known is not None else folder}
         for stale in home.iterdir():
             if stale.is_dir() and stale not in keep and not stale.name.startswith("."):

@@ -134,7 +134,7 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     Args:
         path: The level file.
         content: Where blueprints are registered.
-        trusted: The level was named by whoever runs the server: its models may lie anywhere, and where they differ
+        trusted: The server's operator named the level: its models may lie anywhere, and where they differ
             from what the content root has, the level's are taken.
 
     Returns:
@@ -310,7 +310,7 @@ def _check_parents(path: Path, actor: Actor, actors: Mapping[str, Actor]) -> Non
     above = actor
     while above.parent:
         if above.parent not in actors:
-            raise LevelError(f"{path}: actor '{above.name}' is attached to '{above.parent}', which is not there")
+            raise LevelError(f"{path}: actor '{above.name}' is attached to '{above.parent}', which is not in the level")
         above = actors[above.parent]
         if above.name in seen:
             raise LevelError(f"{path}: actor '{actor.name}' is attached to itself")

@@ -1,7 +1,7 @@
-"""Models that clients send in pieces: what is under way, and a cache of the files by their hashes.
+"""Models that clients send in chunks: uploads in progress, and a cache of the files by their hashes.
 
-A manifest names every file with its hash and size. Files that the cache holds are not sent again, by whichever client
-they came. Names are bare file names and hashes are checked, so nothing that a client says leads out of the folder.
+A manifest names every file with its hash and size. Files in the cache are not sent again, whichever
+client sent them. Names are bare file names and hashes are checked, so no request reaches outside the folder.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class _Upload:
         if kind == "xml":
             return _DOCUMENT_IN_REPLIES, self.document
         if name not in self.assets:
-            raise Refusal("bad_request", f"the manifest names no asset '{name}'")
+            raise Refusal("bad_request", f"the manifest has no asset '{name}'")
         return name, self.assets[name]
 
 

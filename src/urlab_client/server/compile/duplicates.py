@@ -1,4 +1,4 @@
-"""Floors and suns that every robot brings along, of which one is drawn."""
+"""Floors and suns that every robot's model contains, of which one is drawn."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def coinciding_planes(model: mujoco.MjModel) -> list[list[int]]:
 
 
 def draw_once(model: mujoco.MjModel, planes: list[list[int]]) -> None:
-    """Hide what every robot brings along and a picture bears only once. Physics is not touched.
+    """Hide duplicates of floors and suns. Physics is not affected.
 
-    Of coinciding floors one is drawn, as large as all together: drawn all, they flicker. Of directional lights that
-    shine alike one stays on.
+    One of several coinciding floors is drawn, as large as all together, because overlapping floors flicker. One of
+    several directional lights with the same direction and colour stays on.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -1,7 +1,7 @@
-"""From the actors of a level to one MuJoCo model, and the tables that say whose is what in it.
+"""From the actors of a level to one MuJoCo model, and the tables that map its elements to actors.
 
-For whoever starts play, and for the engine, which steps the result. Options, prefixes, keyframes and names follow the
-plugin: see `compile_scene`. Nothing here steps, paces or talks to clients.
+For the code that starts play, and for the engine, which steps the result. Options, prefixes, keyframes and names
+follow the plugin: see `compile_scene`. Nothing here steps, paces or talks to clients.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The blueprints of the editor: importing them, listing them, and deleting what nobody uses."""
+"""The blueprints of the editor: importing them, listing them, and deleting unused ones."""
 
 from __future__ import annotations
 

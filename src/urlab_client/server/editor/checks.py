@@ -1,4 +1,4 @@
-"""Checks of what a request says about an actor: names, numbers, rotations, poses."""
+"""Checks of the actor properties in a request: names, numbers, rotations, poses."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["float32", "pose", "refuse_infinite", "refuse_scale", "require", "rot
 
 
 def require(value: str, name: str) -> None:
-    """Refuse with `missing_field` when a name is empty."""
+    """Refuse with `missing_field` if a name is empty."""
     if not value:
         raise Refusal("missing_field", f"{name} must not be empty")
 
 
 def float32(value: float) -> float:
-    """Round to single precision, in which the plugin keeps it."""
+    """Round to single precision, as the plugin stores it."""
     return c_float(value).value
 
 
@@ -42,7 +42,7 @@ def refuse_scale(scale: Vec3, code: str) -> None:
 
 
 def rotation(quat: Quat | None, euler: Vec3 | None, code: str) -> Quat | None:
-    """Return the rotation a spawn op means, unnormalised; None if it names none."""
+    """Return the rotation in a spawn request, unnormalised; None if it contains none."""
     if quat is not None or euler is None:
         return quat
     refuse_infinite(euler, "rotation_euler", code)
@@ -50,7 +50,7 @@ def rotation(quat: Quat | None, euler: Vec3 | None, code: str) -> Quat | None:
 
 
 def pose(location: Vec3, rotation: Quat, code: str) -> tuple[Vec3, Quat]:
-    """Return position and unit quaternion; refuse with `code` what is not a pose."""
+    """Return position and unit quaternion; refuse an invalid pose with `code`."""
     refuse_infinite(location, "location", code)
     try:
         return location, normalized(rotation)

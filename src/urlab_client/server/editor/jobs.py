@@ -1,6 +1,6 @@
-"""Editor ops that are carried out beside the requests, one after the other, and asked for later.
+"""Editor ops that run in the background, one after the other.
 
-For the dispatcher, which starts them, and for `op_status`, which tells how far they are.
+For the dispatcher, which starts them, and for `op_status`, which returns their progress and results.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from urlab_client.server.refusal import Refusal
 __all__ = ["EditorJobs"]
 
 _MOST: Final = 4096
-"""Jobs that may wait or whose end nobody asked for."""
+"""Maximum number of jobs that wait or whose result was not fetched."""
 
 
 class EditorJobs:
-    """The jobs of one server. The end of a job is told once, to whoever asks first."""
+    """The jobs of one server. The result of a job is returned once, to the first caller."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -32,17 +32,17 @@ class EditorJobs:
         self._thread: threading.Thread | None = None
 
     def start(self, work: Callable[[], dict[str, Any]]) -> str:
-        """Have `work` done when those before it are, and return the job's id.
+        """Queue `work` behind earlier jobs and return the job's id.
 
         Args:
             work: Returns the reply or error as plain data; does not raise.
 
         Raises:
-            Refusal: `bad_request` when too many jobs are open.
+            Refusal: `bad_request` if too many jobs are open.
         """
         with self._lock:
             if len(self._results) >= _MOST:
-                raise Refusal("bad_request", f"{_MOST} jobs are open: ask for their ends with op_status")
+                raise Refusal("bad_request", f"{_MOST} jobs are open: fetch their results with op_status")
             self._count += 1
             job = f"job_{self._count}"
             self._results[job] = None
@@ -54,14 +54,16 @@ class EditorJobs:
         return job
 
     def take(self, job: str) -> dict[str, Any] | None:
-        """Return what a job came to and forget it, or None while it is not done.
+        """Return the result of a job and forget the job, or return None while it is not done.
 
         Raises:
-            Refusal: `unknown_job`.
+            Refusal: `unknown_job` if there is no such job, or its result was already returned.
         """
         with self._lock:
             if job not in self._results:
-                raise Refusal("unknown_job", f"'{job}' is not known: its end was told already, or it never was")
+                raise Refusal(
+                    "unknown_job", f"'{job}' is not known: its result was already returned, or it never existed"
+                )
             result = self._results[job]
             if result is not None:
                 del self._results[job]
@@ -75,7 +77,7 @@ class EditorJobs:
             yield
 
     def close(self) -> None:
-        """Let the thread end after the job under way."""
+        """Let the thread end after the queued jobs."""
         if self._thread is not None:
             self._waiting.put(None)
 

@@ -81,7 +81,7 @@ class Levels:
         return package
 
     def load_file(self, path: Path) -> str:
-        """Open a level file that whoever runs the server named, and return the level's path.
+        """Open a level file named by the server's operator, and return the level's path.
 
         It may lie anywhere; `save_level` then writes to that file. Models it names are imported from where it says.
 

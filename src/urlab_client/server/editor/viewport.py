@@ -1,6 +1,6 @@
 """The viewport's camera: where it is, what it follows and how it shows the world.
 
-For the `viewport` handlers and for whoever draws the view. It is state alone, so no OpenGL is needed to answer the ops.
+For the `viewport` handlers and for the renderer. It contains only state, so the ops need no OpenGL.
 Positions are metres in MuJoCo's frame; the camera's rotation is Unreal's rotator (roll, pitch, yaw), degrees, as in the
 editor.
 """
@@ -21,7 +21,7 @@ ASPECT: Final = 16.0 / 9.0
 """Width by height of the viewport."""
 
 DEFAULT_OFFSET: Final[Vec3] = (0.0, -2.0, 1.0)
-"""Where the camera stands beside a tracked actor, in the actor's frame, metres."""
+"""Position of the camera relative to a tracked actor, in the actor's frame, metres."""
 
 MAX_SMOOTHING: Final = 0.99
 

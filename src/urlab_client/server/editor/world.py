@@ -1,8 +1,8 @@
 """The simulated editor: an open level with its actors, and the ops that author it.
 
-For the op handlers, which map requests to these methods and their results to replies, and for whoever starts play.
-All methods run on the dispatcher's thread and answer with plain values; what cannot be done raises `Refusal` with the
-code of the op. Nothing here simulates: a play session works on the copy that `EditorWorld.freeze` returns.
+For the op handlers, which map requests to these methods and their results to replies, and for the code that starts
+play. All methods run on the dispatcher's thread and return plain values; on failure they raise `Refusal` with the code
+of the op. Nothing here simulates: a play session works on the copy that `EditorWorld.freeze` returns.
 
 Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's world frame, unless a name says `euler`.
 """
@@ -44,7 +44,7 @@ class Placed(NamedTuple):
     """An actor that was placed or moved.
 
     Attributes:
-        actor: The actor as it stands in the level now.
+        actor: The actor in its new state.
         rotation_quat: Rotation as understood from the request; not normalised.
         was_existing: True if an existing actor was moved.
     """
@@ -59,8 +59,8 @@ class EditorWorld:
 
     Attributes:
         content: The content root.
-        pie_running: Whether a play session runs; whoever starts and stops it sets this. While it is true, the ops that
-            look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
+        pie_running: Whether a play session runs; set by the code that starts and stops it. While it is true, the ops
+            that look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
         levels: The level files; which one is open.
         blueprints: What was imported.
         quick_convert: Static meshes that become bodies.
@@ -215,7 +215,7 @@ class EditorWorld:
         code = "spawn_failed"
         name = kind.casefold()
         if name not in ("directional", "point", "spot"):
-            raise Refusal(code, f"no kind of light is called '{kind}': use directional, point or spot")
+            raise Refusal(code, f"'{kind}' is not a kind of light: use directional, point or spot")
         checks.refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
         at, rotation = checks.pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
         self._make_room(1, None, code)

@@ -34,7 +34,7 @@ class Articulations:
 
         Args:
             scene: The scene.
-            controllers: Controller to attach by articulation key; `*` stands for all keys not listed.
+            controllers: Controller to attach by articulation key; `*` means all keys not listed.
             dialect: Decides what articulations are called.
         """
         self._model = scene.model

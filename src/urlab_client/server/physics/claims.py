@@ -1,4 +1,4 @@
-"""Which client owns which robot of a play session, where robots have owners."""
+"""The clients that own the robots of a play session, for dialects with control claims."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class _Claim:
 
 
 class ControlClaims:
-    """The owners of the robots, by key. Nobody owns any at first, and nobody may write then.
+    """The owners of the robots, by key. Robots are unclaimed at first, and unclaimed robots accept no writes.
 
     Args:
-        clock: Tells the time, seconds.
+        clock: Returns the time, seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -42,7 +42,7 @@ class ControlClaims:
         """Make `owner` the owner.
 
         Raises:
-            Refusal: `control_claimed` by another.
+            Refusal: `control_claimed` if another client owns the robot.
         """
         holder = self.owner(key)
         if holder not in (UNCLAIMED, owner) and not force:
@@ -50,33 +50,33 @@ class ControlClaims:
         self._claims[key] = _Claim(owner, ttl_s, self._clock())
 
     def release(self, key: str, owner: str) -> None:
-        """Make it nobody's.
+        """Release the claim on a robot.
 
         Raises:
-            Refusal: `not_control_owner`.
+            Refusal: `not_control_owner` if `owner` does not own it.
         """
         self.check(key, owner)
         del self._claims[key]
 
     def check(self, key: str, owner: str) -> None:
-        """Refuse a write by anybody but the owner; one by the owner keeps the claim alive.
+        """Check that a client may write to a robot, and renew its claim.
 
         Raises:
-            Refusal: `not_control_owner`.
+            Refusal: `not_control_owner` if `owner` does not own it.
         """
         holder = self.owner(key)
         if holder != owner:
-            whose = "nobody's: claim it first" if holder == UNCLAIMED else f"that of '{holder}'"
-            raise Refusal("not_control_owner", f"articulation '{key}' is {whose}", owner=holder)
+            status = "is unclaimed: claim it first" if holder == UNCLAIMED else f"belongs to '{holder}'"
+            raise Refusal("not_control_owner", f"articulation '{key}' {status}", owner=holder)
         self._claims[key].touched = self._clock()
 
     def check_all(self, keys: Iterable[str], owner: str) -> None:
-        """Refuse what concerns all robots while another client owns one of them.
+        """Check that no other client owns any of these robots.
 
         Raises:
-            Refusal: `not_control_owner`.
+            Refusal: `not_control_owner` if another client owns one.
         """
         for key in keys:
             holder = self.owner(key)
             if holder not in (UNCLAIMED, owner):
-                raise Refusal("not_control_owner", f"articulation '{key}' is that of '{holder}'", owner=holder)
+                raise Refusal("not_control_owner", f"articulation '{key}' belongs to '{holder}'", owner=holder)

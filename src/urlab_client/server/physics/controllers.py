@@ -61,7 +61,7 @@ class SetPoints:
 
     Attributes:
         network: Written by `step` and the control topic, shape (n controls,).
-        ui: Written by whoever embeds the server; no op writes them, shape (n controls,).
+        ui: Written by the application that embeds the server; no op writes them, shape (n controls,).
         source: Which of the two is applied.
     """
 
@@ -98,7 +98,7 @@ class SetPoints:
             self.stage_quietly(values)
 
     def stage_quietly(self, values: Sequence[float] | Float64s) -> None:
-        """`stage` for whoever has silenced overflows, for many articulations at once."""
+        """`stage` without silencing overflow warnings, for callers that have silenced them for many articulations."""
         if len(values) == len(self.network):
             self.network[:] = values
         else:
@@ -179,7 +179,7 @@ class ControllerConfig:
 
 
 class Actuated(Protocol):
-    """What a controller has to know of an articulation; `ArticulationIndex` says what the names mean."""
+    """The properties of an articulation that a controller needs; the names are those of `ArticulationIndex`."""
 
     @property
     def actuators(self) -> NDArray[Any]:

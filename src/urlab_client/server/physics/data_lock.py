@@ -1,4 +1,4 @@
-"""The lock around model and data, which tells a busy physics thread from one that MuJoCo does not give back."""
+"""The lock around model and data, which distinguishes a busy physics thread from one stuck inside MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = ["DataLock", "MujocoCall", "Overdue", "busy"]
 
 
 LEAST_PATIENCE_S: Final = 1.0
-"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
+"""Shortest duration of an overdue MuJoCo call; a slice of a long request may take a while on a busy machine."""
 
 
 @dataclass(frozen=True)
 class Overdue:
-    """A call of MuJoCo that takes longer than a step may.
+    """A MuJoCo call that has exceeded the step timeout.
 
     Attributes:
-        thread: The thread that is in it.
-        began_at: When it began, seconds of `time.perf_counter`.
-        seconds: How long ago that is.
+        thread: The calling thread.
+        began_at: Start of the call, seconds of `time.perf_counter`.
+        seconds: Time since then.
     """
 
     thread: threading.Thread
@@ -35,7 +35,7 @@ class Overdue:
 
 
 class MujocoCall:
-    """Which thread is inside MuJoCo, and since when. Entered under the engine's lock, looked at by everybody."""
+    """The MuJoCo call in progress, if any. Entered under the engine's lock, read without it."""
 
     __slots__ = ("_patience_s", "_under_way")
 
@@ -53,7 +53,7 @@ class MujocoCall:
 
     @property
     def overdue(self) -> Overdue | None:
-        """The call, when it takes longer than a step may; None when none is under way, or it is not late."""
+        """The call in progress if it has exceeded the step timeout, otherwise None."""
         under_way = self._under_way
         if under_way is None:
             return None
@@ -72,22 +72,22 @@ class DataLock:
     __slots__ = ("_call", "_timeout", "inner")
 
     def __init__(self, timeout: float, call: MujocoCall) -> None:
-        """Make a lock that nobody holds.
+        """Create an unlocked lock.
 
         Args:
-            timeout: Seconds after which entering raises `Refusal` with `not_ready`: a step request may legally keep
-                physics busy for hours, and no other request may hang for that.
-            call: Tells when there is nothing to wait for.
+            timeout: Seconds after which entering raises `Refusal` with `not_ready`. A step request may legally keep
+                physics busy for hours, and no other request may hang because of that.
+            call: The MuJoCo call in progress; waiting is pointless while it is overdue.
         """
         self.inner: threading.RLock = threading.RLock()
         self._timeout = timeout
         self._call = call
 
     def acquire(self) -> bool:
-        """Take the lock, if it becomes free in time.
+        """Acquire the lock; return False if it does not become free in time.
 
         Raises:
-            Refusal: `not_ready`, at once, while MuJoCo does not come back.
+            Refusal: `not_ready`, immediately, while a MuJoCo call is overdue.
         """
         if self.inner.acquire(blocking=False):
             return True
@@ -95,17 +95,17 @@ class DataLock:
         if overdue is not None:
             raise Refusal(
                 "not_ready",
-                f"MuJoCo has not returned for {overdue.seconds:.0f} s: play continues when it does, and "
+                f"MuJoCo has not returned for {overdue.seconds:.0f} s: play continues when it returns, and "
                 "stop_pie ends it",
             )
         return self.inner.acquire(timeout=self._timeout)
 
     @contextmanager
     def look(self) -> Generator[None]:
-        """Hold the lock, or go without it while MuJoCo does not come back: for what no step changes.
+        """Hold the lock, or proceed without it while a MuJoCo call is overdue. For data that no step changes.
 
         Raises:
-            Refusal: `not_ready` when physics is busy, but comes back.
+            Refusal: `not_ready` if physics is busy, but no call is overdue.
         """
         with ExitStack() as held:
             try:
@@ -126,5 +126,5 @@ class DataLock:
 
 
 def busy() -> Refusal:
-    """Return the refusal of whoever does not get the lock in time."""
+    """Return the refusal for a caller that does not get the lock in time."""
     return Refusal("not_ready", "physics is busy with a step request that is still running; try again later")

@@ -56,17 +56,17 @@ class Engine:
     Attributes:
         scene: The scene.
         lock: Guards the model, the data and this object. Re-entrant. `with engine.lock` raises a `not_ready` refusal
-            when physics keeps it for longer than the step timeout. Not to be held while calling `step` or `close`,
+            when physics holds it for longer than the step timeout. Do not hold it while calling `step` or `close`,
             which may have to wait for the physics thread.
-        dialect: What the server says in the way of one generation of the plugin.
-        articulations: The articulations with their set-points, by what they are called in requests and replies.
+        dialect: Wire dialect of one generation of the plugin.
+        articulations: The articulations with their set-points, by their names in requests and replies.
         snapshots: Numbers the states: one for each request that steps, and for each live iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
-        step_wanted: Tells after a direct request whether `on_tick` is to be called for it; always, by default.
-        seed: The last `reset` seed, or None; MuJoCo has no use for it.
-        variation: What varies from reset to reset, if anything does.
+        step_wanted: Returns, after a direct request, whether to call `on_tick` for it; always True by default.
+        seed: The last `reset` seed, or None; MuJoCo does not use it.
+        variation: Variations applied at each reset, or None.
     """
 
     def __init__(
@@ -81,17 +81,20 @@ class Engine:
         dialect: Dialect = ALPHA,
         randomise: Randomisation | None = None,
     ) -> None:
-        """Prepare a scene for stepping; `start` sets it going.
+        """Prepare a scene for stepping; `start` starts the physics thread.
 
         Args:
             scene: Compiled scene; the engine steps its `data` in place.
             pinned_mode: Start in this mode and refuse `set_mode`; None or `auto` starts live and leaves it free.
             paused: Whether physics starts paused.
-            controllers: Controller to attach by articulation key; `*` stands for all keys not listed.
-            step_timeout_s: Seconds a direct step may take before its caller is told `step_timeout`.
-            health: Told when the physics thread dies.
-            dialect: Decides what articulations are called, and what steps do besides.
-            randomise: What varies from reset to reset; a name that fits nothing is a ValueError.
+            controllers: Controller to attach by articulation key; `*` means all keys not listed.
+            step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
+            health: Receives a report if the physics thread dies.
+            dialect: Determines the names of articulations, and side effects of steps.
+            randomise: Variations to apply at each reset.
+
+        Raises:
+            ValueError: A name in `randomise` matches no element.
         """
         self.scene = scene
         self.dialect = dialect
@@ -226,17 +229,17 @@ class Engine:
             self._player = None
 
     def step(self, request: Step, observe: Callable[[StepMode], T]) -> T:
-        """Do what a `step` means in the active mode and return what `observe` makes of the state after it.
+        """Execute a `step` in the active mode and return the result of `observe` for the state after it.
 
-        Live and auto: stage commands and observe at once. Direct: stage, apply the wrenches and integrate
-        `n_steps` times without anything else coming between. Puppet: write the state and run `mj_forward`.
+        Live and auto: stage commands and observe immediately. Direct: stage, apply the wrenches and integrate
+        `n_steps` times without interruption. Puppet: write the state and run `mj_forward`.
 
         Args:
-            request: The request; its `observations` and `include_cameras` are the caller's affair.
-            observe: Called with the mode in the same critical section, on whatever thread did the work.
+            request: The request; the caller handles its `observations` and `include_cameras`.
+            observe: Callback invoked with the mode in the same critical section, on the thread that did the work.
 
         Raises:
-            Refusal: `step_timeout` when a direct step did not finish in time (it stays queued and runs later),
+            Refusal: `step_timeout` if a direct step did not finish in time (it stays queued and runs later),
                 `shutting_down`, or `not_ready` with MuJoCo's text after a physics error.
         """
         deadline = time.monotonic() + self._step_timeout_s
@@ -378,7 +381,7 @@ class Engine:
 
     @contextmanager
     def commanding(self) -> Generator[Articulations]:
-        """Hold the lock while set-points or controllers change; a paused live loop takes them over at once."""
+        """Hold the lock while set-points or controllers change; a paused live loop applies them immediately."""
         with self.lock:
             yield self.articulations
             self._kick()
@@ -454,7 +457,7 @@ class Engine:
         self.snapshots.take()
 
     def _fail(self, error: Exception) -> Refusal:
-        """Pause after a physics error and return the refusal that tells of it."""
+        """Pause after a physics error and return the refusal that reports it."""
         self._fault = f"physics stopped: {' '.join(str(error).split())}"  # MuJoCo's texts span lines
         self._paused = True
         logger.error("physics stopped and is paused: %s", error, exc_info=error)
@@ -465,7 +468,7 @@ class Engine:
             self._queue.popleft().fail(refusal)
 
     def _tick_if_due(self) -> None:
-        """Show the publishers the last direct step before its state is gone."""
+        """Publish the last direct step before its state is overwritten."""
         if self._tick_due:
             self._tick()
 

@@ -14,12 +14,12 @@ Hook = Callable[[], None]
 
 
 def call_hooks(hooks: list[Hook]) -> None:
-    """Call each; one that raises is logged and removed."""
+    """Call each hook; one that raises is logged and removed."""
     for hook in tuple(hooks):
         try:
             hook()
         except Exception:
-            logger.exception("%r failed and is not called again", hook)
+            logger.exception("%r failed and will not be called again", hook)
             if hook in hooks:
                 hooks.remove(hook)
 
@@ -29,9 +29,9 @@ class Snapshots:
     """Numbers the snapshots of the state.
 
     Attributes:
-        number: Number of the newest.
-        episode: How often the state was reset.
-        hooks: Called for each, and at each reset. One that raises is logged and removed.
+        number: Number of the newest snapshot.
+        episode: Number of resets so far.
+        hooks: Called for each snapshot and at each reset. One that raises is logged and removed.
     """
 
     number: int = 0
@@ -39,11 +39,11 @@ class Snapshots:
     hooks: list[Hook] = field(default_factory=list[Hook])
 
     def take(self) -> None:
-        """Count one more."""
+        """Number a new snapshot and call the hooks."""
         self.number += 1
         call_hooks(self.hooks)
 
     def restart(self) -> None:
-        """Note that the state was reset; it keeps the number."""
+        """Record a reset and call the hooks; the number stays."""
         self.episode += 1
         call_hooks(self.hooks)

@@ -16,8 +16,8 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 class _WarningLog:
     """Sends MuJoCo's warnings to the log while an engine runs.
 
-    MuJoCo has one handler per process and by default appends to a file in the current folder. A handler that somebody
-    else installed stays.
+    MuJoCo has one handler per process and by default appends to a file in the current folder. A handler that the
+    application installed stays.
     """
 
     def __init__(self) -> None:

@@ -19,13 +19,13 @@ IDLE_S: Final = 0.1
 """Longest sleep of the physics thread while nothing integrates."""
 
 MAX_LAG_S: Final = 0.02
-"""A live step later than this is a stall and is not caught up; less is jitter and evens out."""
+"""A live step later than this counts as a stall and is not caught up; smaller delays are jitter."""
 
 MIN_PERIOD_S: Final = 1e-5
 MAX_PERIOD_S: Final = 3600.0
 
 HOLD_S: Final = 0.005
-"""A live loop that never sleeps because it is late lets go of the lock this often, for `GIVE_WAY_S`."""
+"""Interval at which a live loop that runs late, and so never sleeps, releases the lock for `GIVE_WAY_S`."""
 
 GIVE_WAY_S: Final = 0.0005
 
@@ -34,7 +34,7 @@ class LivePacing:
     """Keeps the iterations of live mode on a grid of time slots."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Pace a model's time step at the speed of real time; the first iteration is due at once."""
+        """Pace a model's time step at the speed of real time; the first iteration is due immediately."""
         self._model = model
         self._speed = MAX_SPEED
         self._slot = -math.inf
@@ -50,17 +50,17 @@ class LivePacing:
         self._speed = float(percent)
 
     def restart(self) -> None:
-        """Make the next iteration due at once."""
+        """Make the next iteration due immediately."""
         self._slot = -math.inf
 
     def take_slot(self, *, idle: bool) -> float:
         """Take the next slot if it is due.
 
         Args:
-            idle: Whether an iteration would change nothing and show nobody anything.
+            idle: Whether an iteration would change nothing and no hook observes it.
 
         Returns:
-            0 when the slot is taken; else the seconds to wait before asking again.
+            0 if the slot was taken, otherwise the seconds to wait before the next call.
         """
         now = time.perf_counter()
         due = self._slot + (IDLE_S if idle else self._period())
@@ -71,7 +71,7 @@ class LivePacing:
 
     @property
     def rest_due(self) -> bool:
-        """Whether the loop has kept the lock for so long that others should have a turn."""
+        """Whether the loop has held the lock for so long that it should release it."""
         return time.perf_counter() - self._last_rest > HOLD_S
 
     def rested(self) -> None:

@@ -1,4 +1,4 @@
-"""The thread that runs a simulation, and how it comes to its end."""
+"""The thread that runs a simulation, and its shutdown."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class PhysicsThread:
     """Iterates under the lock of a simulation until it is stopped.
 
     Attributes:
-        stopping: Whether it is to end.
-        death: What it died of, or None.
+        stopping: Whether the thread has been asked to stop.
+        death: Description of the error that ended the thread, or None.
     """
 
     def __init__(
@@ -41,15 +41,15 @@ class PhysicsThread:
         give_up: Callable[[Refusal], None],
         health: Health,
     ) -> None:
-        """Describe the thread; `start` sets it going.
+        """Create the thread; `start` starts it.
 
         Args:
-            model: The model; once stopping takes too long, its solvers are told to be content.
-            lock: Guards the simulation; held but for the waits of `iterate`.
-            iterate: Does what there is to do, or waits for `wake`.
-            fail: Told of an error of `iterate`, after which the thread goes on.
-            give_up: Told, at the end, with what to refuse requests that still wait.
-            health: Told when the thread dies.
+            model: The model; if stopping takes too long, its solver tolerances are raised so that they finish early.
+            lock: Guards the simulation; held except while `iterate` waits.
+            iterate: Does the pending work, or waits for `wake`.
+            fail: Callback invoked with an exception raised by `iterate`; the thread continues afterwards.
+            give_up: Callback invoked at the end with the refusal for requests that still wait.
+            health: Receives a report if the thread dies.
         """
         self._model = model
         self._lock = lock
@@ -64,7 +64,7 @@ class PhysicsThread:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
     def start(self) -> None:
@@ -74,7 +74,7 @@ class PhysicsThread:
         self._thread.start()
 
     def stop(self, timeout: float) -> bool:
-        """End the thread between two sub-steps, and release whoever waits for a step. Safe to call twice.
+        """End the thread between two sub-steps, and release callers that wait for a step. Idempotent.
 
         Args:
             timeout: Seconds to wait.
@@ -86,7 +86,7 @@ class PhysicsThread:
         deadline = time.monotonic() + timeout
         idle = within(timeout / 2.0, lambda seconds: self._lock.inner.acquire(timeout=seconds))
         if not idle:
-            # Whatever its solver still iterates for is no longer wanted: any improvement is too small to go on.
+            # The result is no longer needed, so the solver stops at its next iteration.
             self._model.opt.tolerance = self._model.opt.noslip_tolerance = math.inf
             idle = within(timeout / 2.0, lambda seconds: self._lock.inner.acquire(timeout=seconds))
         if idle:
@@ -110,6 +110,6 @@ class PhysicsThread:
                     except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
                         self._fail(error)
                 self._give_up(shutting_down())
-            except BaseException as error:  # noqa: BLE001 - who waits for a step must not wait for ever
+            except BaseException as error:  # noqa: BLE001 - a caller that waits for a step must not hang
                 self.death = self._health.report(error)
                 self._give_up(Refusal("internal_error", self.death))

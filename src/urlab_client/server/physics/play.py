@@ -1,7 +1,7 @@
-"""The life of a play session: off, compiling, ready or failed, and what runs while it is ready.
+"""The lifecycle of a play session: off, compiling, ready or failed, and the simulation while it is ready.
 
-For the `sim` handlers, which start and stop it, and for the handlers that need a running simulation. Compilation has a
-thread of its own, so that whoever asked for it can give up waiting.
+For the `sim` handlers, which start and stop it, and for the handlers that need a running simulation. Compilation runs
+in a separate thread, so that the caller can stop waiting for it.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Running:
     """A simulation that is ready.
 
     Attributes:
-        scene: What was compiled.
-        engine: What steps it; started.
-        observer: What reads its state.
-        cameras: What draws its cameras.
+        scene: The compiled scene.
+        engine: The engine that steps it, started.
+        observer: Reads its state.
+        cameras: Renders its cameras.
         recordings: Files in the folder of recordings at the start.
-        limits: How much is done for clients.
+        limits: Limits on client requests.
         channels: The user channels.
     """
 
@@ -61,23 +61,23 @@ class Running:
     channels: UserChannels = field(default_factory=lambda: UserChannels({}))
 
     def mjb(self) -> bytes:
-        """Return the model in MuJoCo's binary format, without what varies. The caller holds the engine's lock."""
+        """Return the model in MuJoCo's binary format, without variations. The caller holds the engine's lock."""
         variation = self.engine.variation
         return self.scene.mjb() if variation is None else variation.mjb()
 
     @cached_property
     def claims(self) -> ControlClaims:
-        """Who owns which robot."""
+        """The owners of the robots."""
         return ControlClaims()
 
     @cached_property
     def step_frames(self) -> StepReplies:
-        """What encodes the replies to `step`."""
+        """The encoder of the replies to `step`."""
         return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
 
     @cached_property
     def options(self) -> OptionOverrides:
-        """What `set_sim_options` remembers."""
+        """The options set by `set_sim_options`."""
         return OptionOverrides(self.scene.model, self.limits, self.engine.dialect)
 
     @cached_property
@@ -101,12 +101,12 @@ class Running:
         self.cameras.see(self.engine.snapshots.number, self.engine.snapshots.episode)
 
     def close(self, timeout: float = 1.0) -> bool:
-        """End it within about `timeout` seconds; return False when something was still busy then."""
+        """Stop within about `timeout` seconds; return False if a thread was still busy then."""
         deadline = time.monotonic() + timeout
         drawn = self.cameras.close(timeout / 2.0)
         ended = self.engine.close(max(0.0, deadline - time.monotonic()))
         if ended and self.engine.variation is not None:
-            self.engine.variation.restore()  # for whoever plays the same scene again
+            self.engine.variation.restore()  # the same scene may be played again
         return ended and drawn
 
 
@@ -129,8 +129,8 @@ class Play:
     """The play session of a server: at most one at a time. Safe to use from several threads.
 
     Attributes:
-        listeners: Called with the simulation when it is ready and with None when it goes, in order; must return at
-            once.
+        listeners: Callbacks invoked in order, with the simulation when it is ready and with None when it ends; they
+            must not block.
     """
 
     def __init__(self) -> None:
@@ -147,7 +147,7 @@ class Play:
 
     @property
     def compile_error(self) -> str:
-        """MuJoCo's message in state `COMPILE_FAILED`, else empty."""
+        """MuJoCo's message in state `COMPILE_FAILED`, otherwise empty."""
         attempt = self._attempt
         return "" if attempt is None or attempt.error is None else attempt.error
 
@@ -158,7 +158,7 @@ class Play:
 
     @property
     def current(self) -> Running | None:
-        """The simulation, or None while there is none."""
+        """The running simulation, or None."""
         attempt = self._attempt
         return None if attempt is None else attempt.running
 
@@ -166,7 +166,7 @@ class Play:
         """Return the simulation.
 
         Raises:
-            Refusal: `not_ready` when there is none; the message says why.
+            Refusal: `not_ready` if no simulation is running; the message gives the reason.
         """
         running = self.current
         if running is None:
@@ -176,10 +176,10 @@ class Play:
         return running
 
     def begin(self, build: Callable[[], Running]) -> None:
-        """Start play in a thread of its own, instead of whatever was there.
+        """Start play in a separate thread, replacing the previous session.
 
         Args:
-            build: Compiles and starts the simulation. Must not touch what the caller may change meanwhile.
+            build: Compiles and starts the simulation. Must not access state that the caller may change meanwhile.
         """
         self.stop()
         attempt = _Attempt()
@@ -191,10 +191,10 @@ class Play:
         """Wait until compilation has ended and return the state.
 
         Args:
-            timeout_s: Seconds to wait; afterwards the state is `TIMEOUT`, and compilation goes on.
+            timeout_s: Seconds to wait; afterwards the state is `TIMEOUT`, and compilation continues.
 
         Raises:
-            Refusal: `shutting_down`.
+            Refusal: `shutting_down` if the server is stopping.
         """
         # NaN compares false, so it does not wait.
         wait_s = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0
@@ -205,7 +205,7 @@ class Play:
             return PIEState.TIMEOUT if self.state is PIEState.COMPILING else self.state
 
     def stop(self) -> None:
-        """End play; a compilation under way is left to finish for nothing."""
+        """End play; a compilation in progress finishes in the background, and its result is discarded."""
         with self._changed:
             attempt, self._attempt = self._attempt, None
             if attempt is not None:
@@ -215,13 +215,13 @@ class Play:
             attempt.running.close()
 
     def close(self, timeout: float) -> bool:
-        """End play for good and release whoever waits, with `shutting_down`.
+        """End play permanently and refuse waiting callers with `shutting_down`.
 
         Args:
             timeout: Seconds to wait for the simulation to end.
 
         Returns:
-            False when it was still busy then.
+            False if it was still busy then.
         """
         with self._changed:
             self._closing = True
@@ -239,7 +239,7 @@ class Play:
             running = build()
         except CompileFailed as failure:
             error = failure.message
-        except BaseException as failure:  # noqa: BLE001 - who waits for the start must not wait for ever
+        except BaseException as failure:  # noqa: BLE001 - a caller that waits for the start must not hang
             error = _unexpected(failure)
         with self._changed:
             if not attempt.abandoned:
@@ -263,6 +263,6 @@ class Play:
 
 
 def _unexpected(failure: BaseException) -> str:
-    """Log why play could not be started, and return how that reads."""
+    """Log why play could not be started, and return the message for clients."""
     logger.error("play could not be started", exc_info=failure)
     return f"the server failed with {type(failure).__name__}: {failure}; its log has the details"

@@ -30,10 +30,10 @@ class QueuedStep(Generic[T]):
         self._error: Exception | None = None
 
     def run(self, advance: Callable[[Step], None]) -> None:
-        """Do the step, unless its caller was told that it is not done any more; observe, and release the caller.
+        """Run the step, unless it was cancelled by its timeout; observe, and release the caller.
 
         Args:
-            advance: Does what the request asks for. The engine's lock is held.
+            advance: Executes the request; called with the engine's lock held.
         """
         with self._lock:
             self._begun = True
@@ -58,14 +58,14 @@ class QueuedStep(Generic[T]):
 
         Args:
             remaining: Seconds until `step_timeout` is raised.
-            timeout: Seconds since the request came in by then.
-            runs_late: Whether it stays queued then although it has not begun.
+            timeout: The whole step timeout, seconds, for the message.
+            runs_late: Whether a step that has not begun by then stays queued.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True
             with self._lock:
                 self._dropped = not (runs_late or self._begun)
-            fate = "is not done any more" if self._dropped else "runs to its end when physics gets to it"
+            fate = "was cancelled" if self._dropped else "will still run to its end"
             raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
         if self._error is not None:
             raise self._error

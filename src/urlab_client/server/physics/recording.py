@@ -224,14 +224,14 @@ def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...
     qpos = [value for state in states.values() for value in state.qPos]
     qvel = [value for state in states.values() for value in state.qVel]
     if not all(map(math.isfinite, (frame.timestamp, *qpos, *qvel))):
-        raise ValueError(f"the frame at {frame.timestamp} s holds a number that is not finite")
+        raise ValueError(f"the frame at {frame.timestamp} s contains a number that is not finite")
     return Frame(frame.timestamp, layout, np.array(qpos, dtype=np.float64), np.array(qvel, dtype=np.float64))
 
 
 def _read_loosely(plain: object) -> list[_RecordedFrame]:
     frames = _folded(plain).get("frames")
     if not isinstance(frames, list):
-        raise ValueError("there is no list 'Frames'")  # noqa: TRY004 - the file is wrong, not the caller
+        raise ValueError("the list 'Frames' is missing")  # noqa: TRY004 - the file is wrong, not the caller
     found: list[_RecordedFrame] = []
     for item in cast("list[object]", frames):
         fields = _folded(item)
@@ -291,7 +291,7 @@ def decode_csv(content: bytes) -> list[Frame]:
         time = float(row[clock]) if clock is not None else number * CSV_PERIOD_S
         qpos = np.array([float(row[at]) for at in order], dtype=np.float64)
         if not (math.isfinite(time) and np.isfinite(qpos).all()):
-            raise ValueError(f"row {number + 2} holds a number that is not finite")
+            raise ValueError(f"row {number + 2} contains a number that is not finite")
         frames.append(Frame(time, layout, qpos, np.empty(0)))
     return frames
 

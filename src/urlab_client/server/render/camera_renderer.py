@@ -1,8 +1,8 @@
-"""Camera images, drawn with MuJoCo's renderer in a thread of their own.
+"""Camera images, drawn with MuJoCo's renderer in a separate thread.
 
 The handler of `step` asks a `CameraRenderer` for frames. The first frame triggers the search for OpenGL, in a child
 process, because a broken driver may end the process that loads it. A machine without OpenGL serves no frames;
-everything else goes on.
+everything else works.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _VISIBLE: Final = (
 """The parts of a state that pictures depend on."""
 
 GIVEN_UP: Final = 8
-"""States that wait to be drawn though nobody waits for them any more; beyond, older frames have to do."""
+"""Maximum number of abandoned states in the queue; beyond it, older frames are returned."""
 
 MAX_FAILED: Final = 3
 """After so many failures in a row drawing is given up until the next play session."""
@@ -182,7 +182,7 @@ class Painting:
 
 
 class CameraRenderer:
-    """Draws the cameras of one scene; all share one OpenGL context, which belongs to a thread of its own."""
+    """Draws the cameras of one scene; all share one OpenGL context, which belongs to a separate thread."""
 
     def __init__(
         self,
@@ -195,16 +195,16 @@ class CameraRenderer:
         varied: Sequence[str] = (),
         dialect: Dialect = ALPHA,
     ) -> None:
-        """Prepare for a scene; nothing is drawn, and no OpenGL looked for, before a frame is wanted.
+        """Prepare for a scene. Drawing, and the search for OpenGL, begin with the first request for a frame.
 
         Args:
             scene: The scene.
-            modes: What the pixels mean by articulation key and camera name; the others are `real`.
+            modes: Meaning of the pixels by articulation key and camera name; `real` by default.
             appearance: What pictures depend on besides the model.
-            health: Told when the thread that draws dies.
-            names: What articulations are called in requests and replies, by key; that, for those not mentioned.
+            health: Receives a report if the drawing thread dies.
+            names: Names of articulations in requests and replies, by key; the key itself by default.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
-            dialect: Decides what cameras are called there.
+            dialect: Determines the names of cameras there.
         """
         self._scene = scene
         self._health = Health() if health is None else health
@@ -347,13 +347,13 @@ class CameraRenderer:
     def frames(
         self, shots: Sequence[Shot], film: Film, wait_s: float = FRAMES_DEADLINE_S
     ) -> dict[str, CameraFrame] | None:
-        """Draw what has to be drawn and return the frames by the request's keys; None without any.
+        """Draw the missing frames and return all frames by the request's keys; None if there are none.
 
-        Without OpenGL, or when drawing fails or takes too long, cameras are left out; the log says why.
+        Without OpenGL, or if drawing fails or takes too long, cameras are left out; the log gives the reason.
 
         Args:
-            shots: What is asked for.
-            film: What `capture` returned.
+            shots: The requested frames.
+            film: The result of `capture`.
             wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
                 is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
@@ -375,33 +375,33 @@ class CameraRenderer:
         """Draw a picture of the viewport.
 
         Args:
-            job: What `capture_viewport` returned.
+            job: The result of `capture_viewport`.
 
         Returns:
             Red, green, blue and alpha from the top, shape (height, width, 4).
 
         Raises:
-            RenderingUnavailable: It cannot be drawn.
+            RenderingUnavailable: The picture cannot be drawn.
         """
         need_backend()
         if not self._submit(job):
             raise RenderingUnavailable(
-                "play ended before the picture was drawn" if self._closed else "drawing failed; the log says why"
+                "play ended before the picture was drawn" if self._closed else "drawing failed; see the log"
             )
         if not job.done.wait(FRAMES_DEADLINE_S):
             raise RenderingUnavailable(f"no picture within {FRAMES_DEADLINE_S:g} s")
         if job.pixels is None:
-            raise RenderingUnavailable("the picture was not drawn; if play has not ended, the log says why")
+            raise RenderingUnavailable("the picture was not drawn; see the log if play has not ended")
         return job.pixels
 
     def close(self, timeout: float = 1.0) -> bool:
-        """Stop drawing and release whoever waits. Safe to call twice.
+        """Stop drawing and release waiting callers. Idempotent.
 
         Args:
             timeout: Seconds to wait for the thread.
 
         Returns:
-            False when it was still drawing then.
+            False if it was still drawing then.
         """
         with self._lock:
             self._closed = True
@@ -467,7 +467,7 @@ class CameraRenderer:
                     self._draw(stage)
         except Exception:
             logger.exception("camera images are left out from now on: drawing failed")
-        except BaseException as error:  # noqa: BLE001 - who asks for images hears of it by the next request
+        except BaseException as error:  # noqa: BLE001 - the next request for images fails
             self._health.report(error)
         finally:
             with self._lock:

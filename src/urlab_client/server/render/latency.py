@@ -1,7 +1,7 @@
 """Cameras that show what they saw some time ago.
 
-For `CameraRenderer`. Such a camera keeps past states of the simulation rather than pictures: what it shows is as old as
-it should be however rarely somebody looks, and only what somebody looks at is drawn.
+For `CameraRenderer`. Such a camera keeps past states of the simulation rather than pictures. Its frames therefore have
+the right age however rarely a client asks, and only requested frames are drawn.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from urlab_client.protocol.messages.session import CameraFrame
 __all__ = ["Instant", "Latency", "Past"]
 
 CAPACITY: Final = 1000
-"""About how many states of a camera's past are kept; of more, as many are skipped as it takes."""
+"""Approximate number of past states kept per camera; at higher rates, states are skipped."""
 
 _SLACK_S: Final = 1e-6  # sums of timesteps are not exact
 
@@ -62,16 +62,16 @@ class Latency:
     """The latency of one camera, and what the camera has seen but may not have shown yet.
 
     Attributes:
-        settings: What was asked for.
-        withholds: Whether the camera shows anything else than what it sees now.
-        past: What it shows, or is going to show, oldest first.
+        settings: The requested latency.
+        withholds: Whether the camera shows past states instead of the current one.
+        past: States that it shows now or later, oldest first.
     """
 
     def __init__(self, settings: CameraDelayInForce, seed: int, before: Latency | None = None) -> None:
         """Begin to delay.
 
         Args:
-            settings: What is asked for, with numbers that are finite and not negative.
+            settings: The requested latency; its numbers are finite and not negative.
             seed: Seed of the jitter.
             before: The camera's latency until now; what the camera has seen is kept if the clock stays.
         """
@@ -84,7 +84,7 @@ class Latency:
         self.past: deque[Past] = before.past if before is not None and keep else deque()
 
     def skips(self, now: Instant) -> bool:
-        """Return whether a state of now comes too soon after the last one to be kept."""
+        """Return whether the current state follows the last one too closely to be kept."""
         return bool(self.past) and 0.0 < self._at(now) - self.past[-1].at < self._spacing - _SLACK_S
 
     def forget(self) -> None:
@@ -93,7 +93,7 @@ class Latency:
             self.past.clear()
 
     def see(self, frame_id: int, now: Instant, captured: float, state: NDArray[np.float64]) -> None:
-        """Keep a state, and forget those that are not going to be shown any more.
+        """Keep a state, and forget those that will no longer be shown.
 
         Args:
             frame_id: Number of its snapshot.

@@ -1,4 +1,4 @@
-"""Suns that stand over what a picture shows.
+"""Directional lights that follow the subject of a picture.
 
 A directional light shines everywhere, but its shadows are drawn around its position only, as far as
 `vis.map.shadowclip` times the model's extent. A robot that walks away from there loses its shadow, or parts of it.
@@ -37,13 +37,13 @@ def moving_geoms(model: mujoco.MjModel) -> NDArray[np.intp]:
 
 
 def follow_subject(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.intp]) -> None:
-    """Move the suns of a scene along the ground so that they stand over what the camera sees; they shine as before.
+    """Move the suns of a scene along the ground to a place above what the camera sees; their light does not change.
 
     Args:
         scene: The scene, with camera and lights as they are to be drawn.
         model: The model.
         data: Its data with positions computed.
-        geoms: What counts, as `moving_geoms` returns it.
+        geoms: Geoms to consider, from `moving_geoms`.
     """
     if not geoms.size:
         return
