@@ -115,9 +115,10 @@ def test_others_keep_their_connection(server: SimulatedServer, client: URLabClie
 
 
 @either_transport
-def test_a_corrupt_reply(client: URLabClient, faults: Faults) -> None:
-    with faults.add(Corrupt("step", times=1)), pytest.raises(ProtocolError):
-        client.step()
+@pytest.mark.parametrize("flips", [0, 1000])
+def test_a_corrupt_reply(client: URLabClient, faults: Faults, flips: int) -> None:
+    with faults.add(Corrupt("step", times=1, flips=flips)), pytest.raises(ProtocolError):
+        client.step(timeout=10.0)
     assert client.step().step == 2
 
 
