@@ -39,6 +39,7 @@ _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
 _OF_SCENE = "-/"
 _PAST_STATES = 200
+_ROUNDING_S = 1e-6  # browsers round the value of a slider: a position so close to the end means the end
 
 
 class ReplayView(Struct):
@@ -129,7 +130,7 @@ class Replay:
         return ReplayView(
             self._run.path.name,
             round(self._at, 3),
-            self._seconds,  # unrounded: clients go to the end by this number
+            round(self._seconds, 6),
             self._playing,
             self._rate,
             self._before is not None,
@@ -232,7 +233,7 @@ class Replay:
                 raise ValueError(f"the pace must be from 0.05 to 20, not {rate}")
             self._rate = rate
         if at is not None:
-            self._at = min(max(at, 0.0), self._seconds)
+            self._at = self._seconds if at > self._seconds - _ROUNDING_S else max(at, 0.0)
         if playing is not None:
             if playing and at is None and self._at >= self._seconds:
                 self._at = 0.0
