@@ -377,7 +377,7 @@ async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_
     [
         ([], {}, "scenes must be one or more"),
         ("tcp://editor", {}, "scenes must be one or more sim://"),
-        ("sim://arm", {"retries": -1}, "retries are 0 or more"),
+        ("sim://arm", {"retries": -1}, "retries must be 0 or more"),
         ("sim://arm", {"episode_timeout": 0}, "above 0 seconds"),
         ("sim://arm", {"env_options": {"render_mode": "rgb_array"}}, "env_options cannot have render_mode"),
         ("sim://arm", {"ids": [0, 1]}, "ids must be unique and from 0 to 0"),

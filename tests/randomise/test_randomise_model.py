@@ -57,7 +57,7 @@ def varied(model: mujoco.MjModel, **vary: Any) -> tuple[Any, dict[str, Any], Any
     moved = {name: after[name] - before[name] for name in ratio}
     qpos = np.array(model.qpos0)
     variation.start(draws, qpos)
-    return ratio, moved, (draws.told()["varied"][0]["drawn"], qpos)
+    return ratio, moved, (draws.to_dict()["varied"][0]["drawn"], qpos)
 
 
 FIELDS = (
@@ -144,8 +144,8 @@ def test_each_quantity_changes_what_it_says_and_nothing_else(model: mujoco.MjMod
 def test_an_entry_more_leaves_the_others_numbers_alone(model: mujoco.MjModel) -> None:
     one = Vary(what="mass", scale=(0.5, 2.0), distribution="log-uniform")
     two = Vary(what="damping", scale=(0.5, 2.0))
-    alone = Variation(Randomisation(vary=(one,)), model).draw(3).told()["varied"]
-    both = Variation(Randomisation(vary=(one, two)), model).draw(3).told()["varied"]
+    alone = Variation(Randomisation(vary=(one,)), model).draw(3).to_dict()["varied"]
+    both = Variation(Randomisation(vary=(one, two)), model).draw(3).to_dict()["varied"]
     assert both[0] == alone[0]
     draws = [Variation(Randomisation(vary=(one,)), model).draw(seed).varied[0][2] for seed in range(200)]
     assert abs(float(np.mean(np.log(draws)))) < 0.1, "as often halved as doubled"

@@ -55,9 +55,9 @@ def core_of(server: SimulatedServer) -> ServerCore:
 
 
 def hurry(server: SimulatedServer) -> None:
-    """Let play lose patience soon."""
+    """Let play time out soon."""
     engine = core_of(server).play.running().engine
-    engine._step_timeout_s = engine.lock._timeout = engine._call._patience_s = STEP_TIMEOUT_S
+    engine._step_timeout_s = engine.lock._timeout = engine._call._timeout_s = STEP_TIMEOUT_S
 
 
 @pytest.fixture

@@ -268,7 +268,7 @@ def main() -> int:
     print(
         f"{ran} of {total} tests that run on Linux ran here: {100 * ran / total:.1f} %, "
         f"{sum(outcome.passed for outcome in outcomes)} passed; {sum(outcome.failed for outcome in outcomes)} failed, "
-        f"were skipped or were not come to, in {clock.passed:.0f} s"
+        f"were skipped or not reached, in {clock.passed:.0f} s"
     )
     return 1 if any(outcome.problems for outcome in outcomes) else 0
 

@@ -72,7 +72,7 @@ class EpisodeDraws:
     seed: int
     varied: tuple[tuple[Vary, Elements, Floats], ...]
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return plain data: `seed`, and for each entry of `varied` the quantity, the operation and the numbers."""
         return {
             "seed": self.seed,

@@ -222,9 +222,9 @@ class URLabBatchEnv(Vectorized):
         return tuple(to_rgb(frame, mode) for frame in drawn[self._rendered])
 
     def draws(self, index: int) -> dict[str, Any] | None:
-        """Return the values drawn for an environment's episode, as in `EpisodeDraws.told`; None if nothing varies."""
+        """Return the values drawn for an episode, as in `EpisodeDraws.to_dict`; None if nothing varies."""
         found = None if self._varied is None else self._varied.draws[index]
-        return None if found is None else found.told()
+        return None if found is None else found.to_dict()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the drawing context."""

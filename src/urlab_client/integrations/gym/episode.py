@@ -167,8 +167,8 @@ class EnvEpisode:
         return States(self._task.scene, qpos, qvel, np.array([data.time]), [self._goal])
 
     def draws(self) -> dict[str, Any] | None:
-        """Return the values drawn for the episode, as in `EpisodeDraws.told`; None if nothing was drawn."""
-        return None if self._draws is None else self._draws.told()
+        """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""
+        return None if self._draws is None else self._draws.to_dict()
 
     async def reset(
         self, rng: np.random.Generator, keyframe: str | None = None, seed: int | None = None

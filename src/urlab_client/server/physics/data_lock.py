@@ -15,7 +15,7 @@ from urlab_client.server.refusal import Refusal
 __all__ = ["DataLock", "MujocoCall", "Overdue", "busy"]
 
 
-LEAST_PATIENCE_S: Final = 1.0
+MIN_TIMEOUT_S: Final = 1.0
 """Shortest duration of an overdue MuJoCo call; a slice of a long request may take a while on a busy machine."""
 
 
@@ -37,10 +37,10 @@ class Overdue:
 class MujocoCall:
     """The MuJoCo call in progress, if any. Entered under the engine's lock, read without it."""
 
-    __slots__ = ("_patience_s", "_under_way")
+    __slots__ = ("_timeout_s", "_under_way")
 
-    def __init__(self, patience_s: float) -> None:
-        self._patience_s = max(patience_s, LEAST_PATIENCE_S)
+    def __init__(self, timeout_s: float) -> None:
+        self._timeout_s = max(timeout_s, MIN_TIMEOUT_S)
         self._under_way: tuple[threading.Thread, float] | None = None
 
     def __enter__(self) -> None:
@@ -59,7 +59,7 @@ class MujocoCall:
             return None
         thread, began_at = under_way
         seconds = time.perf_counter() - began_at
-        return Overdue(thread, began_at, seconds) if seconds > self._patience_s else None
+        return Overdue(thread, began_at, seconds) if seconds > self._timeout_s else None
 
 
 class DataLock:
