@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from urlab_client.integrations._feed.messages import (
@@ -81,4 +82,25 @@ def write_recording(
                     qvel=[],
                 )
                 add(f"/entity/{name}", pose, sample)
+        writer.finish()
+
+
+def with_later_pictures(source: Path, target: Path, by_ns: int) -> None:
+    """Copy a recording, with its pictures later than the states that they show."""
+    with source.open("rb") as original, target.open("wb") as file:
+        reader, writer = make_reader(original), Writer(file)
+        header = reader.get_header()
+        writer.start(profile=header.profile, library=header.library)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, kind, channel.metadata
+                )
+            later = by_ns if channel.topic.startswith("/camera/") else 0
+            writer.add_message(channels[channel.id], message.log_time + later, message.data, message.publish_time)
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
         writer.finish()

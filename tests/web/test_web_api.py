@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from made_recordings import Robot, write_recording
+from made_recordings import Robot, with_later_pictures, write_recording
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.routing import Mount
@@ -415,6 +415,17 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         assert http.get("/api/status").json()["mode"] == "direct"
         reached = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
         assert reached == pytest.approx(live, abs=0.01), "the simulation is where it was before the replay"
+
+        with_later_pictures(file, tmp_path / "late.mcap", 1)
+        assert http.put("/api/recordings/late.mcap", content=(tmp_path / "late.mcap").read_bytes()).status_code == 200
+        end = http.post("/api/replay", json={"name": "late.mcap", "playing": False}).json()["seconds"]
+        with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
+            http.post("/api/replay", json={"time": end})
+            head, _ = picture_in(watching)
+            while head["sim_time"] != pytest.approx(pictures[-1].time - table.time[0], abs=1e-6):
+                head, _ = picture_in(watching)
+        http.delete("/api/replay")
+        http.delete("/api/recordings/late.mcap")
 
         taken = http.put("/api/recordings/other.mcap", content=file.read_bytes())
         assert taken.json()["seconds"] == made["seconds"]

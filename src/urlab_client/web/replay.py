@@ -39,7 +39,7 @@ _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
 _OF_SCENE = "-/"
 _PAST_STATES = 200
-_ROUNDING_S = 1e-6  # browsers round the value of a slider: a position so close to the end means the end
+_ROUNDING_S = 1e-6  # of slider values in browsers; and a picture may be a nanosecond later than its state
 
 
 class ReplayView(Struct):
@@ -152,6 +152,11 @@ class Replay:
         """The position, seconds from the recording's start."""
         return self._at
 
+    @property
+    def _moment(self) -> float:
+        """Position on the recording's clock, seconds, late enough for times that were rounded."""
+        return self._start + self._at + _ROUNDING_S
+
     def has_pictures(self, camera: str) -> bool:
         """Return whether the pictures of a camera, `ARTICULATION/CAMERA` or `-/CAMERA`, come from the recording."""
         return self._run is not None and self._before is None and camera in self._cameras
@@ -163,7 +168,7 @@ class Replay:
             URLabError: The file is damaged at this position.
             OSError: The file cannot be read.
         """
-        run, at = self._run, self._start + self._at
+        run, at = self._run, self._moment
         if run is None or not self.has_pictures(camera):
             return None
         found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(_OF_SCENE), at))
@@ -285,7 +290,7 @@ class Replay:
 
     async def _show(self) -> None:
         async with self._showing:  # one at a time, each of the present moment: none comes after a later one
-            run, at = self._run, self._start + self._at
+            run, at = self._run, self._moment
             if run is None:
                 return
             state = await _read(lambda: run.state_at(at))
