@@ -1,18 +1,27 @@
 """What holds for every test."""
 
+import functools
 import gc
 import importlib.metadata
 import importlib.util
+import itertools
 import os
+import signal
 import sys
 from collections.abc import Generator
+from typing import Any
 
 import pytest
+from children import ended_with_a_failure
 from hypothesis import HealthCheck, settings
 from not_on_windows import listed, names
 
 # The tests start hundreds of processes; without bytecode files each would compile the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# Started in the background (`nohup`, a script's `&`) they ignore SIGINT, which some send to themselves and to programs.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A test that is slow because the machine is busy has not failed; pytest's own limit ends those that hang.
 settings.register_profile("urlab", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=30)
@@ -20,7 +29,16 @@ settings.register_profile("thorough", settings.get_profile("urlab"), max_example
 settings.load_profile("urlab")
 
 # Marker -> modules without which its tests are left out, and the extras to install.
-OPTIONAL = {"ray": (("ray",), "ray"), "view": (("foxglove", "rerun"), "foxglove,rerun")}
+OPTIONAL = {
+    "mutants": (("coverage", "mutmut"), "mutants"),
+    "ray": (("ray",), "ray"),
+    "view": (("foxglove", "rerun"), "foxglove,rerun"),
+}
+
+LEFT_OUT: dict[str, str] = {}
+"""Tests that cannot run here, and what they need."""
+
+OPENGL = "URLAB_TESTS_WITHOUT_OPENGL"
 
 MISSING = {
     marker: extras
@@ -57,37 +75,85 @@ IMPOSSIBLE = listed(wine=on_wine()) if sys.platform == "win32" else {}
 collect_ignore = [test.removeprefix("tests/") for test in IMPOSSIBLE if "::" not in test]  # some cannot be imported
 
 
-def too_new(item: pytest.Item) -> bool:
-    """Whether a test needs a newer MuJoCo than is installed."""
-    marker = item.get_closest_marker("mujoco")
-    return marker is not None and release(MUJOCO) < release(marker.args[0])
+@functools.cache
+def without_opengl() -> str:
+    """Return why no pictures can be drawn here; empty where they can. The workers ask the process that starts them."""
+    if OPENGL not in os.environ:
+        from urlab_client.server.render.opengl import Backend, search_backend
+
+        found = search_backend()
+        os.environ[OPENGL] = "" if isinstance(found, Backend) else found
+    return os.environ[OPENGL]
 
 
+def lacking(item: pytest.Item) -> str:
+    """Return what a test needs that is not here; empty when it can run."""
+    for marker, extras in MISSING.items():
+        if item.get_closest_marker(marker):
+            return f"pip install -e '.[{extras}]'"
+    newer = item.get_closest_marker("mujoco")
+    if newer is not None and release(MUJOCO) < release(newer.args[0]):
+        return f"MuJoCo {newer.args[0]} or later; this is {MUJOCO}"
+    if names(IMPOSSIBLE, item.nodeid):
+        return "another system (tests/not_on_windows.toml says why)"
+    if item.get_closest_marker("opengl") and without_opengl():
+        return f"OpenGL: {without_opengl()}"
+    return ""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Look for OpenGL once for all workers, which collect the tests."""
+    if getattr(config.option, "numprocesses", None):
+        without_opengl()
+
+
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what cannot run here: for want of an extra, of a newer MuJoCo, or of something that Windows lacks."""
-    left_out = [
-        item
-        for item in items
-        if any(item.get_closest_marker(marker) for marker in MISSING) or too_new(item) or names(IMPOSSIBLE, item.nodeid)
-    ]
+    """Leave out what cannot run here."""
+    needs = {item: lacking(item) for item in items}
+    left_out = [item for item in items if needs[item]]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in left_out]
+        items[:] = [item for item in items if not needs[item]]
+    # A worker tells the process that started it, which collects nothing and counts nothing.
+    told = getattr(config, "workeroutput", None)
+    (LEFT_OUT if told is None else told.setdefault("left_out", {})).update(
+        {item.nodeid: needs[item] for item in left_out}
+    )
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take over what a worker has left out."""
+    LEFT_OUT.update(getattr(node, "workeroutput", {}).get("left_out", {}))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name the tests that were left out, with what they need."""
+    for need in sorted(set(LEFT_OUT.values())):
+        tests = [test for test, needed in LEFT_OUT.items() if needed == need]
+        terminalreporter.section("left out", "-")
+        terminalreporter.write_line(f"{len(tests)} left out, which need {need}")
+        functions = sorted({test.partition("[")[0] for test in tests})
+        for file, group in itertools.groupby(functions, lambda name: name.partition("::")[0]):
+            terminalreporter.write_line(f"{file}: {', '.join(name.rpartition('::')[2] for name in group)}")
 
 
 def pytest_report_header(config: pytest.Config) -> list[str]:
-    """Say what is left out: with workers, the summary does not count it."""
-    return [
-        *([f"tests are left out by -m {config.option.markexpr!r}"] if config.option.markexpr else []),
-        *(f"tests marked `{marker}` need: pip install -e '.[{extras}]'" for marker, extras in MISSING.items()),
-        f"tests marked `mujoco` need the release that they name, or a later one; this is {MUJOCO}",
-        *([f"{len(IMPOSSIBLE)} entries of tests/not_on_windows.toml are left out"] if IMPOSSIBLE else []),
-    ]
+    """Say which tests are left out by their marks."""
+    return [f"tests are left out by -m {config.option.markexpr!r}"] if config.option.markexpr else []
 
 
 def pytest_collection_finish() -> None:
     """Keep the collected tests out of the garbage collector's rounds: some tests run it again and again."""
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None]:
+    """End the processes that a failed test leaves hanging."""
+    with ended_with_a_failure():
+        yield
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -16,6 +16,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "keys": frozenset({"protocol"}),
     "aio": frozenset(
         {
+            "_background",
             "_children",
             "_confined",
             "_landlock",
@@ -31,6 +32,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "sync": frozenset({"aio", "protocol"}),
     "server": frozenset(
         {
+            "_background",
             "_children",
             "_confined",
             "_installation",
@@ -39,6 +41,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_mujoco",
             "_processors",
             "_uninterrupted",
+            "_whole_files",
             "_windows",
             "keys",
             "protocol",
@@ -47,6 +50,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     ),
     "randomise": frozenset({"protocol"}),
     "enums": frozenset({"protocol"}),
+    "_background": frozenset(),
     "_children": frozenset(),
     "_confined": frozenset(),
     "_landlock": frozenset(),
@@ -76,12 +80,13 @@ ALLOWED: dict[str, frozenset[str]] = {
             "sync",
         }
     ),
-    "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
+    "cluster": frozenset({"_installation", "_whole_files", "integrations", "protocol", "sync"}),
     "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
     "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
+            "_background",
             "_extras",
             "_installation",
             "_mujoco",
@@ -106,6 +111,7 @@ ALLOWED: dict[str, frozenset[str]] = {
 ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
+        "background",
         "deadline",
         "arguments",
         "session_level",

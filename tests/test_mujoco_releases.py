@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
 
-from urlab_client import _mujoco
+from urlab_client import URLabClient, _mujoco
+from urlab_client.aio.model.upload import flatten
+from urlab_client.protocol.base import DialectName
+from urlab_client.protocol.messages.session import Hello
+from urlab_client.server import SimulatedServer
 
 OBJ = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
@@ -172,6 +179,87 @@ def test_attributes_of_a_newer_release_are_left_out_of_attached_documents() -> N
     model, left_out = _mujoco.without_newer_attributes(scene, files, mujoco.MjModel.from_xml_string)
     assert left_out == ["geom.glow"]
     assert (model.body("a_hand").id, model.body("b_hand").id) == (1, 2)
+
+
+SCHEMA = {
+    line.partition(":")[0]: set(line.partition(":")[2].split())
+    for line in (Path(__file__).parent / "data" / "mujoco-3.8-schema.txt").read_text("utf-8").splitlines()
+}
+"""The attributes of each element in MuJoCo 3.8, from its `mj_printSchema`."""
+
+SERVOS = f"""
+<mujoco model="servos">
+  <default>
+    <default class="fast"><position kp="2"/></default>
+    <default class="slow"><velocity kv="3"/></default>
+  </default>
+  <worldbody><light pos="0 0 3"/><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+  <actuator>
+    {"".join(f'<{kind} joint="j" lengthrange="0 1" {rest}/>' for kind, rest in SHORTCUTS.items())}
+    <position joint="j" class="fast"/><velocity joint="j" class="slow"/>
+    <general joint="j" gainprm="4" biastype="affine" biasprm="0 -4 -1"/>
+  </actuator>
+</mujoco>"""
+
+
+def newer(documents: Mapping[str, str | bytes]) -> set[str]:
+    """What MuJoCo 3.8 does not know of some documents."""
+    elements = [element for text in documents.values() for element in ET.fromstring(text).iter()]
+    unknown = {element.tag for element in elements} - SCHEMA.keys()
+    return unknown | {
+        f"{element.tag}.{name}" for element in elements for name in {*element.keys()} - SCHEMA.get(element.tag, set())
+    }
+
+
+def assert_same_actuators(model: mujoco.MjModel, original: mujoco.MjModel, copies: int = 1) -> None:
+    for name in ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm"):
+        ours, theirs = (getattr(one, f"actuator_{name}") for one in (model, original))
+        np.testing.assert_allclose(ours, np.concatenate([theirs] * copies), err_msg=name)
+
+
+@pytest.fixture
+def servos(tmp_path: Path) -> Path:
+    """A robot with all kinds of actuators that MuJoCo 3.8 has."""
+    file = tmp_path / "servos.xml"
+    file.write_text(SERVOS)
+    return file
+
+
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_the_oldest_release_knows_all_that_a_server_writes(dialect: DialectName, servos: Path, tmp_path: Path) -> None:
+    saved = tmp_path / "saved"
+    with (
+        SimulatedServer(servos, servos, play=True, dialect=dialect, saved_dir=saved) as server,
+        URLabClient(address=server.address, step_port=server.step_port) as client,
+    ):
+        hello = client.call(Hello(include_assets=True))
+    assert hello.mjcf_compiled is not None
+    assert hello.vfs_assets is not None
+    sent = {"scene": hello.mjcf_compiled, **hello.vfs_assets}
+    stored = {str(file): file.read_bytes() for file in saved.rglob("*.xml")}
+    assert stored
+    assert newer(sent) | newer(stored) == set()
+    model = mujoco.MjModel.from_xml_string(hello.mjcf_compiled, dict(hello.vfs_assets))
+    assert_same_actuators(model, mujoco.MjModel.from_xml_path(str(servos)), copies=2)
+
+
+@pytest.mark.parametrize("write", [_mujoco.export_model, _mujoco.flat_model])
+def test_the_oldest_release_knows_all_that_is_sent(servos: Path, write: Callable[..., tuple[str, Any]]) -> None:
+    spec = mujoco.MjSpec.from_file(str(servos))
+    spec.compile()
+    xml, files = write(spec)
+    assert newer({"document": xml}) == set()
+    assert_same_actuators(mujoco.MjModel.from_xml_string(xml, files), mujoco.MjModel.from_xml_path(str(servos)))
+
+
+@pytest.mark.mujoco("3.12")
+def test_what_an_actuator_of_a_newer_release_is_told_stays(servos: Path) -> None:
+    pid = '<pid joint="j" input="pos" kp="3"/><pid joint="j" input="pos vel" kp="3"/>'
+    servos.write_text(SERVOS.replace("</actuator>", f"{pid}</actuator>"))
+    original = mujoco.MjModel.from_xml_path(str(servos))
+    flat = flatten(servos)
+    model = mujoco.MjModel.from_xml_string(flat.xml.decode(), flat.files)
+    np.testing.assert_array_equal(model.actuator_ctrlspec, original.actuator_ctrlspec)
 
 
 NEWER = re.compile(

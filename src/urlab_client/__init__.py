@@ -150,6 +150,7 @@ if TYPE_CHECKING:
         StateSnapshot,
         StreamPolicy,
         StreamStats,
+        TaskFailed,
     )
     from urlab_client.protocol.names import UnknownName
     from urlab_client.protocol.observer import ClientObserver
@@ -194,6 +195,7 @@ if TYPE_CHECKING:
         URLabController,
         URLabEntity,
         URLabPDController,
+        check_address,
     )
 
 __version__: str
@@ -381,6 +383,7 @@ __all__ = [
     "StreamOverflow",
     "StreamPolicy",
     "StreamStats",
+    "TaskFailed",
     "TooManyCells",
     "Transport",
     "URLabArticulation",
@@ -412,4 +415,5 @@ __all__ = [
     "Verdict",
     "WrongTransport",
     "__version__",
+    "check_address",
 ]

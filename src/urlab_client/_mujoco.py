@@ -215,6 +215,8 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
             # Beside the folder, because a confined process cannot write elsewhere.
             with _archive(spec, folder.with_name(_ARCHIVE)) as content:
                 content.extractall(folder)
+        document = folder / MODEL_FILE
+        document.write_bytes(_for_older_releases(spec, document.read_bytes()))
         return
     spec.to_xml()  # raises if it cannot be written, before anything is changed
     text, files = _written_by_hand(spec)
@@ -230,7 +232,7 @@ def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
         return _written_by_hand(spec.copy())
     with tempfile.TemporaryDirectory() as folder, _archive(spec, Path(folder, _ARCHIVE)) as content:
         files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-    return files.pop(MODEL_FILE).decode(), files
+    return _for_older_releases(spec, files.pop(MODEL_FILE)).decode(), files
 
 
 def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
@@ -357,7 +359,26 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
         spec.compile()
         for asset in (*spec.meshes, *spec.hfields, *spec.textures):
             asset.content_type = str(asset.content_type)
-    return spec.to_xml(), files
+    return _for_older_releases(spec, spec.to_xml().encode()).decode(), files
+
+
+def _for_older_releases(spec: mujoco.MjSpec, text: bytes) -> bytes:
+    """Return the MJCF of a spec without the attribute that MuJoCo adds to servos, and that older releases refuse.
+
+    From 3.16 on MuJoCo writes a `position` as a `general` with `input="pos"`, and `velocity`, `intvelocity` and
+    `cylinder` likewise. There it only tells what the control means. In a `pid` and its like it decides what the
+    controls are, but a model that has one needs a newer release anyway.
+    """
+    if any(
+        getattr(actuator, "ctrlspec", 0) and _constant(actuator.gaintype) not in _ONE_CONTROL
+        for actuator in spec.actuators
+    ):
+        return text
+    return _INPUT.sub(rb"\1", text)
+
+
+_ONE_CONTROL = {"FIXED", "AFFINE"}
+_INPUT = re.compile(rb'(<general\b[^<>]*?) input="[^"]*"')
 
 
 def check_copy(original: Path, copy: mujoco.MjModel) -> None:

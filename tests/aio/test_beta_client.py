@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from scripted import ScriptedServer, client_of, meta_ok, names
 from scripted_beta import BETA_OPS, ROBOT, ScriptedBeta, error
 from waiting import DEADLINE_S
 
+import urlab_client
 from urlab_client import (
     DestroyFailed,
     OutcomeUnknown,
@@ -116,7 +118,24 @@ async def test_an_instance_may_say_little_or_strange_things(beta: ScriptedBeta, 
     beta.on("hello", hello)
     async with client_of(beta, step_mode="direct") as client:
         await client.discover()
-        await client.step()
+        assert set(client.articulations) == {"arm_a", "arm_C_1"}
+        assert (await client.step()).time == client.sim_time == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("given", [None, 5555, 5001])
+async def test_a_state_port_that_is_given_is_not_replaced_by_the_announced_one(
+    beta: ScriptedBeta, given: int | None
+) -> None:
+    """There may be a tunnel in between, also with the number of the default."""
+    options = {} if given is None else {"state_port": given}
+    async with client_of(beta, **options) as client:
+        await client.discover()
+        (found,) = [one for one in (await client.explain()).findings if one.subject == "state stream"]
+        assert f":{given or beta.port + 1}" in found.text
+        assert URLabClient(**client.config.options()).config == client.config
+    for flavour in (URLabClient, urlab_client.URLabClient):
+        parameter = inspect.signature(flavour).parameters["state_port"]
+        assert (parameter.default, repr(parameter.default)) == (5555, "5555"), "help() shows a number"
 
 
 async def test_robots_listed_as_entities(beta: ScriptedBeta) -> None:
@@ -214,6 +233,24 @@ async def test_another_mujoco_is_worked_with(mode: str) -> None:
             client.articulations["arm_a"].set_ctrl({"m": 0.5})
             await client.step(2)
             assert client.entities["crate"].root_pos_w[:2].tolist() == [0.0, 2.0]
+    finally:
+        beta.close()
+
+
+async def test_a_model_that_needs_another_mujoco_is_refused_with_its_release() -> None:
+    beta = ScriptedBeta(skew=True)
+    whole = beta.answers["hello"]
+    newer = "<mujoco><actuator><novelty/></actuator></mujoco>"
+    beta.on("hello", lambda request: {**whole(request), "mjcf_compiled": newer, "vfs_assets": {}})
+    try:
+        async with client_of(beta, mujoco_version_check=False) as client:
+            with (
+                pytest.warns(UserWarning, match=r"MuJoCo 3\.11\.1"),
+                pytest.raises(
+                    ProtocolError, match=r"novelty(.|\n)*Install mujoco==3\.11\.1, or pass local_model=False"
+                ),
+            ):
+                await client.discover()
     finally:
         beta.close()
 
@@ -369,7 +406,7 @@ async def test_unknown_fields_do_no_harm(client: URLabClient, beta: ScriptedBeta
     for op in ("step", "op_status"):
         answer = beta.answers[op]
         beta.on(op, lambda request, answer=answer: {**answer(request), "favourite": {"colour": 1}})
-    await client.step()
+    assert (await client.step()).time == client.sim_time == pytest.approx(0.002)
     await client.scene.import_xml("/robots/arm.xml")
 
 
@@ -388,11 +425,11 @@ async def test_pictures_of_a_step(served: SimulatedServer) -> None:
     """Beta statements 50 and 75. Generation 2 statements 54 and 55."""
     async with URLabClient(**served.client_options(), step_mode="direct") as client:
         await client.discover()
-        robot = client.articulations["arm_1"]
-        reply = await client.step(include_cameras={"arm_1/wrist": "sync"})
+        robot = client.articulations["copy1_arm"]
+        reply = await client.step(include_cameras={"copy1_arm/wrist": "sync"})
         assert reply.cameras is not None
-        assert list(reply.cameras) == ["arm_1/wrist"]
-        assert reply.cameras["arm_1/wrist"].frame_id == reply.frame_id
+        assert list(reply.cameras) == ["copy1_arm/wrist"]
+        assert reply.cameras["copy1_arm/wrist"].frame_id == reply.frame_id
         camera = robot.cameras["wrist"]
         assert (camera.frame_id, camera.sim_time, camera.delivered) == (reply.frame_id, client.sim_time, True)
         assert client.articulations["arm"].cameras["wrist"].latest_frame is None
@@ -400,7 +437,7 @@ async def test_pictures_of_a_step(served: SimulatedServer) -> None:
             await client.step(include_cameras={"wrist": "sync"})
         everything = await client.step(include_cameras=True)
         assert everything.cameras is not None
-        assert set(everything.cameras) == {"arm/wrist", "arm_1/wrist"}
+        assert set(everything.cameras) == {"arm/wrist", "copy1_arm/wrist"}
 
 
 async def test_an_older_picture_is_not_handed_out_as_that_of_the_step(client: URLabClient, beta: ScriptedBeta) -> None:
@@ -425,7 +462,7 @@ async def test_a_camera_streams_while_somebody_looks(served: SimulatedServer) ->
     async with URLabClient(**served.client_options(), step_mode="direct", live_pictures=False) as client:
         await client.discover()
         await client.step()
-        camera = client.articulations["arm_1"].cameras["wrist"]
+        camera = client.articulations["copy1_arm"].cameras["wrist"]
 
         async def next_picture(frames: Stream[CameraSample]) -> CameraSample:
             coming = asyncio.ensure_future(anext(frames))

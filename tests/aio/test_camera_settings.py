@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 from scripted import client_of
 from scripted_beta import ROBOT, ScriptedBeta
-from waiting import until
+from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import CameraDelay, CameraTransports, UnknownOp
 from urlab_client.aio import URLabClient
@@ -101,6 +102,36 @@ async def test_what_was_set_ends_with_play(client: URLabClient, beta: ScriptedBe
     async with other.frames():
         await streams(beta, BOTH, "arm_C_1/wrist")
     assert beta.streaming.get("arm_a/wrist", NEITHER) == NEITHER
+
+
+def never_heard(beta: ScriptedBeta) -> None:
+    """The next requests to switch cameras are carried out, and their replies are lost."""
+    beta.on("set_camera_streaming", lambda request: beta._set_camera_streaming(request) and None)
+
+
+async def test_an_abandoned_switch_is_undone_for_certain(client: URLabClient, beta: ScriptedBeta) -> None:
+    answer = beta.answers["set_camera_streaming"]
+    never_heard(beta)
+    abandoned = asyncio.create_task(client.runtime.set_camera_streaming({"arm_a/wrist": True}))
+    await streams(beta, BOTH)
+    beta.on("set_camera_streaming", answer)
+    abandoned.cancel()
+    await asyncio.wait((abandoned,))
+    await client.resync()
+    assert beta.streaming["arm_a/wrist"] == NEITHER
+
+
+async def test_a_stream_whose_switch_timed_out_is_switched_off_in_the_end(
+    client: URLabClient, beta: ScriptedBeta
+) -> None:
+    answer = beta.answers["set_camera_streaming"]
+    never_heard(beta)
+    async with client.articulations["arm_a"].cameras["wrist"].frames():
+        await streams(beta, BOTH)
+        beta.on("set_camera_streaming", answer)
+        pass_time(DEADLINE_S)
+        await client.runtime.set_paused(False)  # the line is free: that request has been given up
+    await streams(beta, NEITHER)
 
 
 async def test_latencies(client: URLabClient, beta: ScriptedBeta) -> None:

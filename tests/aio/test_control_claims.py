@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 
 import pytest
 from hello import hello_ok
@@ -18,6 +19,7 @@ from urlab_client import (
 from urlab_client.aio import URLabClient
 from urlab_client.aio.control import process_owner
 from urlab_client.protocol.messages.control import ReleaseControl
+from urlab_client.web.explained_errors import explain_error
 
 OURS = process_owner()
 
@@ -57,6 +59,51 @@ async def test_writing_into_a_view_held_since_long_is_a_write(client: URLabClien
     view[0] = 0.75
     await client.step()
     assert (beta.owners, beta.ctrl["arm_C_0"]) == ({"arm_C_0": OURS}, [0.75])
+
+
+async def test_looking_at_set_points_is_no_write(client: URLabClient, beta: ScriptedBeta) -> None:
+    robot = client.articulations["arm_a"]
+    copied, doubled = robot.ctrl_array.copy(), robot.ctrl_array * 2.0
+    copied[:] = doubled[:] = 9.0
+    assert (robot.ctrl_array.tolist(), robot.get_ctrl()) == ([0.0], {"m": 0.0})
+    await client.step()
+    assert "claim_control" not in names(beta.arrived())
+
+
+async def test_writing_what_was_there_already_is_a_write(client: URLabClient, beta: ScriptedBeta) -> None:
+    """The server may have other set-points, of an owner from before."""
+    robot = client.articulations["arm_a"]
+    beta.ctrl["arm_C_0"] = [0.75]
+    robot.ctrl_array[:] = 0.0
+    await client.step()
+    assert (beta.owners, beta.ctrl["arm_C_0"]) == ({"arm_C_0": OURS}, [0.0])
+    await robot.release()
+    robot.ctrl_array[0] = 0.0
+    await client.step()
+    assert beta.owners == {"arm_C_0": OURS}
+
+
+async def test_what_was_changed_past_the_view_and_changed_back_is_sent(client: URLabClient, beta: ScriptedBeta) -> None:
+    set_points = client.articulations["arm_a"].ctrl_array
+    set_points += 0.5
+    await client.step()
+    set_points -= 0.5
+    await client.step()
+    assert beta.ctrl["arm_C_0"] == [0.0]
+
+
+@pytest.mark.parametrize("said", ["arm_C_0 is taken", "", "the dashboards have it", "belongs to dashboard"])
+@pytest.mark.parametrize("code", ["control_claimed", "not_control_owner"])
+async def test_a_refusal_names_the_owner_however_it_is_worded(
+    client: URLabClient, beta: ScriptedBeta, code: str, said: str
+) -> None:
+    beta.on("claim_control" if code == "control_claimed" else "step", error(code, said, owner="dashboard"))
+    client.articulations["arm_a"].set_ctrl({"m": 0.5})
+    with pytest.raises(NotControlOwner, match=r"\bdashboard\b.*force=True") as caught:
+        await client.step()
+    _, shown = explain_error(caught.value)  # in the console
+    assert re.findall(r"\bdashboard\b", shown["message"]) == ["dashboard"]
+    assert said in shown["message"]
 
 
 @pytest.mark.parametrize("mode", ["live", "direct"])
@@ -156,6 +203,27 @@ async def test_an_idle_claim_is_renewed(client: URLabClient, beta: ScriptedBeta)
     again = await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S)
     assert (again["op"], again["articulation"], again["ttl_s"]) == ("claim_control", "arm_a", 0.15)
     assert not again.get("force")
+
+
+async def test_a_claim_made_again_keeps_its_own_time_limit(client: URLabClient, beta: ScriptedBeta) -> None:
+    robot = client.articulations["arm_a"]
+    await robot.claim(ttl=7.5)
+    beta.owners.clear()
+    beta.arrived()
+    robot.set_ctrl({"m": 0.5})
+    await client.step()
+    assert [request["ttl_s"] for request in beta.arrived() if request["op"] == "claim_control"] == [7.5]
+
+
+async def test_a_renewal_that_fails_does_not_lose_the_claim(client: URLabClient, beta: ScriptedBeta) -> None:
+    await client.articulations["arm_a"].claim(ttl=0.15)
+    beta.arrived()
+    grant = beta.answers["claim_control"]
+    beta.on("claim_control", error("internal_error", "the editor is busy"))
+    assert (await asyncio.to_thread(beta.request))["op"] == "claim_control"
+    assert client.articulations["arm_a"].control_owner == OURS
+    beta.on("claim_control", grant)
+    assert (await asyncio.to_thread(beta.request))["ttl_s"] == 0.15
 
 
 async def test_an_observer_claims_nothing_by_itself(beta: ScriptedBeta) -> None:

@@ -87,17 +87,17 @@ async def test_rows_are_those_that_an_alpha_publishes(rover: Path) -> None:
 async def test_rows_come_with_own_steps(served: SimulatedServer) -> None:
     async with URLabClient(**served.client_options(), step_mode="direct") as client:
         await client.discover()
-        one = client.row_stream("rover_1", ["joint"], ["axle"], policy="all", timeout=DEADLINE_S)
+        one = client.row_stream("copy1_rover", ["joint"], ["axle"], policy="all", timeout=DEADLINE_S)
         every = client.row_stream(kinds=["base_state"], timeout=DEADLINE_S)
         async with one, every:
-            robot = client.articulations["rover_1"]
+            robot = client.articulations["copy1_rover"]
             for value in (0.5, -0.5):
                 robot.set_ctrl({"drive": value})
                 await client.step(5)
                 sample = await anext(one)
-                assert (sample.owner, sample.component) == ("rover_1", "axle")
+                assert (sample.owner, sample.component) == ("copy1_rover", "axle")
                 assert values_of(sample)[1] == np.float32(robot.get_qpos()["axle"])
-            assert {(await anext(every)).owner for _ in range(2)} == {"rover", "rover_1"}
+            assert {(await anext(every)).owner for _ in range(2)} == {"rover", "copy1_rover"}
             await client.reset()
             assert values_of(await anext(one))[1] == 0.0
 
@@ -120,7 +120,7 @@ async def test_silence_between_steps_is_no_sign_of_death(served: SimulatedServer
             await client.step(timeout=None)
             snapshot, row = await asyncio.gather(*first)
             assert snapshot.time == client.sim_time
-            assert row.owner in {"rover", "rover_1"}
+            assert row.owner in {"rover", "copy1_rover"}
             with pytest.raises(URLabTimeoutError, match="state") as caught:
                 await states.receive(timeout=0.01)
             assert "only in live mode" in str(caught.value.hint)

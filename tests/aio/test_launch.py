@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ import pytest
 from waiting import DEADLINE_S, eventually, pass_time, until
 
 import urlab_client
-from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
-from urlab_client.aio import URLabClient, launch
+from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable, URLabError
+from urlab_client.aio import URLabClient, check_address, launch
 from urlab_client.aio.launch import serve_arguments, start_seconds, with_model_options
 
 
@@ -119,6 +119,15 @@ async def test_a_model_that_is_not_there() -> None:
     assert children() == set()
 
 
+async def test_a_program_that_says_something_else_is_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "sitecustomize.py").write_text("print('{\"x\": ' + '[' * 50_000)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    async with URLabClient("sim://arm") as client:
+        with pytest.raises(ServerUnreachable, match="its first line is not a server's"):
+            await client.discover()
+    assert children() == set()
+
+
 async def test_a_killed_server_is_noticed() -> None:
     async with URLabClient("sim://ball", step_mode="direct") as client:
         await client.discover()
@@ -157,8 +166,8 @@ async def test_a_call_that_waits_for_a_connection_to_a_killed_server_ends(monkey
     processes: list[LateNews] = []
     start = launch._start
 
-    async def start_one(command: Sequence[str]) -> Any:
-        processes.append(LateNews(await start(command)))  # type: ignore[arg-type]
+    async def start_one(*arguments: Any) -> Any:
+        processes.append(LateNews(await start(*arguments)))
         return processes[-1]
 
     monkeypatch.setattr(launch, "_start", start_one)
@@ -220,6 +229,31 @@ def never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program.write_text(f"#!{sys.executable}\nimport time\nprint('{ready}', flush=True)\ntime.sleep(600)\n")
     program.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(program))
+
+
+@pytest.fixture
+def forks_and_never_ends(never_ends: None) -> None:
+    program = Path(sys.executable)
+    program.write_text(program.read_text().replace("\ntime", "\nimport os\nos.write(1, b'%d\\n' % os.fork())\ntime"))
+
+
+async def test_what_a_server_has_forked_does_not_delay_the_close(
+    forks_and_never_ends: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "_STOP_S", 0.1)
+    client = URLabClient("sim://ball", rcv_timeout_ms=1)
+    with pytest.raises(URLabError):  # on a busy machine its time is over before that is known
+        await client.discover()
+    process = client._transport._process  # type: ignore[attr-defined]
+    forked = max([int(await process.stdout.readline()) for _ in range(2)])  # the fork itself says 0
+    try:
+        async with asyncio.timeout(DEADLINE_S):
+            await client.close()
+    finally:
+        os.kill(forked, signal.SIGKILL)
+        for pipe in (process.stdout, process.stderr):
+            await pipe.read()
+    assert await process.wait() == -signal.SIGKILL
 
 
 async def test_cancelling_the_close_ends_the_server_at_once(never_ends: None) -> None:
@@ -316,3 +350,45 @@ def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:
 )
 def test_addresses_become_arguments(address: str, arguments: list[str]) -> None:
     assert serve_arguments(address) == arguments
+
+
+@pytest.mark.parametrize("option", ["insecure-no-auth", "server-key=a", "allow-client=a", "allow-any-client"])
+@pytest.mark.parametrize("flavour", [urlab_client.URLabClient, URLabClient])
+def test_no_address_opens_a_server_to_others(flavour: Any, option: str) -> None:
+    with pytest.raises(ValueError, match=rf"'{option.partition('=')[0]}' is for a server that others use"):
+        flavour(f"sim://arm?host=0.0.0.0&{option}")
+
+
+@pytest.mark.parametrize("address", ["sim://--host=0.0.0.0", "sim://arm?model=--until-eof", "sim://arm?model="])
+def test_what_an_address_names_as_a_model_is_no_option(address: str) -> None:
+    with pytest.raises(ValueError, match="names no model"):
+        URLabClient(address)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["sim://arm", "sim://arm?model=ball&camera-size=64x48&play", "sim://ball?play", "tcp://localhost:5569"],
+)
+def test_an_address_from_outside_may_say_what_is_allowed(address: str) -> None:
+    assert urlab_client.check_address is check_address
+    options, servers = {"camera-size", "play"}, ("tcp://localhost:5569",)
+    assert check_address(address, models=["arm", "ball"], options=options, servers=servers) == address
+
+
+@pytest.mark.parametrize(
+    ("address", "named"),
+    [
+        ("sim:///etc/passwd", "model '/etc/passwd'"),
+        ("sim://arm?model=../x.xml", "model '../x.xml'"),
+        ("sim://arm?saved-dir=/home/me", "option 'saved-dir'"),
+        ("sim://arm?camera-size=64x48&%73aved-dir=/home/me", "option 'saved-dir'"),
+        ("sim://arm?start-timeout=1e9", "option 'start-timeout'"),
+        ("sim://arm?-play", "option '-play'"),
+        ("SIM://arm", "server 'SIM://arm'"),
+        ("tcp://localhost", "server 'tcp://localhost'"),
+        ("ipc:///run/other", "server 'ipc:///run/other'"),
+    ],
+)
+def test_an_address_from_outside_may_say_nothing_else(address: str, named: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"the {named} is not one of those that are allowed")):
+        check_address(address, models=["arm"], options=["camera-size"], servers=["tcp://localhost:5569"])

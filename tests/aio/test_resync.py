@@ -10,12 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 from relay import Relay
+from scripted import names
+from scripted_beta import ScriptedBeta
 from waiting import DEADLINE_S, pass_time, until
 
 import urlab_client
 from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout, URLabTimeoutError
 from urlab_client.aio import URLabClient
-from urlab_client.server import SimulatedServer
+from urlab_client.protocol.messages.sim import BeginPie, StopPie
+from urlab_client.server import Delay, Faults, SimulatedServer
 
 MESSAGE = 60  # bytes: more than some heartbeats, less than any request or reply
 
@@ -92,6 +95,32 @@ async def test_with_nothing_in_doubt_everything_stays(server: SimulatedServer, t
             assert (found.step, found.time) == (client.step_count, before)
             assert client.session_id == session
         assert (await client.step()).step == client.step_count == 11
+
+
+@pytest.mark.parametrize("fault", ["cancelled", "timed out"])
+async def test_over_shared_memory_resync_does_not_overtake_an_abandoned_handshake(
+    server: SimulatedServer, relay: Relay, fault: str
+) -> None:
+    async with URLabClient(**options(server, relay) | {"transport": "shm"}) as client:
+        await client.discover()
+        await client.step(5)
+        swallowed, over_shm = relay.swallowed, client.transport_stats.over_shm
+        relay.freeze()
+        abandoned = asyncio.create_task(client.discover(timeout=DEADLINE_S))
+        await relay.until_swallowed(swallowed + MESSAGE)
+        if fault == "cancelled":
+            abandoned.cancel()
+        else:
+            pass_time(DEADLINE_S)
+        with pytest.raises(asyncio.CancelledError if fault == "cancelled" else URLabTimeoutError):
+            await abandoned
+        resync = asyncio.create_task(client.resync())
+        sent = client.transport_stats.sent
+        await until(lambda: client.transport_stats.sent > sent)
+        assert client.transport_stats.over_shm == over_shm
+        relay.thaw()
+        found = await resync
+        assert (await client.step(2)).step == client.step_count == found.step + 2
 
 
 async def test_a_reconnection_alone_leaves_no_doubt(client: URLabClient, relay: Relay) -> None:
@@ -195,11 +224,56 @@ async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None
     assert sent.index("step") < sent.index("forward")
 
 
+async def test_a_cancelled_stop_is_completed(beta_client: URLabClient, beta: ScriptedBeta) -> None:
+    """The plugin answers `stop_pie` when the end has been requested, not when play is over."""
+    stop, status, left = beta.answers["stop_pie"], beta.answers["pie_status"], 3
+    beta.on("stop_pie", {"op": "stop_pie_ok"})
+    stopping = asyncio.create_task(beta_client.sim.stop())
+    await until(lambda: "pie_status" in names(beta.arrived()))
+    stopping.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await stopping
+
+    def winding_down(request: dict[str, Any]) -> Any:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            stop(request)
+        return status(request)
+
+    beta.on("pie_status", winding_down)
+    found = await beta_client.resync()
+    assert (found.playing, beta_client.manager_present, left) == (False, False, 0)
+
+
+async def test_a_cancelled_handshake_of_another_world_is_made_up_for() -> None:
+    faults = Faults()
+    async with (
+        SimulatedServer("arm", play=True, faults=faults) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        await client.discover()
+        await client.scene.duplicate_actor("arm", "second", by_name=True)
+        await client.call(StopPie())  # as another program would: the client does not know
+        await client.call(BeginPie())
+        late = faults.add(Delay("hello", seconds=DEADLINE_S, times=1))
+        abandoned = asyncio.create_task(client.discover())
+        await until(lambda: late.applied)
+        abandoned.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await abandoned
+        late.remove()
+        await client.resync()
+        assert len(client.articulations) == 2
+        assert (await client.step(2)).step == 2
+
+
 @pytest.mark.parametrize("lose", [lose_the_reply, lose_the_request])
 async def test_a_lost_reset_is_found_out(client: URLabClient, relay: Relay, lose: Any) -> None:
-    await lose(relay, asyncio.create_task(client.reset()))
+    await lose(relay, asyncio.create_task(client.reset(seed=7)))
     found = await client.resync()
     assert found.reset_applied is (lose is lose_the_reply)
+    assert client.reset_seed == (7 if found.reset_applied else None)
     assert found.session_renewed is (lose is lose_the_request)
     assert found.time == client.sim_time == (0.0 if found.reset_applied else pytest.approx(0.01))
 
@@ -214,6 +288,17 @@ async def test_a_lost_mode_change_is_made_certain(client: URLabClient, relay: Re
     before = client.sim_time
     await client.step(4)
     assert client.sim_time == pytest.approx(before + 0.008)
+
+
+async def test_a_lost_pause_is_made_certain(client: URLabClient, relay: Relay, server: SimulatedServer) -> None:
+    session, play = client.session_id, server._running._core.play  # type: ignore[union-attr]
+    await lose_the_request(relay, asyncio.create_task(client.runtime.set_paused(True)))
+    await client.resync()
+    assert client.session_id != session, "it may still be on its way, and must not arrive after another"
+    assert play.running().engine.paused
+    assert not await client.runtime.set_paused(False)
+    await client.resync()
+    assert not play.running().engine.paused
 
 
 async def test_a_lost_push_is_found_out_and_the_local_state_stays(client: URLabClient, relay: Relay) -> None:

@@ -144,6 +144,22 @@ def test_latest_keeps_one_message_however_large() -> None:
     assert len(buffer) == 1
 
 
+@pytest.mark.parametrize("policy", [StreamPolicy.LATEST, StreamPolicy.LATEST_PER_KEY])
+def test_a_gap_is_told_with_what_took_over(policy: StreamPolicy) -> None:
+    buffer = StreamBuffer(policy, 10, 1000)
+    buffer.note_gap("reconnected")
+    for _ in range(3):
+        buffer.push(b"a", b"", 0)
+    buffer.push(b"a", b"", 0)
+    entry = buffer.pop()
+    assert entry is not None
+    assert (entry.seq, entry.dropped, entry.gap) == (4, 3, "reconnected")
+    buffer.push(b"a", b"", 0)
+    entry = buffer.pop()
+    assert entry is not None
+    assert entry.gap is None
+
+
 @pytest.mark.parametrize("limits", [(0, 1), (1, 0)])
 def test_a_buffer_without_room_is_refused(limits: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="at least one item and one byte"):

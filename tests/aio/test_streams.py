@@ -386,6 +386,23 @@ class TestPolicies:
             stats = states.stats
             assert (stats.delivered, stats.dropped, stats.malformed, stats.waiting) == (1, 1, 1, 0)
 
+    async def test_what_is_lost_after_an_item_was_looked_at_is_told_with_it(
+        self, publisher: Publisher, state: StateSource
+    ) -> None:
+        async with everything(state, buffer=2) as states, Marker(state, publisher) as marker:
+            await publisher.subscribed(STATE)
+            for time in (1.0, 2.0):
+                publisher.send(STATE, snapshot(time))
+            await until(lambda: states.stats.received == 2)
+            seen = states.latest()
+            assert seen is not None
+            assert (seen.time, seen.dropped) == (2.0, 0)
+            await marker.passed()
+            with pytest.raises(StreamOverflow, match="1 messages were lost"):
+                await states.receive()
+            assert await states.receive() is seen
+            assert seen.dropped == 1
+
     @pytest.mark.parametrize(
         ("options", "problem"),
         [
@@ -855,6 +872,25 @@ class TestBackground:
         await until(lambda: taken)
         assert taken == [-1.0]
         reception.stop()
+
+    async def test_a_snapshot_that_waited_for_the_lock_is_not_taken_over_after_the_end(
+        self, publisher: Publisher, state: StateSource
+    ) -> None:
+        lock = threading.RLock()
+        taken: list[float] = []
+        reception = LiveState(state, lambda found: taken.append(found.time), lock)
+        reception.start()
+        with lock:  # of this very thread, which counts as another's
+            async with Marker(state, publisher) as marker:
+                await publisher.subscribed(STATE)
+                await marker.passed()
+            loop = asyncio.get_running_loop()
+            waiting = [timer for timer in loop._scheduled if not timer.cancelled() and "_try_again" in repr(timer)]
+            assert waiting, "it is tried again"
+            reception.stop()
+        assert all(timer.cancelled() for timer in waiting)
+        reception.on_drained()
+        assert taken == []
 
     async def test_what_does_not_fit_is_refused_and_reception_goes_on(
         self, publisher: Publisher, state: StateSource, caplog: pytest.LogCaptureFixture

@@ -17,12 +17,13 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
-from waiting import pass_time, until
+from scripted import client_of
+from waiting import DEADLINE_S, pass_time, until
 from wire_log import WireLog
 
 from urlab_client import NoSession, NotReady, SessionTakenOver, StepMode, URLabTimeoutError
 from urlab_client.aio import URLabClient
-from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.runtime import ListKeyframes, SetMode
 from urlab_client.protocol.messages.session import Forward, Hello
 from urlab_client.protocol.messages.streams import SessionOpened
 from urlab_client.server import Cut, Delay, Drop, Faults, Refuse, SimulatedServer
@@ -274,6 +275,16 @@ async def test_a_cancelled_start_is_told(faults: Faults, served: tuple[Simulated
 
 
 # Deadlines
+
+
+async def test_a_call_waits_for_no_background_request_however_many_begin_at_once(scripted: Any) -> None:
+    async with client_of(scripted, local_model=False) as client:
+        await client.discover()
+        probe = client._session.probe
+        probes = [asyncio.create_task(probe(ListKeyframes(), timeout=DEADLINE_S)) for _ in range(2)]
+        await until(scripted.held.qsize)
+        assert await client.meta(timeout=5)
+        assert await asyncio.gather(*probes) == [None, None]
 
 
 async def test_a_step_that_waits_for_pictures_has_no_less_time_than_any_other(scripted: Any) -> None:

@@ -8,31 +8,30 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+from children import DEADLINE_S, child
 
-DEADLINE_S = 240.0
 FREE_PORTS = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
 GYMNASIUM_MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 def urlab(
-    *arguments: str | Path, cwd: Path, environment: Mapping[str, str] | None = None
+    *arguments: str | Path, cwd: Path, environment: Mapping[str, str] | None = None, **outputs: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
+    """Run a command to its end, with pipes where no other outputs are given."""
     return subprocess.run(
         [sys.executable, "-m", "urlab_client", *map(str, arguments)],
         cwd=cwd,
         env={**os.environ, **(environment or {})},
         stdin=subprocess.DEVNULL,
-        capture_output=True,
         text=True,
         timeout=DEADLINE_S,
         check=False,
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **outputs},
     )
 
 
@@ -91,27 +90,6 @@ class Server:
             self.process.send_signal(number)
         out, err = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, out, err
-
-
-@contextlib.contextmanager
-def child(*command: str | Path, cwd: Path) -> Generator[subprocess.Popen[str]]:
-    """Run a Python program with pipes; it is killed when it outlives the deadline or the block."""
-    process = subprocess.Popen(
-        [sys.executable, *map(str, command)],
-        cwd=cwd,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    watchdog = threading.Timer(DEADLINE_S, process.kill)
-    watchdog.start()
-    with process:
-        try:
-            yield process
-        finally:
-            watchdog.cancel()
-            process.kill()
 
 
 @contextlib.contextmanager

@@ -19,10 +19,12 @@ def test_a_paused_simulation(tmp_path: Path) -> None:
     assert "it is paused. Call runtime.set_paused(False)." in done.stdout
 
 
-def test_json_of_a_running_one(tmp_path: Path) -> None:
+def test_json_of_a_running_one_where_only_ascii_can_be_written(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True, unpaused=True) as server:
-        done = urlab("doctor", f"{server.address}:{server.step_port}", "--json", "--timeout=30", cwd=tmp_path)
+        command = ["doctor", f"{server.address}:{server.step_port}", "--json", "--timeout=30"]
+        done = urlab(*command, cwd=tmp_path, environment={"PYTHONIOENCODING": "ascii"})
     assert done.returncode == 0, done.stderr
+    assert "m/s²" in str(json.loads(done.stdout))
     subjects = {finding["subject"]: finding["verdict"] for finding in json.loads(done.stdout)["findings"]}
     assert subjects["play"] == "ok"
 

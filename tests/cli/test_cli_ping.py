@@ -148,6 +148,7 @@ def test_the_registry_is_listed(
             content = entry | ({} if said is None else {"registry_written_at": said})
             (tmp_path / f"{name}_1.json").write_text(json.dumps(content))
         (tmp_path / "broken_1.json").write_text("{")
+        (tmp_path / "deep_1.json").write_text('{"x": ' + "[" * 100_000)
         (tmp_path / "far_1.json").write_text(json.dumps(entry | {"host": "elsewhere.example", "instance_id": "far"}))
         assert main(["ping", "--all", "--json", "--timeout", "1"]) == 0
         listed = json.loads(capsys.readouterr().out)

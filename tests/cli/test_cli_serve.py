@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import socket
 from pathlib import Path
 
 import pytest
-from commands import DEADLINE_S, FREE_PORTS, GYMNASIUM_MODELS, child, refusal, served, signals_kept, urlab
+from children import DEADLINE_S, child, in_background
+from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, signals_kept, urlab
 from waiting import eventually
 
 from urlab_client import ModeLocked, URLabClient, URLabPDController
@@ -43,17 +45,19 @@ def test_serves_until_told_to_stop_and_leaves_nothing_behind(tmp_path: Path, end
         pass
 
 
-def test_leaves_ctrl_c_to_the_program_that_holds_its_input(tmp_path: Path) -> None:
-    with (
-        served("ball", "--play", "--until-eof", cwd=tmp_path) as server,
-        URLabClient(**server.client_options, step_mode="direct") as client,
-    ):
+@pytest.mark.parametrize("background", [False, True])
+def test_leaves_ctrl_c_to_the_program_that_holds_its_input_or_the_terminal(tmp_path: Path, background: bool) -> None:
+    options = [] if background else ["--until-eof"]
+    with contextlib.ExitStack() as stack:
+        with in_background() if background else contextlib.nullcontext():
+            server = stack.enter_context(served("ball", "--play", *options, cwd=tmp_path))
+        client = stack.enter_context(URLabClient(**server.client_options, step_mode="direct"))
         client.discover()
         server.process.send_signal(signal.SIGINT)
         for _ in range(20):
             client.step(1000)
         assert client.sim_time == pytest.approx(40)
-        assert server.end(None) == (0, "", "")
+        assert server.end(signal.SIGTERM if background else None) == (0, "", "")
 
 
 def test_ends_while_a_client_is_connected_and_physics_runs(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shlex
@@ -9,11 +10,13 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Generator
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import DEADLINE_S, child, refusal, urlab
+from children import DEADLINE_S, child
+from commands import refusal, urlab
 
 from urlab_client.cli import _parser, main
 from urlab_client.server import bundled_models
@@ -148,10 +151,11 @@ def test_an_address_that_is_none_is_one_line_that_says_so(
 
 
 def test_a_terminal_without_the_characters_of_a_file_name_shows_their_numbers(tmp_path: Path) -> None:
-    done = urlab("keys", "new", "ключ", cwd=tmp_path, environment={"PYTHONIOENCODING": "cp1252"})
+    name = os.fsdecode("ключ".encode())  # also in a locale of ASCII
+    done = urlab("keys", "new", name, cwd=tmp_path, environment={"PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "1"})
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(r"\u043a\u043b\u044e\u0447.key")
-    assert (tmp_path / "ключ.key").is_file()
+    assert (tmp_path / f"{name}.key").is_file()
 
 
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:
@@ -170,20 +174,32 @@ def test_ctrl_c_is_exit_code_130_without_a_traceback(tmp_path: Path) -> None:
     assert (ping.returncode, out, err) == (130, "", "")
 
 
-def test_a_reader_that_has_gone_is_no_traceback(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
+@pytest.mark.parametrize("command", ["ping sim://ball --no-session", ""])
+def test_a_reader_that_has_gone_ends_a_command_silently(command: str, unbuffered: str, tmp_path: Path) -> None:
+    with unread() as stdout:
+        done = urlab(*command.split(), cwd=tmp_path, stdout=stdout, environment={"PYTHONUNBUFFERED": unbuffered})
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_so_does_the_reader_of_the_errors(tmp_path: Path) -> None:
+    with unread() as stderr:
+        done = urlab("info", "nothing.mcap", cwd=tmp_path, stderr=stderr)
+    assert (done.returncode, done.stdout) == (141, "")
+
+
+@contextlib.contextmanager
+def unread() -> Generator[int]:
+    """Yield a pipe that nobody reads any more."""
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        ping = subprocess.run(
-            [sys.executable, "-m", "urlab_client", "ping", "sim://ball", "--no-session"],
-            cwd=tmp_path,
-            stdin=subprocess.DEVNULL,
-            stdout=writing,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=DEADLINE_S,
-            check=False,
-        )
+        yield writing
     finally:
         os.close(writing)
-    assert (ping.returncode, ping.stderr) == (2, "")
+
+
+def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with open(os.devnull, "rb") as read_only:
+        done = urlab("robots", cwd=tmp_path, stdout=read_only, environment={"PYTHONUNBUFFERED": ""})
+    assert (done.returncode, done.stderr) == (2, "urlab: Bad file descriptor\n")

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from commands import DEADLINE_S, child
+from children import DEADLINE_S, child, in_background
 from relay import Relay
 from waiting import eventually, until
 
@@ -111,3 +111,12 @@ def test_ctrl_c_ends_a_recording_early_and_whole(mode: str, tmp_path: Path) -> N
     assert (recording.returncode, err) == (0, "")
     assert out.startswith(f"{path}  ")
     assert read_run(path).summary().complete
+
+
+async def test_in_the_background_only_sigterm_ends_it() -> None:
+    with in_background(), _watching.interruptible() as stop:
+        signal.raise_signal(signal.SIGINT)
+        await asyncio.sleep(0)
+        assert not stop.is_set()
+        signal.raise_signal(signal.SIGTERM)
+        await asyncio.wait_for(stop.wait(), DEADLINE_S)

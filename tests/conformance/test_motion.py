@@ -189,6 +189,21 @@ async def test_time_that_passed_before_a_client_came_does_not_count(
         assert await again.articulations["kinds"].move_to({"knee": 0.0}) > 0.0, "it was elsewhere"
 
 
+async def test_a_client_that_comes_between_the_steps_of_another_knows_where_it_begins(
+    connect: Any, server: Any
+) -> None:
+    first, late = connect(server, step_mode="direct"), connect(server, step_mode="direct")
+    await first.discover()
+    await first.articulations["kinds"].move_to({"knee": 0.6})
+    await first.run_for(1.0)
+    await late.discover()
+    seen: list[float] = []
+    knee = late.articulations["kinds"].joints["knee"]
+    assert await late.wait_until(lambda: seen.append(knee.position) or True) == 0.0
+    assert seen == [first.articulations["kinds"].joints["knee"].position]
+    assert await late.run_for(0.2) == pytest.approx(0.2)
+
+
 async def test_waiting_ends_when_it_is_so(moving: Any) -> None:
     (art,) = moving.articulations.values()
     art.set_ctrl({"push": 1.0})

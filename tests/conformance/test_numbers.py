@@ -111,7 +111,10 @@ async def test_one_of_several_inputs_is_named_by_its_number(connect: Any, serve:
 async def test_huge_set_points_are_numbers(client: Any) -> None:
     bot = client.articulations["bot"]
     bot.ctrl_array[:] = 1e308
+    steps = client.step_count
     await client.step()
+    assert client.step_count == steps + 1
+    assert np.abs(bot.last_applied_ctrl).min() > 1e30, "they were applied"
     bot.ctrl_array[:] = 0
 
 

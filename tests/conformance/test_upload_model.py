@@ -10,7 +10,7 @@ import pytest
 
 from urlab_client import ImportFailed, UnknownOp, UploadProgress, URLabAsset, URLabClient, URLabTimeoutError
 from urlab_client.aio import URLabClient as AsyncClient
-from urlab_client.server import Delay, Drop, Faults, SimulatedServer
+from urlab_client.server import Cut, Delay, Drop, Faults, SimulatedServer
 
 MESH = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 ROBOT = """
@@ -107,6 +107,17 @@ def test_a_model_goes_over_zmq_and_its_import_takes_its_time(robot: Path, memory
         assert client.scene.upload_model(robot).class_path
         assert client.transport_stats.over_shm == before
         assert slow.seen == 1
+
+
+def test_an_upload_goes_on_after_a_cut_connection(robot: Path) -> None:
+    with (
+        SimulatedServer(dialect="beta", faults=Faults(Cut(op="upload_model_chunk", times=1))) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        client.discover()
+        seen: list[UploadProgress] = []
+        assert client.scene.upload_model(robot, on_progress=seen.append).imported_now
+        assert seen[-1].sent_bytes == seen[-1].total_bytes
 
 
 def test_a_chunk_whose_reply_was_lost_is_not_sent_again(robot: Path) -> None:

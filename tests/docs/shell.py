@@ -24,6 +24,7 @@ NOT_RUN = {
     r"python3 -m pip wheel": "fetches the build backend: tests/packaging builds the wheel with the one installed",
     r"\.venv/bin/python -m pytest$": "is this run",
     r"\.venv/bin/python -m pytest tests/protocol/test_registry.py ": "test_docs_adding_an_op.py runs it in a copy",
+    r"\.venv/bin/python tools/sample_mutants\.py": "takes hours: tests/tools/test_sample_mutants.py runs its parts",
     r"(\.venv/bin/python|python3) tools/gen_": "writes to the repository: test_docs_adding_an_op.py does it in a copy",
     r"(ssh|scp) ": "goes to a second machine",
     r"urlab console( tcp://10\..*)?$": "goes to an editor",

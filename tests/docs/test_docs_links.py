@@ -42,9 +42,7 @@ def test_every_thread_is_in_the_architecture_page() -> None:
         for part in ("aio", "sync", "server")
         for path in PACKAGE.rglob(f"{part}/**/*.py")
     ]
-    threads = {
-        name for source in sources for name in re.findall(r'(?:name=|ServingThread\()"(urlab-[a-z]+)", ', source)
-    }
+    threads = {name for source in sources for name in re.findall(r'[tT]hread\(\s*"(urlab-[a-z]+)"', source)}
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert threads >= {"urlab-io", "urlab-rpc", "urlab-physics"}
     assert sorted(threads - set(re.findall(r"`(urlab-[a-z]+)`", page))) == []

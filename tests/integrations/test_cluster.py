@@ -310,6 +310,14 @@ def test_a_policy_that_raises_ends_the_run_with_its_error(cluster: Any) -> None:
         list(rollouts(policy, "sim://arm", 2, n_workers=1, **OPTIONS))
 
 
+def test_what_a_server_refuses_is_not_asked_again(cluster: Any) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    options = OPTIONS | {"env_options": {"keyframe": "away"}}
+    with pytest.raises(RolloutError, match=r"Episode 0 raised UnknownKeyframe: .*arm_home"):
+        list(rollouts(noisy(), "sim://arm", 2, n_workers=1, **options))
+
+
 def test_a_scene_that_no_server_can_load_uses_up_the_attempts(cluster: Any) -> None:
     from urlab_client.cluster import RolloutError, rollouts
 
@@ -348,6 +356,51 @@ def test_an_attempt_that_takes_too_long_is_ended_with_its_server(
     with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 90 s"):
         list(rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=90, **OPTIONS))
     assert gone(tmp_path / "notes")
+    os.close(writers[0])
+
+
+def waits_once(fifo: Path, notes: Path, pool: Any) -> Any:
+    """Return a policy that notes who holds the pool's address, and whose first attempt waits for what nobody writes."""
+    fifo_name, notes_name = str(fifo), str(notes)
+    os.mkfifo(fifo_name)
+    Path(notes_name).touch()
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        seen = Path(notes_name).read_text().split()
+        (holder,) = pool.holders().values()
+        if holder not in seen:
+            Path(notes_name).write_text(" ".join([*seen, str(holder)]))
+        if not seen:
+            os.read(os.open(fifo_name, os.O_RDONLY), 1)
+        return rng.normal(scale=0.3, size=7)
+
+    return policy
+
+
+def test_an_attempt_that_takes_too_long_leaves_its_lease_to_the_next(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from urlab_client.cluster import LeasePool, rollouts
+
+    writers: list[int] = []
+
+    def clock() -> float:
+        if not writers:
+            with contextlib.suppress(OSError):  # as long as nobody reads: the policy does not wait yet
+                writers.append(os.open(tmp_path / "fifo", os.O_WRONLY | os.O_NONBLOCK))
+        return time.monotonic() + 100 * len(writers)
+
+    monkeypatch.setattr(import_module("urlab_client.cluster.rollouts"), "time", SimpleNamespace(monotonic=clock))
+    with SimulatedServer("arm", play=True) as server:
+        address = f"{server.address}:{server.step_port}"
+        pool = LeasePool([address], ttl=600)  # far longer than this test
+        policy = waits_once(tmp_path / "fifo", tmp_path / "notes", pool)
+        (episode,) = rollouts(policy, pool, 1, retries=1, episode_timeout=90, **OPTIONS)
+        assert episode.attempt == 2
+        first, second = (tmp_path / "notes").read_text().split()
+        assert first != second, "what the first attempt gives back late is not the second's"
+        assert pool.holders() == {address: None}
+        pool.close()
     os.close(writers[0])
 
 

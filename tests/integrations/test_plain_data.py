@@ -181,6 +181,11 @@ def test_whatever_a_call_returns_comes_back_from_its_data(value: Any, arrays: An
         (Diagnosis, {"findings": [7]}, r"findings\[0\]: 7 is not a mapping of fields"),
         (Pose, [], r"Pose: \[\] is not a mapping"),
         (CameraPose, {"location": [0, 0, True]}, "missing|does not fit float"),
+        (Pose, {"position": [0, 0, 10**400], "quaternion": [1, 0, 0, 0]}, r"position\[2\]: int too large"),
+        (Pose, {None: 1}, "no field None"),
+        (ClientEvent, {"event": ["lost"]}, r"\['lost'\] is none of"),
+        (ArticulationState, {"qpos": [10**400], "qvel": []}, "qpos: int too large"),
+        (ArticulationState, {"qpos": [[0.0], [0.0, 1.0]], "qvel": []}, "qpos: "),
     ],
 )
 def test_data_that_do_not_fit_are_refused_by_name(kind: type[Any], data: Any, problem: str) -> None:
@@ -188,6 +193,8 @@ def test_data_that_do_not_fit_are_refused_by_name(kind: type[Any], data: Any, pr
         kind.from_dict(data)
     with pytest.raises(ValueError, match=f"{kind.__name__}: "):
         kind.from_json("{")
+    with pytest.raises(ValueError, match=f"{kind.__name__}: .*recursion"):
+        kind.from_json("[" * 100_000)
 
 
 def test_numbers_that_are_not_finite_are_strings_that_pydantic_and_javascript_read() -> None:

@@ -6,6 +6,7 @@ import asyncio
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -26,7 +27,8 @@ from urlab_client.integrations.policy import (
     run,
     run_blocking,
 )
-from urlab_client.server import SimulatedServer
+from urlab_client.protocol.enums import StepMode
+from urlab_client.server import ControllerConfig, SimulatedServer
 
 QUADRUPED = "sim://quadruped?controller=quadruped=pd"
 
@@ -134,12 +136,21 @@ def arm() -> Iterator[URLabClient]:
             "default .* between low and hi",
         ),
         ("[gains]", "[gains", "not TOML: .*line"),
+        ("[gains]", "a = " + "[" * 100_000 + "\n[gains]", "not TOML: .*recursion"),
+        ("[gains]", "a = " + "1" * 5000 + "\n[gains]", "not TOML: .*4300 digits"),
     ],
 )
 def test_a_declaration_that_cannot_work_is_refused_by_file_and_key(old: str, new: str, said: str) -> None:
     with pytest.raises(PolicyFileError, match=said) as caught:
         parse_spec(walk((old, new)), "walk.toml")
     assert str(caught.value).startswith("walk.toml: ")
+
+
+@pytest.mark.parametrize("term", ["1", "[1]", "'gravity'", "{term = 1}", "{term = ['gravity']}", "{}"])
+def test_terms_of_a_wrong_type_are_refused(term: str) -> None:
+    text = f"observation = [{term}]\n" + WALK.replace("[[observation]]", "[[ignored]]")
+    with pytest.raises(PolicyFileError, match=r"walk\.toml: "):
+        parse_spec(text, "walk.toml")
 
 
 def test_a_table_for_a_normaliser_gets_advice() -> None:
@@ -226,6 +237,9 @@ def test_scales_clips_history_command_and_last_action_make_the_input(quadruped: 
     assert thighs == {"FL_thigh": 0.1 + 0.5 * 1.0, "FR_thigh": 0.1 - 0.25 * 0.5}
     policy.reset()
     assert policy.action.tolist() == [0.0, 0.0]
+    policy.command = [0.2, 0.0, 0.0]
+    policy.act(robot)
+    assert inputs[-1] == first + first, "nothing of the episode before"
     for wrong in ([2.0, 0.0, 0.0], [0.1], [np.nan, 0.0, 0.0]):
         with pytest.raises(ValueError, match=r"from \[0.0, 0.0, -1.0\] to \[1.0, 0.0, 1.0\]"):
             policy.command = wrong
@@ -460,6 +474,48 @@ async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch:
         with pytest.raises(URLabError, match="Physics stands still"):
             await run(client, policy, seconds=60.0, on_action=pause)
         await tasks[0]
+
+
+class Overslept:
+    """A client whose simulation is always a few physics steps further than its program waited for."""
+
+    step_mode = StepMode.LIVE
+    LATE = 3
+
+    def __init__(self, client: aio.URLabClient) -> None:
+        self._client = client
+        self.runtime = SimpleNamespace(set_paused=self._unpause)
+        self.waits = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    async def step(self, *, include_cameras: object = False) -> None:
+        """What sends set-points takes no time; then the simulation runs until the program wakes up."""
+        if self.waits:
+            due = np.ceil((self.sleeps - 1e-9) / 0.002)
+            await self._client.step(int(due) + self.LATE)
+        self.waits = False
+
+    async def sleep(self, seconds: float) -> None:
+        self.waits, self.sleeps = True, seconds
+
+    async def _unpause(self, paused: bool) -> None:
+        assert not paused
+
+
+async def test_a_live_policy_that_wakes_late_keeps_its_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SimulatedServer("quadruped", play=True, controllers={"quadruped": ControllerConfig()}) as server:
+        async with aio.URLabClient(**server.client_options(), step_mode="direct") as client:
+            await client.discover()
+            late = Overslept(client)
+            monkeypatch.setattr(
+                "urlab_client.integrations.policy.runner.asyncio",
+                SimpleNamespace(sleep=late.sleep, get_running_loop=asyncio.get_running_loop),
+            )
+            found = await run(late, policy_of(WALK, lambda _: np.zeros(2)), seconds=1.0)
+    assert found.actions == 50, "one each 20 ms, as if each had come in time"
+    assert found.late == 0
 
 
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 import urlab_client
 from urlab_client.cli import main
@@ -261,6 +262,34 @@ def test_late_lost_and_noisy_samples_are_seen_and_rewards_are_judged_without(mad
         ):
             with pytest.raises(ValueError, match=reason):
                 URLabBatchEnv(where(server), 1, task=Reach(), observations=["qpos"], randomise=declared)
+
+
+def test_an_episode_ends_with_what_was_seen_and_leaves_nothing_to_the_next(made: list[Any]) -> None:
+    disturbed = Randomisation(
+        noise=(Noise(field="qpos", std=0.01, bias=0.05),), delay=Delay(observation=(1, 2), action=2, drop=0.2)
+    )
+    with SimulatedServer("arm", play=True) as server:
+
+        def env_of(mode: AutoresetMode) -> URLabBatchEnv:
+            options: Any = {"observations": ["qpos"], "randomise": disturbed, "max_episode_steps": 3}
+            env = URLabBatchEnv(where(server), 2, autoreset_mode=mode, **options)
+            made.append(env)
+            return env
+
+        def episode(env: URLabBatchEnv) -> list[Any]:
+            seen = [env.reset(seed=5)[0]]
+            actions = (np.full(env.action_space.shape, 0.3 * k, dtype=np.float32) for k in (1, 2, 3))
+            return [*seen, *(env.step(action) for action in actions)]
+
+        disabled, same_step = env_of(AutoresetMode.DISABLED), env_of(AutoresetMode.SAME_STEP)
+        first, second = episode(disabled), episode(disabled)
+        assert np.array_equal(first[0], second[0])
+        for ours, theirs in zip(first[1:], second[1:], strict=True):
+            assert np.array_equal(ours[0], theirs[0]), "no action or picture of the episode before"
+        ended = episode(same_step)[-1]
+        assert ended[3].all()
+        for final, last in zip(ended[4]["final_obs"], first[-1][0], strict=True):
+            assert np.array_equal(final, last), "the last observation as the agent sees it, noise and delay included"
 
 
 def test_what_varied_is_recorded_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

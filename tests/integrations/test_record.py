@@ -7,8 +7,6 @@ import errno
 import gc
 import json
 import math
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +16,10 @@ import hypothesis
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from children import child
+from made_recordings import Robot, messages_of, write_messages, write_recording
 from mcap.reader import make_reader
+from mcap.writer import IndexType
 from waiting import eventually, until
 
 import urlab_client
@@ -357,19 +358,14 @@ with URLabClient(address, step_mode="direct") as client:
 def test_a_killed_process_leaves_what_was_written(server: SimulatedServer, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     address = f"{server.address}:{server.step_port}"
-    with subprocess.Popen([sys.executable, "-c", CHILD, address, path], stdout=subprocess.PIPE, text=True) as child:
-        guard = threading.Timer(60, child.kill)
-        guard.start()
-        assert child.stdout is not None
+    with child("-c", CHILD, address, path, stderr=None) as recording:
+        assert recording.stdout is not None
         start = written = 0
-        for line in child.stdout:
+        for line in recording.stdout:
             _, _, written = map(int, line.split())
             start = start or written
             if written > start:  # a chunk is in the file
                 break
-        child.kill()
-        child.wait()
-        guard.cancel()
     run = read_run(path)
     table = run.table()
     assert len(table) > 0
@@ -405,6 +401,19 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
     cut.write_bytes(b"PK" + whole)
     with pytest.raises(RecordingError, match="neither an MCAP file"):
         read_run(cut)
+
+
+def test_messages_out_of_order_are_found_without_an_index(tmp_path: Path) -> None:
+    source, shuffled = tmp_path / "run.mcap", tmp_path / "shuffled.mcap"
+    write_recording(source, (({"arm": Robot([float(number)])}, {}) for number in range(6)))
+    content = messages_of(source)
+    unindexed = {"use_chunking": False, "index_types": IndexType.NONE}
+    write_messages(shuffled, [content[number] for number in (3, 1, 0, 5, 2, 4)], **unindexed)
+    for time in np.arange(-0.005, 0.06, 0.005).tolist():
+        expected, found = read_run(source).state_at(time), read_run(shuffled).state_at(time)
+        assert (expected is None) == (found is None)
+        if expected is not None and found is not None:
+            assert found.articulations["arm"].qpos.tolist() == expected.articulations["arm"].qpos.tolist()
 
 
 def test_damage_costs_what_is_damaged_and_no_more(

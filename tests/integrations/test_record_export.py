@@ -16,6 +16,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from made_recordings import Robot, write_recording
 from PIL import Image
 from pyarrow import parquet
 
@@ -29,11 +30,14 @@ from urlab_client.integrations.record import (
     RecordingError,
     Run,
     export,
+    lerobot_process,
     lerobot_writer,
     read_run,
     record,
     table_builder,
 )
+from urlab_client.integrations.record.lerobot_process import LeRobot
+from urlab_client.integrations.record.lerobot_writer import _rate
 from urlab_client.integrations.record.pixels import even, visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
@@ -259,6 +263,22 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
 
 
+def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    python = tmp_path / "python"
+    python.write_text(
+        f"#!{sys.executable}\nimport os, time\n"
+        "if encodes := os.fork():\n    open(os.sys.argv[3] + '/encodes', 'w').write(str(encodes))\n    os._exit(0)\n"
+        "time.sleep(600)\n"
+    )
+    python.chmod(0o700)
+    monkeypatch.setattr(lerobot_process, "_DEADLINE_S", 0.1)
+    with LeRobot(str(python), tmp_path) as writer:
+        writer._process.wait()
+        with pytest.raises(RecordingError, match="LeRobot did not finish"):
+            writer.finish()
+    os.kill(int((tmp_path / "encodes").read_text()), signal.SIGKILL)
+
+
 @pytest.mark.usefixtures("small_pieces")
 def test_a_lerobot_dataset_is_whole_or_not_there(recorded: Run, tmp_path: Path, lerobot: str) -> None:
     stand_in = next(tmp_path.rglob("lerobot_dataset.py"))
@@ -311,6 +331,17 @@ def test_a_frame_never_shows_an_older_picture_unasked(recorded: Run, tmp_path: P
     ):
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
     assert not (tmp_path / "spins").exists()
+
+
+def test_the_rate_is_the_usual_one_although_pictures_are_missing(recorded: Run) -> None:
+    times = np.arange(50) / 25
+    assert _rate(recorded, [np.delete(times, [7, 8, 20]), np.delete(times, [3])]) == 25
+
+
+def test_a_dataset_of_centuries_is_refused(tmp_path: Path, lerobot: str) -> None:
+    write_recording(tmp_path / "run.mcap", [({"arm": Robot([0.0])}, {})] * 3, period_ns=10**18)
+    with pytest.raises(RecordingError, match=r"run\.mcap: .* more than 10000000 frames"):
+        export.write_lerobot(read_run(tmp_path / "run.mcap"), tmp_path / "made", python=lerobot, task="t", fps=30)
 
 
 def test_a_missing_lerobot_is_told(recorded: Run, tmp_path: Path) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import struct
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from children import in_background
 from made_recordings import Robot, write_recording
 
 from urlab_client._whole_files import replaced
@@ -116,7 +118,10 @@ def interrupting(limit: int) -> Any:
     return progress
 
 
-def test_a_conversion_that_is_terminated_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("job", [contextlib.nullcontext, in_background], ids=["in a terminal", "in the background"])
+def test_a_conversion_that_is_terminated_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: Callable[[], contextlib.AbstractContextManager[None]]
+) -> None:
     write_recording(tmp_path / "run.mcap", steady(10))
 
     def half(_run: Run, path: Path, *_: Any, **__: Any) -> int:
@@ -128,7 +133,8 @@ def test_a_conversion_that_is_terminated_leaves_nothing(tmp_path: Path, monkeypa
     monkeypatch.setattr(export, "write_csv", half)
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # where it is not heeded the file is made
     try:
-        assert main(["convert", str(tmp_path / "run.mcap"), str(tmp_path / "run.csv")]) == 130
+        with job():
+            assert main(["convert", str(tmp_path / "run.mcap"), str(tmp_path / "run.csv")]) == 130
     finally:
         signal.signal(signal.SIGTERM, before)
     assert os.listdir(tmp_path) == ["run.mcap"]

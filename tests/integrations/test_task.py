@@ -146,6 +146,29 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(made: 
     assert task.ends == [(bool(success), 2) for success in near]
 
 
+def test_ended_is_told_the_length_of_its_own_episode(made: list[Any]) -> None:
+    class Falls(Reach):
+        """An episode of environment i ends after i + 2 actions."""
+
+        def __init__(self) -> None:
+            self.acted, self.ends = np.zeros(3, dtype=int), []
+
+        def terminated(self, states: Any) -> Any:
+            self.acted += 1
+            return self.acted == np.arange(3) + 2
+
+        def ended(self, success: bool, steps: int) -> None:
+            self.ends.append(steps)
+
+    task = Falls()
+    env = URLabBatchEnv("sim://arm", 3, task=task)
+    made.append(env)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    assert task.ends == [2, 3, 4]
+
+
 def test_where_some_episodes_begin_anew_infos_tell_of_all(made: list[Any]) -> None:
     disabled, same_step = AutoresetMode.DISABLED, AutoresetMode.SAME_STEP
     env = URLabBatchEnv(Reach.scene_address, 2, task=Reach(), max_episode_steps=2, autoreset_mode=disabled)

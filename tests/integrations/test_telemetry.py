@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from children import child
 from opentelemetry.sdk.metrics import MeterProvider
 from opentelemetry.sdk.metrics.export import InMemoryMetricReader
 from opentelemetry.sdk.trace import TracerProvider
@@ -153,9 +152,9 @@ def test_a_server_counts_what_it_answers_and_bears_callbacks_that_fail(
 def test_urlab_serve_has_metrics_on_a_port_of_their_own() -> None:
     import urllib.request
 
-    command = [sys.executable, "-m", "urlab_client", "serve", "ball", "--json", "--until-eof", "--metrics-port", "0"]
+    command = ["-m", "urlab_client", "serve", "ball", "--json", "--until-eof", "--metrics-port", "0"]
     command += [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with child(*command, stderr=None) as process:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
         with urllib.request.urlopen(f"http://127.0.0.1:{ready['metrics_port']}/metrics", timeout=30) as page:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import math
 import os
-import subprocess
-import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from children import child
 from waiting import DEADLINE_S
 
 from urlab_client import URLabError
@@ -115,6 +114,18 @@ async def test_bad_velocities_and_names_are_refused(client: URLabClient) -> None
         await teleoperate(client, towards, hz=5000.0)
 
 
+async def test_the_hand_is_one_of_the_named_robot_though_another_begins_with_its_name(tmp_path: Path) -> None:
+    longer = tmp_path / "arm_longer.xml"
+    body = '<body><joint/><geom size="0.1"/><site name="tip"/></body>'
+    longer.write_text(f'<mujoco model="arm_longer"><worldbody>{body}</worldbody></mujoco>')
+    with SimulatedServer("arm", longer, play=True) as server:
+        async with URLabClient(**server.client_options(), step_mode="direct") as client:
+            await client.discover()
+            assert HandControl(client, "arm").ik.frame == "grip"
+            with pytest.raises(KeyError, match=r"'longer_tip'.*Known: 'grip'"):
+                HandControl(client, "arm", site="longer_tip")
+
+
 async def test_episodes_are_recorded_with_outcome_and_goal(client: URLabClient, tmp_path: Path) -> None:
     def operate(view: TeleopView) -> TeleopCommand:
         if view.episode == 1 and view.time > 0.1:
@@ -215,8 +226,7 @@ def test_the_command_records_what_is_typed(tmp_path: Path, server: SimulatedServ
     options, file = server.client_options(), tmp_path / "typed.mcap"
     arguments = [f"tcp://{server.address.rpartition('/')[2]}:{options['step_port']}", "--record", str(file)]
     keyboard, screen = pty.openpty()
-    command = [sys.executable, "-m", "urlab_client", "teleop", *arguments, "--task", "urlab/Reach-v0"]
-    with subprocess.Popen(command, stdin=screen, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with child("-m", "urlab_client", "teleop", *arguments, "--task", "urlab/Reach-v0", stdin=screen) as process:
         assert process.stdout is not None
         for _ in range(6):  # the keys and what they do: from here on it listens
             process.stdout.readline()

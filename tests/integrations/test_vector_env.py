@@ -17,7 +17,8 @@ from gymnasium.vector import AutoresetMode
 import urlab_client
 from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
-from urlab_client.server import Drop, Faults, SimulatedServer
+from urlab_client.protocol.errors import BadValue
+from urlab_client.server import Cut, Drop, Faults, Refuse, SimulatedServer
 
 Make = Callable[..., Any]
 
@@ -159,6 +160,52 @@ def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made
         *_, truncated, infos = env.step(action)
         assert not truncated.any()
         assert infos["restarts"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_an_episode_that_could_not_begin_begins_with_the_next_step(by_hand: bool, made: list[Any]) -> None:
+    faults = Faults()
+    with SimulatedServer("arm", play=True, faults=faults) as one, SimulatedServer("arm", play=True) as two:
+        addresses = [f"{server.address}:{server.step_port}" for server in (one, two)]
+        env = URLabVectorEnv(addresses, max_episode_steps=1)
+        made.append(env)
+        env.reset(seed=0)
+        action = np.zeros(env.action_space.shape)
+        env.step(action)
+        faults.add(Cut("reset", times=1))
+        infos = env.reset()[1] if by_hand else env.step(action)[-1]
+        assert infos["_error"].tolist() == [True, False]
+        *_, infos = env.step(action)
+        assert "error" not in infos, "it was reset, not stepped"
+        assert infos["restarts"].tolist() == [1, 0]
+        assert infos["step_count"].tolist() == [0, 1]
+
+
+def test_a_refusal_is_raised_and_costs_no_server(made: list[Any]) -> None:
+    faults = Faults()
+    with SimulatedServer("arm", play=True) as well, SimulatedServer("arm", play=True, faults=faults) as refusing:
+        addresses = [f"{server.address}:{server.step_port}" for server in (well, refusing)]
+        env = URLabVectorEnv(addresses, max_episode_steps=1)
+        made.append(env)
+        action = np.zeros(env.action_space.shape)
+        with pytest.raises(urlab_client.UnknownKeyframe, match="arm_home") as caught:
+            env.reset(options={"keyframe": "away"})
+        assert caught.value.__notes__[-1].startswith("environment 0 at")
+        env.reset(options={"keyframe": "home"})
+        faults.add(Refuse("reset", code="unknown_keyframe", times=1))
+        with pytest.raises(urlab_client.UnknownKeyframe, match="unknown_keyframe") as caught:
+            env.reset()
+        assert caught.value.__notes__[-1].startswith("environment 1 at")
+        *_, infos = env.step(action)  # what was refused is reset again
+        assert (infos["step_count"].tolist(), infos["restarts"].tolist()) == ([1, 0], [0, 0])
+        faults.add(Refuse("step", code="bad_value", times=1))
+        *_, truncated, infos = env.step(action)
+        assert (truncated.tolist(), infos["_error"].tolist()) == ([False, True], [False, True])
+        assert isinstance(infos["error"][1], BadValue)
+        observations, *_, infos = env.step(action)
+        assert "error" not in infos
+        assert infos["restarts"].tolist() == [0, 0]
+        assert observations[1, 7] == 0.04, "the keyframe of the reset before"
 
 
 def test_an_environment_that_takes_long_to_come_back_holds_up_nobody(

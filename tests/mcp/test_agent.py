@@ -320,6 +320,18 @@ async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
     assert news["next"] > first["next"]
 
 
+async def test_a_model_that_replaces_another_on_its_server_says_so(tmp_path: Path) -> None:
+    """Statement 9.2 of beta.md: every upload makes the class `model`."""
+    files = {name: tmp_path / f"{name}.xml" for name in ("box", "crate")}
+    for file in files.values():
+        file.write_text("<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>")
+    (tmp_path / "elsewhere").mkdir()
+    with SimulatedServer("arm", dialect="beta", model_roots=[tmp_path / "elsewhere"]) as server:
+        async with desk(server, models=files) as one:
+            assert "replaced" not in (await one.call("import_model", model="box"))["done"]
+            assert "has replaced the model" in (await one.call("import_model", model="crate"))["done"]
+
+
 async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
     files = {**bundled_models(), "box": tmp_path / "box.xml"}
     with SimulatedServer("arm", play=True, model_roots=[tmp_path], saved_dir=tmp_path) as server:
@@ -363,6 +375,16 @@ async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_
         await one.call("run", seconds=0.1)
     # What is not stopped is finished when the console closes.
     assert [len(read_run(tmp_path / made["name"]).table()) for made in (first, second)] == [5, 5]
+
+
+async def test_arguments_of_wrong_types_are_refused_by_their_tool(direct: Desk) -> None:
+    deep: list[object] = []
+    for _ in range(150):
+        deep = [deep]
+    for tool in (await direct.mcp.list_tools()).tools:
+        for name in tool.input_schema["properties"]:
+            for odd in ("[" * 100_000, '{"a": ' * 100_000, deep, {"a": deep}, [1], [None], 10**400, {"": {}}):
+                assert f"{tool.name}: " in await direct.refused(tool.name, **{name: odd, "nothing": odd})
 
 
 async def test_resources(direct: Desk) -> None:

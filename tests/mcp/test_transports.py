@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx2
 import pytest
 from agents import ALL, text_of
+from children import child
 from http_served import served
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
@@ -21,6 +22,7 @@ from waiting import DEADLINE_S
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
+from urlab_client.cli import mcp as command
 from urlab_client.mcp import Agent
 from urlab_client.mcp.transports import http_application
 from urlab_client.server import SimulatedServer
@@ -64,14 +66,8 @@ def test_the_command_ends_with_its_input(tmp_path: Path) -> None:
 def test_a_signal_ends_a_command_that_serves_pages_in_good_order(
     command: list[str], number: signal.Signals, tmp_path: Path
 ) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-m", "urlab_client", *command, "sim://arm", "--port", str(free_port())],
-        cwd=tmp_path,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    ) as process:
+    arguments = ["-m", "urlab_client", *command, "sim://arm", "--port", str(free_port())]
+    with child(*arguments, cwd=tmp_path, stderr=subprocess.STDOUT) as process:
         assert process.stdout is not None
         while "Ctrl-C ends it" not in process.stdout.readline():
             pass
@@ -137,6 +133,16 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
 def test_what_cannot_be_honoured_is_said(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["mcp", *arguments]) == 2
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [None, 0, command.AGENT_PORT, 8001])
+def test_beside_standard_input_the_console_has_any_port_but_one_that_is_given(
+    monkeypatch: pytest.MonkeyPatch, given: int | None
+) -> None:
+    told: list[command.McpArguments] = []
+    monkeypatch.setattr(command, "run", lambda arguments: told.append(arguments) or 0)
+    assert main(["mcp", "sim://arm", *([] if given is None else ["--port", str(given)])]) == 0
+    assert command._console_port(told[0]) == (given or 0)
 
 
 def test_without_the_sdk_the_extra_is_named(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -25,7 +26,7 @@ def run(command: Sequence[str | Path], cwd: Path) -> subprocess.CompletedProcess
     return subprocess.run(
         command,
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         timeout=240,
         check=False,
         cwd=cwd,
@@ -142,19 +143,34 @@ def test_the_citation_names_the_same_version() -> None:
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
-DRIVE = """
+def test_no_extra_admits_a_starlette_with_a_known_defect() -> None:
+    """CVE-2025-62727: up to 0.49.0 a Range header takes quadratic time, and the console serves files."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"].items()
+    bounds = {extra: name for extra, names in extras for name in names if name.startswith("starlette")}
+    assert bounds == dict.fromkeys(("mcp", "web", "test"), "starlette>=0.49.1")
+
+
+def test_actions_of_others_are_pinned_by_commit() -> None:
+    """A tag can be moved to other code."""
+    workflows = [file.read_text(encoding="utf-8") for file in (ROOT / ".github" / "workflows").glob("*.y*ml")]
+    used = [line for text in workflows for line in text.splitlines() if re.match(r"\s*(- )?uses:", line)]
+    assert [line for line in used if not re.search(r"@[0-9a-f]{40} # v[0-9]+\.[0-9]+\.[0-9]+$", line)] == []
+
+
+DRIVE = r"""
 import urlab_client
 with urlab_client.URLabClient("sim://ball", step_mode="direct") as client:
     client.discover()
     client.step(100)
-    print(f"{client.sim_time:.1f}", urlab_client.__file__, urlab_client.__version__)
+    print(f"{client.sim_time:.1f}", urlab_client.__file__, urlab_client.__version__, sep="\n")
 """
 
 
 def test_the_wheel_works_without_the_repository(venv: Path, tmp_path: Path) -> None:
     done = run([venv / PROGRAMS / "python", "-W", "error", "-c", DRIVE], tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    time, file, version = done.stdout.split()
+    time, file, version = done.stdout.splitlines()
     assert time == "0.2"
     assert Path(file).is_relative_to(venv)
     assert run([venv / PROGRAMS / "urlab", "--version"], tmp_path).stdout == f"urlab_client {version}\n"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -15,7 +17,8 @@ from samples import filled
 from vectors import load
 
 from urlab_client.protocol.base import Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_reply, encode_reply, encode_request
+from urlab_client.protocol.codec import check_request, decode_reply, encode_message, encode_reply, encode_request
+from urlab_client.protocol.dialects import ALPHA, BETA
 from urlab_client.protocol.errors import (
     PathNotWritable,
     ProtocolError,
@@ -23,6 +26,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     WrongTransport,
 )
+from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.recording import RecordingSaveOk
 from urlab_client.protocol.messages.runtime import SetModeOk, SetPausedOk, SetSimSpeed
 from urlab_client.protocol.messages.session import (
@@ -33,11 +37,15 @@ from urlab_client.protocol.messages.session import (
     EntityState,
     ErrorReply,
     HelloOk,
+    InstanceInfo,
     Step,
     StepOk,
     TwistState,
 )
+from urlab_client.protocol.messages.streams import ClientEvent, StateSnapshot
 from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.serializable import plain as plain_data
+from urlab_client.server.streams.broadcast import StateFull
 
 OPS_BY_NAME = sorted(OPS)
 
@@ -79,6 +87,53 @@ def test_every_reply_survives_the_wire(name: str, json: bool) -> None:
     decoded = decode_reply(op, op.reply, encode_reply(reply, json=json))
     assert type(decoded) is op.reply
     assert plain(decoded) == before
+
+
+def content(value: Any) -> Any:
+    """Return a copy of a value and of all that it holds, with the type of each part."""
+    match value:
+        case msgspec.Struct():
+            inside: Any = {name: content(getattr(value, name)) for name in value.__struct_fields__}
+        case dict():
+            inside = {key: content(item) for key, item in value.items()}
+        case list() | tuple():
+            inside = [content(item) for item in value]
+        case np.ndarray():
+            inside = (value.dtype, value.tolist())
+        case msgspec.Raw():
+            inside = bytes(value)
+        case _:
+            inside = value
+    return type(value), inside
+
+
+ENCODERS: dict[str, Callable[[Any], object]] = {
+    "alpha": lambda message: encode_reply(ALPHA.shaped(message)),
+    "beta": lambda message: encode_reply(BETA.shaped(message)),
+    "json": lambda message: encode_reply(message, json=True),
+    "published": encode_message,
+    "plain data": lambda message: plain_data(message, "list"),
+}
+REPLIES = [op.reply for op in OPS.values()]
+PUBLISHED = [StateSnapshot, StateFull, InstanceInfo, *ClientEvent.__subclasses__()]
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_encoding_leaves_what_it_encodes_as_it_was(encoder: str) -> None:
+    messages = [filled(kind) for kind in (*REPLIES, *PUBLISHED, ErrorReply, OpStarted)]
+    before = content(messages)
+    for message in messages:
+        ENCODERS[encoder](message)
+    assert content(messages) == before
+
+
+@pytest.mark.parametrize("json", [False, True])
+def test_encoding_leaves_requests_as_they_were(json: bool) -> None:
+    requests: list[Any] = [filled(op.request) for op in OPS.values()]
+    before = content(requests)
+    for request in requests:
+        assert b"another session" in encode_request(request, "another session", json=json)
+    assert content(requests) == before
 
 
 @pytest.mark.parametrize("name", OPS_BY_NAME)
@@ -158,6 +213,16 @@ def test_the_viewport_answers_under_the_name_of_another_op() -> None:
     op = OPS["set_viewport_mode"]
     frame = msgspec.msgpack.encode({"op": "set_mode_ok", "mode": "Lit"})
     assert decode_reply(op, op.reply, frame).mode == "Lit"  # type: ignore[attr-defined]
+
+
+def test_what_is_not_finite_is_null_in_json() -> None:
+    """The plugin's JSON would be invalid."""
+    state = ArticulationState(qpos=np.array([math.nan, 1.5]), qvel=np.array([math.inf, -math.inf]))
+    encoded = encode_reply(StepOk(time=math.nan, step=1, per_articulation={"arm": state}), json=True)
+    found = json.loads(encoded, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert found["time"] is None
+    assert found["per_articulation"]["arm"]["qpos"] == [None, 1.5]
+    assert found["per_articulation"]["arm"]["qvel"] == [None, None]
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -43,7 +43,7 @@ class TestLookUp:
         assert caught.value.matches == ("robot_C_0", "robot_C_1")
 
     def test_an_exact_key_wins_over_an_alias_of_the_same_name(self) -> None:
-        # The simulated server calls two instances of one model `robot` and `robot_1`.
+        # What a level may call two instances of one model.
         arts = NameMap({"robot": 1, "robot_1": 2}, {"robot": ["robot", "robot_1"]})
         assert arts["robot"] == 1
         assert "robot" not in arts.aliases

@@ -151,6 +151,20 @@ def test_an_entry_more_leaves_the_others_numbers_alone(model: mujoco.MjModel) ->
     assert abs(float(np.mean(np.log(draws)))) < 0.1, "as often halved as doubled"
 
 
+def test_two_entries_of_one_range_draw_apart(model: mujoco.MjModel) -> None:
+    bodies = (Vary(what="mass", on=body, scale=(0.5, 2.0)) for body in ("box", "rod"))
+    box, rod = (list(entry["drawn"].values()) for entry in twice_drawn(model, tuple(bodies)))
+    assert box != rod
+    assert 0.5 <= min(*box, *rod) <= max(*box, *rod) <= 2.0
+
+
+def twice_drawn(model: mujoco.MjModel, entries: tuple[Vary, ...]) -> list[dict[str, Any]]:
+    """What a seed draws for a declaration's entries, the same each time."""
+    drawn, again = (Variation(Randomisation(vary=entries), model).draw(3).to_dict()["varied"] for _ in range(2))
+    assert drawn == again
+    return drawn
+
+
 def test_toml_json_and_python_say_the_same(tmp_path: Path) -> None:
     declared = Randomisation(
         vary=(Vary(what="mass", on=("a/*", "b"), scale=(0.5, 2.0)), Vary(what="gravity", add=((-1, 0, 0), (1, 0, 0)))),
@@ -185,7 +199,10 @@ def test_toml_json_and_python_say_the_same(tmp_path: Path) -> None:
         ("[[camera]]\ndelay_s = -1", "camera: delay_s must be 0 or more seconds"),
         ("[wind]\nx = 1", "unknown field `wind`"),
         ("vary = [", "it.toml: "),
+        ("vary = " + "[" * 100_000, "it.toml: .*recursion"),
+        ("vary = " + "1" * 5000, "it.toml: .*4300 digits"),
     ],
+    ids=lambda value: value[:40],
 )
 def test_a_wrong_declaration_says_what_is_wrong_and_where(tmp_path: Path, text: str, reason: str) -> None:
     file = tmp_path / "it.toml"

@@ -53,7 +53,7 @@ def controllers(server: SimulatedServer) -> dict[str, Any]:
 def test_an_mjcf_names_its_controller(tmp_path: Path, data: str | None, expected: Any) -> None:
     model = write(tmp_path, data)
     with SimulatedServer(model, model, play=True) as server:
-        assert controllers(server) == {"lever": expected, "lever_1": expected}
+        assert controllers(server) == {"lever": expected, "copy1_lever": expected}
 
 
 @pytest.mark.parametrize(

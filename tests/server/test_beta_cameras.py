@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +18,8 @@ from waiting import eventually
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.render.camera_renderer import GIVEN_UP
+from urlab_client.server.render import camera_renderer
+from urlab_client.server.render.camera_renderer import GIVEN_UP, CameraRenderer
 from urlab_client.server.render.drawing import Stage
 
 
@@ -103,7 +105,7 @@ def test_cameras_are_off_until_they_are_switched_on(playing: Bench) -> None:
         before = playing.step()["frame_id"]
         playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True})
         playing.step()
-        assert number_of(socket.recv_multipart()) > before, "nothing came before it was switched on"
+        assert number_of(socket.recv_multipart()) >= before, "nothing came before it was switched on"
     eventually(lambda: regions(playing) == {"cam_arm_a_cam.shm"})
     playing.play()
     assert regions(playing) == set()
@@ -151,6 +153,72 @@ def test_a_stream_is_silent_while_the_state_stands_still(playing: Bench) -> None
             repeating.recv_multipart()
         second = playing.step()["frame_id"]
         assert number_of(socket.recv_multipart()) == second, "nothing came between, not even when it was switched on"
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": False})
+        playing.step(include_cameras={"arm_a/cam": "sync"}, render="sync")
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True})
+        for _ in range(4):
+            repeating.recv_multipart()
+        third = playing.step()["frame_id"]
+        assert number_of(socket.recv_multipart()) == third, "what it has drawn for a step is not news, either"
+
+
+@pytest.mark.parametrize("mode", ["direct", "live"])
+def test_a_camera_that_is_switched_on_at_standstill_shows_what_it_has_missed(playing: Bench, mode: str) -> None:
+    """Beta statement 55, the other way round."""
+    playing.wire.ask("set_mode", mode=mode)
+    if mode == "live":
+        playing.wire.ask("set_paused", paused=False)
+    while not playing.step()["frame_id"]:
+        pass
+    playing.wire.ask("set_mode", mode="direct")
+    camera = f"{playing.b}/cam"  # on a port of this session alone: nobody who has left seems to listen still
+    told = playing.wire.ask("set_camera_streaming", cameras={camera: True})["cameras"][camera]
+    assert playing.server.shm_dir is not None
+    region = RawRegion(playing.server.shm_dir / f"cam_{playing.b}_cam.shm")
+    try:
+        eventually(lambda: region.sequence == 1)
+        with pictures(told["zmq_endpoint"], f"{camera} ".encode()) as socket:
+            message = socket.recv_multipart()
+        shared = region.read()[1]
+        assert (shared[:32], shared[40:]) == (message[1][:32], message[1][40:]), "the same but for when it was drawn"
+        now = playing.step()["frame_id"]
+        assert number_of(message) == now - 1
+    finally:
+        region.close()
+
+
+def test_a_picture_that_a_reply_takes_along_is_streamed_all_the_same(
+    playing: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = f"{playing.b}/cam"
+    told = playing.wire.ask("set_camera_streaming", cameras={camera: {"zmq": True}})["cameras"][camera]
+    drawn: queue.SimpleQueue[int] = queue.SimpleQueue()
+    go_on, seen = threading.Semaphore(0), {0}
+    draw: Any = CameraRenderer.frames
+
+    def waits(renderer: CameraRenderer, *args: Any) -> Any:
+        """Have the stream wait between drawing a state and sending it."""
+        frames = draw(renderer, *args)
+        number = frames[camera].frame_id
+        if threading.current_thread().name == "urlab-cameras" and number not in seen:
+            seen.add(number)
+            drawn.put(number)
+            go_on.acquire()
+        return frames
+
+    monkeypatch.setattr(camera_renderer, "LATEST_S", np.inf)
+    monkeypatch.setattr(CameraRenderer, "frames", waits)
+    with pictures(told["zmq_endpoint"], f"{camera} ".encode()) as socket:
+        try:
+            for _ in range(3):
+                playing.step()
+                number = drawn.get()
+                reply = playing.step(include_cameras={camera: "latest"})
+                assert reply["cameras"][camera]["frame_id"] == number
+                go_on.release()
+                assert number_of(socket.recv_multipart()) == number
+        finally:
+            go_on.release(100)
 
 
 @pytest.fixture
@@ -262,6 +330,18 @@ def test_a_delayed_camera(playing: Bench) -> None:
         second = socket.recv_multipart()
         assert number_of(second) > number_of(first), "what was sent is not sent again"
         assert sim_time_of(second) == pytest.approx(later["time"] - 0.5)
+
+
+def test_two_cameras_jitter_apart(playing: Bench) -> None:
+    cameras = ["arm_a/cam", f"{playing.b}/cam"]
+    playing.wire.ask("set_camera_delay", cameras={key: {"delay_s": 0.05, "jitter_s": 0.04} for key in cameras})
+    seen: dict[str, list[int]] = {name: [] for name in cameras}
+    for _ in range(60):
+        pictures = playing.step(include_cameras=True).get("cameras", {})
+        for name in cameras:
+            seen[name].append(pictures[name]["frame_id"] if name in pictures else 0)
+    assert all(seen[name][-1] for name in cameras)
+    assert seen[cameras[0]] != seen[cameras[1]]
 
 
 def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> None:

@@ -49,6 +49,9 @@ def test_the_handshake_in_play(playing: Bench) -> None:
     """Beta statements 3, 4, 5, 6, 47 and 87."""
     reply = playing.wire.hello()
     assert len(reply["instance"]) == 11
+    assert reply["instance"]["capabilities"] == [
+        *("render_sync", "render_async", "shm_rpc", "model_upload", "content_cache")
+    ]
     assert reply["instance"]["step_port"] == playing.server.step_port
     assert reply["instance"]["state_port"] == playing.server.state_port
     assert reply["urlab_version"] == "urlab/0.2"

@@ -7,11 +7,15 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import pytest
 from beta_bench import Bench
 from waiting import DEADLINE_S
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.editor.jobs import EditorJobs
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
 
 
 def test_jobs(bench: Bench, tmp_path: Path) -> None:
@@ -72,6 +76,39 @@ def test_steps_go_on_beside_a_job(playing: Bench) -> None:
     done.set()
     assert playing.end(job) == {"op": "save_level_ok"}
     assert playing.end(other["job_id"])["code"] == "import_failed"
+
+
+def test_results_that_nobody_fetches_keep_nobody_out(bench: Bench) -> None:
+    jobs = bench.core.jobs
+    started = [jobs.start(lambda: {"op": "save_level_ok"}) for _ in range(4096)]
+    with jobs.alone():  # all of them have ended
+        pass
+    assert bench.job("import_xml", path="nowhere.xml")["code"] == "import_failed"
+    assert bench.refused("op_status", job_id=started[0])[0] == "unknown_job"
+    assert jobs.take(started[-1]) == {"op": "save_level_ok"}
+
+
+def test_old_results_go() -> None:
+    now = 0.0
+    jobs = EditorJobs(Health(), clock=lambda: now)
+
+    def ended() -> str:
+        job = jobs.start(lambda: {"op": "save_level_ok"})
+        with jobs.alone():
+            return job
+
+    first = ended()
+    now = 299.0
+    later = ended()
+    now = 301.0
+    with pytest.raises(Refusal, match="expired"):
+        jobs.take(first)
+    assert jobs.take(later) == {"op": "save_level_ok"}
+    many = [ended() for _ in range(4097)]
+    with pytest.raises(Refusal, match="expired"):
+        jobs.take(many[0])
+    assert jobs.take(many[1]) is not None
+    jobs.close()
 
 
 def test_removing(bench: Bench) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from waiting import eventually
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
@@ -97,8 +98,7 @@ def test_the_stream_shows_live_physics(
     socket = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
     socket.recv_multipart()
     wire.ask("set_paused", paused=False)
-    while np.frombuffer(socket.recv_multipart()[1], "<f4").min() < 300.0:
-        pass
+    eventually(lambda: np.frombuffer(socket.recv_multipart()[1], "<f4").min() >= 300.0)
 
 
 def test_stepped_modes_publish_nothing(

@@ -65,27 +65,43 @@ def test_malformed_vectors(wire: Wire, op: str, field: str, value: object) -> No
     assert wire.refused(op, **{**VALID[op], field: value}) == "missing_field"
 
 
-@pytest.mark.parametrize("color", [[1], None, "red", [2, -1, math.nan]])
-def test_malformed_colors_are_accepted(wire: Wire, color: object) -> None:
-    wire.ask("draw_marker", location=[0, 0, 0], color=color)
+@pytest.mark.parametrize(
+    ("color", "drawn"),
+    [([1], (1.0, 1.0, 0.0)), (None, (1.0, 1.0, 0.0)), ("red", (1.0, 1.0, 0.0)), ([2, -1, math.nan], (1.0, 0.0, 0.0))],
+)
+def test_malformed_colors_are_replaced_or_cut(wire: Wire, color: object, drawn: tuple[float, float, float]) -> None:
+    wire.ask("clear_markers")
+    wire.ask("draw_marker", location=[0, 0, 0], color=color, ttl=-1)
+    assert wire.core.drawings.take_frame(in_play=False) == [Sphere(center=(0.0, 0.0, 0.0), color=drawn)]
 
 
 @pytest.mark.parametrize("op", ["draw_box", "draw_axes"])
 def test_rotations_that_are_none(wire: Wire, op: str) -> None:
     assert wire.refused(op, **VALID[op], rotation_quat=[0, 0, 0, 0]) == "missing_field"
     assert wire.refused(op, **VALID[op], rotation_euler=[math.inf, 0, 0]) == "missing_field"
+    wire.ask("clear_markers")
     wire.ask(op, **VALID[op], rotation_quat=[0, 0, 1])
+    wire.ask(op, **VALID[op])
+    drawn = wire.core.drawings.take_frame(in_play=False)
+    assert drawn[: len(drawn) // 2] == drawn[len(drawn) // 2 :] != [], "a rotation that is not four numbers is none"
 
 
-def test_overlay_text_may_be_empty(wire: Wire) -> None:
-    wire.ask("set_overlay_text", text="")
-    wire.ask("set_overlay_text", text=None)
+@pytest.mark.parametrize("text", ["", None])
+def test_empty_overlay_text_clears_it(wire: Wire, text: object) -> None:
+    wire.ask("set_overlay_text", text="hello")
+    assert wire.core.drawings.overlay == "hello"
+    wire.ask("set_overlay_text", text=text)
+    assert wire.core.drawings.overlay == ""
 
 
 def test_drawing_works_during_play(serve: Callable[..., Wire]) -> None:
     playing = serve("ball", play=True)
-    for op, fields in VALID.items():
-        playing.ask(op, **fields)
+    drawings = playing.core.drawings
+    for op in ("draw_marker", "draw_line", "draw_box", "draw_arrow", "draw_axes"):
+        playing.ask(op, **VALID[op], ttl=-1)
+        assert drawings.take_frame(in_play=True)
+        playing.ask("clear_markers")
+        assert (drawings.take_frame(in_play=True), drawings.take_frame(in_play=False)) == ([], [])
 
 
 def test_colors_are_bytes_cut_off() -> None:

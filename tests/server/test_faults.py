@@ -244,6 +244,15 @@ def test_what_is_not_a_fault_is_refused_and_harms_nobody(client: URLabClient, fa
     assert client.step().step == 1
 
 
+def test_a_request_too_deep_to_read_meets_no_fault(server: SimulatedServer, faults: Faults) -> None:
+    deep = b'{"op": "step", "x": ' + b"[" * 100_000
+    with faults.add(Drop("step")), zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.connect(f"{server.address}:{server.step_port}")
+        socket.send(deep)
+        assert socket.poll(60_000)
+        assert b"bad_request" in socket.recv()
+
+
 class Clumsy(Drop):
     def concerns_request(self, op: str) -> bool:
         raise LookupError(op)

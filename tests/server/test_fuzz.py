@@ -6,6 +6,7 @@ The short form runs in CI. The long form: `URLAB_FUZZ_FACTOR=100 pytest tests/se
 from __future__ import annotations
 
 import contextlib
+import copy
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,19 +18,21 @@ import numpy as np
 import pytest
 import zmq
 from mangling import FACTOR, golden_replies, golden_requests, mutated, strange
+from samples import filled
 from scenes import hasty
 from wire import Wire, pack
 
 from urlab_client import ProtocolError, URLabRPCError
+from urlab_client.protocol.base import DialectName, Needs
 from urlab_client.protocol.codec import decode_reply
 from urlab_client.protocol.control_messages import ActuatorInfo, ControlPayload, decode_gains
-from urlab_client.protocol.dialects import ALPHA
+from urlab_client.protocol.dialects import ALPHA, DIALECTS
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.protocol.messages.session import HelloOk, StepOk
 from urlab_client.protocol.registry import OPS
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import STATE_FULL, StreamTopic, TopicKind
-from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server import ControllerConfig, Limits, SimulatedServer
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
 
@@ -104,8 +107,8 @@ def _talk(session: str) -> list[dict[str, Any]]:
         ("set_mode", {"mode": "direct"}),
         ("set_paused", {"paused": False}),
         ("set_sim_speed", {"percent": 50.0}),
-        ("set_sim_options", {"timestep": 0.002, "integrator": "rk4", "gravity": [0.0, 0.0, -9.81]}),
-        ("set_qpos", {"articulation": "bot", "qpos": [0.0] * 8}),
+        ("set_sim_options", {"options": {"timestep": 0.002, "integrator": "rk4", "gravity": [0.0, 0.0, -9.81]}}),
+        ("set_qpos", {"target": "bot", "qpos": [0.0] * 8}),
         ("set_twist", {"articulation": "bot", "linear": [1.0, 0.0, 0.0], "angular": [0.0, 0.0, 1.0]}),
         ("get_contacts", {"max_contacts": 5}),
         ("configure_controller", {"articulation": "bot", "params": {"kp": 5.0}}),
@@ -169,6 +172,110 @@ def test_a_live_server_answers_every_frame(
     # Most mutations leave nothing to understand; some of what is left must reach the handlers.
     assert refused
     assert served > LIVE_FRAMES // 10
+
+
+UNFIT: tuple[Any, ...] = (None, True, -1, float("nan"), "text", b"x", [], {}, [None], [{}], {"bot": None})
+MISSING: Any = object()
+# What succeeds in the scene of the next test where a sample value of each field does not.
+SCENE: dict[str, dict[str, Any]] = {
+    "claim_control": {"articulation": "bot", "ttl_s": 600.0},
+    "step": {"include_cameras": False},
+    "reset": {"keyframe_name": "bot_home"},
+    "set_control_source": {"source": "zmq", "articulation": "bot"},
+    "set_mocap_pose": {"body": "hand_hand", "pos": [0.0, 0.0, 1.0], "quat": [1.0, 0.0, 0.0, 0.0]},
+    "read_mocap_pose": {"body": "hand_hand"},
+    "set_camera_streaming": {"cameras": {"bot_cam": {"zmq": True, "shm": False}}},
+    "set_camera_delay": {"cameras": {"bot_cam": {"delay_ms": 1.0}}},
+    "replay_set_active": {"name": "take"},
+    "import_xml": {"path": "prop.xml"},
+    "load_level": {"level_path": "text"},
+    "spawn_actor": {"scale": [1.0, 1.0, 1.0]},
+    "spawn_grid": {"scale": [1.0, 1.0, 1.0]},
+    "begin_pie": {"level_path": "", "timeout_s": 20.0},
+    "set_viewport_mode": {"mode": "lit"},
+    "upload_model_manifest": {
+        "xml_sha256": "0" * 64,
+        "assets": [{"name": "a.obj", "sha256": "1" * 64, "size": 8}],
+        "step_mode": "direct",
+    },
+    "upload_model_chunk": {"kind": "asset", "name": "a.obj", "offset": 0, "total": 8, "data": b"a"},
+}
+BY_TARGET = "set_actor_transform", "actor_hierarchy", "get_actor_bounds", "frame_actor", "select_actor", "track_actor"
+
+
+def _places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the paths to all that a request says, fields inside others, too."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, part in inner:
+        if at or key not in ("op", "session_id"):
+            yield (*at, key)
+            yield from _places(part, (*at, key))
+
+
+def _with(request: dict[str, Any], place: tuple[Any, ...], value: Any) -> bytes:
+    changed = holder = copy.deepcopy(request)
+    for key in place[:-1]:
+        holder = holder[key]
+    if value is MISSING:
+        del holder[place[-1]]
+    else:
+        holder[place[-1]] = value
+    return pack(changed)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_no_field_of_any_op_fails_the_server(
+    dialect: DialectName, models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every field, and every one inside it, is missing, null, empty or of another type."""
+    monkeypatch.setattr("urlab_client.server.core.Engine", hasty(0.01))
+    monkeypatch.setattr("urlab_client.server.assets.uploads.MAX_OPEN", 10_000)
+    talk = {request["op"]: request for request in _talk("")}
+    known = {op: {**talk.get(op, {}), **SCENE.get(op, {})} for op in {*talk, *SCENE}}
+    known |= {op: {**known.get(op, {}), "target": "two"} for op in BY_TARGET}
+    # First what needs play, as it runs, and of that the claim that the beta asks for; last what opens another level.
+    order = {"claim_control": -2, "begin_pie": 1, "stop_pie": 2}
+    ops = DIALECTS[dialect].ops.values()
+    ops = sorted(ops, key=lambda op: order.get(op.name, -1 if op.needs is Needs.MANAGER else 0))
+    with (
+        SimulatedServer(
+            *(models / f"{name}.xml" for name in ("bot", "hand")),
+            play=True,
+            unpaused=True,
+            dialect=dialect,
+            limits=LIMITS,
+            controllers={"*": ControllerConfig()},
+            model_roots=[models],
+            saved_dir=tmp_path,
+        ) as server,
+        Wire(server) as wire,
+    ):
+
+        def answered(frame: bytes) -> dict[str, Any]:
+            reply = msgspec.msgpack.decode(wire.exchange(frame))
+            while "job_id" in reply and reply.get("state", "running") == "running":
+                reply = wire.raw({"op": "op_status", "session_id": wire.session_id, "job_id": reply["job_id"]})
+            reply = reply.get("result", reply)
+            assert reply.get("code") != "internal_error", (frame, reply)
+            return reply
+
+        served = set[str]()
+        for op in ops:
+            if op.name == "import_xml":
+                wire.ask("stop_pie")
+            wire.hello(encoding="msgpack")
+            request = msgspec.to_builtins(filled(op.request), builtin_types=(bytes,), enc_hook=np.ndarray.tolist)
+            request = msgspec.msgpack.decode(pack({**request, **known.get(op.name, {}), "session_id": wire.session_id}))
+            if op.name == "upload_model_chunk":
+                opened = wire.ask("upload_model_manifest", **SCENE["upload_model_manifest"])
+                request["upload_id"] = opened["upload_id"]
+            if answered(pack(request))["op"] != "error":
+                served.add(op.name)
+            for place in _places(request):
+                for value in (MISSING, *UNFIT):
+                    answered(_with(request, place, value))
+            answered(pack(request))
+    assert len(served) > 0.8 * len(ops), {op.name for op in ops} - served
 
 
 def test_frames_on_the_other_sockets_leave_the_server_well(models: Path) -> None:

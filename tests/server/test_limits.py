@@ -141,8 +141,10 @@ def test_a_recording_too_large_to_load(serve: Serve, tmp_path: Path) -> None:
 
 
 def test_drawings_give_way(small: Wire) -> None:
-    for _ in range(10):
-        small.ask("draw_marker", location=[0, 0, 0], color=[1, 0, 0], ttl=-1)
+    for x in range(10):
+        small.ask("draw_marker", location=[x, 0, 0], color=[1, 0, 0], ttl=-1)
+    kept = small.core.drawings.take_frame(in_play=False)
+    assert [marker.center[0] for marker in kept] == [7, 8, 9], "the newest stay"
 
 
 def test_a_frame_beyond_all_limits_costs_its_sender_the_connection(small: Wire) -> None:

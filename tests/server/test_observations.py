@@ -167,6 +167,11 @@ def test_sim_clock_truncates_to_nanoseconds(seconds: float) -> None:
     assert abs(clock.sec + 1e-9 * clock.nsec) <= abs(seconds) * (1 + 1e-15)
 
 
+@pytest.mark.parametrize("seconds", [0.9999999999, 1.9999999999, 3599.9999999998])
+def test_sim_clock_never_rounds_up(seconds: float) -> None:
+    assert (sim_clock(seconds).sec, sim_clock(seconds).nsec) == (int(seconds), 999_999_999)
+
+
 @given(st.floats())
 def test_sim_clock_always_fits_the_wire(seconds: float) -> None:
     clock = sim_clock(seconds)

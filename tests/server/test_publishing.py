@@ -375,7 +375,7 @@ def test_ids_are_global_whatever_the_topic_says(play: Play, models: Path) -> Non
     payload = ControlPayload(np.array([1]), np.array([0.5], np.float32)).encode()
     publisher.send_multipart([b"bot/control ", payload])
     for reply in bench.wire.until("forward"):
-        if reply["per_articulation"]["bot_1"]["ctrl"] == [0.5]:
+        if reply["per_articulation"]["copy1_bot"]["ctrl"] == [0.5]:
             assert reply["per_articulation"]["bot"]["ctrl"] == [0.0]
             break
 
@@ -395,7 +395,7 @@ def test_an_actuator_of_several_inputs_takes_its_first_by_id(play: Play, tmp_pat
             assert ctrl["multi"][0] == 0.0
             assert ctrl["multi"][1] == 1.0
             assert ctrl["multi"][4] == 2.0
-            assert [ctrl["multi_1"][place] for place in (0, 1, 4)] == [3.0, 4.0, 5.0]
+            assert [ctrl["copy1_multi"][place] for place in (0, 1, 4)] == [3.0, 4.0, 5.0]
             break
 
 
@@ -453,7 +453,7 @@ def test_of_too_many_commands_that_wait_for_physics_the_oldest_go(play: Play, mo
         ctrl = {key: state["ctrl"] for key, state in reply["per_articulation"].items()}
         if ctrl["bot"] != [0.0]:
             break
-    assert ctrl == {"bot": [float32(0.3)], "bot_1": [0.0]}
+    assert ctrl == {"bot": [float32(0.3)], "copy1_bot": [0.0]}
 
 
 def test_streamed_gains_reach_the_controller(play: Play) -> None:
@@ -502,7 +502,7 @@ def test_info_describes_every_articulation_in_one_frame_each(play: Play) -> None
         "maxs": [1.0],
         "camera_list": announced,
     }
-    assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("bot_1", [1], [-100.0], [100.0])
+    assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("copy1_bot", [1], [-100.0], [100.0])
 
 
 @pytest.mark.mujoco("3.11")

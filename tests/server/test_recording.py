@@ -208,6 +208,19 @@ def test_clearing_goes_on_recording(bot: Wire) -> None:
     assert bot.ask("recording_stop")["frame_count"] == 3
 
 
+def test_a_recording_begun_after_a_replay_was_loaded_is_the_one_that_is_saved(bot: Wire) -> None:
+    bot.ask("recording_start")
+    bot.ask("step", n_steps=3)
+    bot.ask("recording_stop")
+    loaded = bot.ask("recording_save", path="old.json")["absolute_path"]
+    bot.ask("replay_load", path=loaded)
+    bot.ask("recording_start")
+    bot.ask("step", n_steps=5)
+    bot.ask("recording_stop")
+    frames = json.loads(saved(bot))["Frames"]
+    assert [frame["timestamp"] for frame in frames] == pytest.approx([0.002 * step for step in range(4, 9)])
+
+
 def saved(wire: Wire) -> bytes:
     return Path(wire.ask("recording_save")["absolute_path"]).read_bytes()
 
@@ -221,7 +234,7 @@ SAVER = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from urlab_client.server.assets.content import write_atomic
+from urlab_client._whole_files import write_whole
 from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
 
 layout = JointLayout.of([("j", 1, 1)])
@@ -237,7 +250,7 @@ for _ in range(60):
     if child == 0:
         while True:
             for one in contents:
-                write_atomic(file, one)
+                write_whole(file, one)
     while killed == 0 and not file.exists():  # the first one has time to write it
         time.sleep(0.001)
     time.sleep(chance.uniform(0.0, 0.02))

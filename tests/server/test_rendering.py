@@ -14,12 +14,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render import camera_renderer, drawing, opengl
+from urlab_client.server.render.appearance import APPEARANCE_TEXT, Appearance
 from urlab_client.server.render.drawing import NO_HIT_CM
 from urlab_client.server.render.opengl import Backend, find_backend, free_context, make_context
 from urlab_client.server.render.tints import tint
@@ -32,6 +34,7 @@ WALL = """
     <light pos="0 0 0" dir="1 0 0" directional="true"/>
     <camera name="eye" xyaxes="0 -1 0 0 0 1" fovy="60" resolution="40 30"/>
     <camera name="away" xyaxes="0 1 0 0 0 1" resolution="8 4"/>
+    <camera name="flat" xyaxes="0 -1 0 0 0 1" projection="orthographic" fovy="2" resolution="8 4"/>
     <geom name="upper" type="box" pos="2.5 0 5" size="0.5 9 5" rgba="1 0 0 1"/>
     <geom name="lower" type="box" pos="2.5 0 -5" size="0.5 9 5" rgba="0 0 1 1"/>
     <site name="mark" pos="1 0 0" size="0.3"/>
@@ -159,10 +162,19 @@ def test_an_unknown_quality_is_refused() -> None:
         SimulatedServer(render_quality="best")  # type: ignore[arg-type]  # what is tested
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"quality": 3}', '{"x": ' + "[" * 20_000], ids=lambda text: text[:9])
+def test_a_scene_that_tells_its_appearance_wrongly_is_refused(text: str) -> None:
+    spec = mujoco.MjSpec()
+    spec.add_text(name=APPEARANCE_TEXT, data=text)
+    with pytest.raises(ValueError, match=f"the scene's text '{APPEARANCE_TEXT}': "):
+        Appearance.of(spec.compile())
+
+
 def test_depth_is_planar_and_in_centimetres(play: Play) -> None:
-    wire = play("wall", modes={"wall/eye": "depth", "wall/away": "depth"})
-    cameras = wire.ask("step", include_cameras={"eye": "sync", "away": "sync"})["cameras"]
+    wire = play("wall", modes={f"wall/{name}": "depth" for name in ("eye", "away", "flat")})
+    cameras = wire.ask("step", include_cameras=dict.fromkeys(("eye", "away", "flat"), "sync"))["cameras"]
     assert pixels(cameras["eye"]) == pytest.approx(np.full((30, 40), 200.0), rel=1e-4)
+    assert pixels(cameras["flat"]) == pytest.approx(np.full((4, 8), 200.0), rel=1e-4)
     assert (pixels(cameras["away"]) == np.float32(NO_HIT_CM)).all()
 
 
@@ -208,7 +220,7 @@ def test_keys_are_those_of_the_request(play: Play) -> None:
         "away": None,
     }
     assert set(wire.ask("step", include_cameras=wanted)["cameras"]) == {"drop/above", "above", "eye"}
-    assert set(wire.ask("step", include_cameras=True)["cameras"]) == {"above", "plain", "eye", "away"}
+    assert set(wire.ask("step", include_cameras=True)["cameras"]) == {"above", "plain", "eye", "away", "flat"}
 
 
 @pytest.mark.parametrize("wanted", [False, {}, {"nobody": "sync"}, {"above": None}, None])
@@ -221,7 +233,7 @@ def test_live_ignores_cameras(play: Play) -> None:
 
 
 def test_a_bare_name_means_the_last_robot(play: Play) -> None:
-    wire = play("wall", "wall", modes={"wall/eye": "depth", "wall_1/eye": "real"})
+    wire = play("wall", "wall", modes={"wall/eye": "depth", "copy1_wall/eye": "real"})
     frame = wire.ask("step", include_cameras={"eye": "sync", "wall/eye": "sync"})["cameras"]
     assert frame["eye"]["dtype"] == "bgra8"
     assert frame["wall/eye"]["dtype"] == "float32"
@@ -249,15 +261,15 @@ def colors(image: np.ndarray[Any, Any]) -> set[tuple[int, int, int]]:
 
 
 def test_one_class_has_one_semantic_color(play: Play) -> None:
-    wire = play("pair", "pair", modes={"pair/above": "semantic", "pair_1/above": "semantic"})
-    frames = wire.ask("step", include_cameras={"pair/above": "sync", "pair_1/above": "sync"})["cameras"]
+    wire = play("pair", "pair", modes={"pair/above": "semantic", "copy1_pair/above": "semantic"})
+    frames = wire.ask("step", include_cameras={"pair/above": "sync", "copy1_pair/above": "sync"})["cameras"]
     expected = {(0, 0, 0), tint(zlib.crc32(b"pair_C"), None)}
     assert [colors(pixels(frame)) for frame in frames.values()] == [expected, expected]
 
 
 def test_each_body_has_an_instance_color(play: Play) -> None:
-    wire = play("pair", "pair", modes={"pair/above": "instance", "pair_1/above": "instance"})
-    frames = wire.ask("step", include_cameras={"pair/above": "sync", "pair_1/above": "sync"})["cameras"]
+    wire = play("pair", "pair", modes={"pair/above": "instance", "copy1_pair/above": "instance"})
+    frames = wire.ask("step", include_cameras={"pair/above": "sync", "copy1_pair/above": "sync"})["cameras"]
     group = zlib.crc32(b"pair_C")
     first, second = (colors(pixels(frame)) - {(0, 0, 0)} for frame in frames.values())
     assert {tint(group, 1), tint(group, 2)} <= first

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -99,23 +100,100 @@ def test_the_limit_that_a_model_exceeds_is_named(limit: str, value: int, content
         assert limit in refusal(wire, model)
 
 
+HANGING = "import time; time.sleep(600)"
+# In both, a process that nobody knows is left, and ends only when it is ended.
+LEFT_WITH_THE_PIPE = """
+import os, sys, time
+alive = os.open("{alive}", os.O_WRONLY)
+sys.stdin.readline()
+if os.fork() == 0:
+    time.sleep(600)
+"""
+LEFT_AT_WORK = """
+import os, signal
+alive = os.open("{alive}", os.O_WRONLY)
+from urlab_client.server.assets import sandbox
+def work(order):
+    os.kill(os.getppid(), signal.SIGKILL)
+    while True:
+        sum(range(10**9))  # which heeds no signal
+sandbox._work, sandbox.confine_files = work, lambda *_: None  # or the kernel forbids the signal
+sandbox.serve()
+"""
+LEFT_ITS_GROUP = LEFT_WITH_THE_PIPE.replace("    time.", "    os.setsid(); os.write(alive, b'%d' % os.getpid()); time.")
+
+
+@pytest.fixture
+def compile_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]]:
+    """Have a model compiled by a program of the test's, and return why that failed."""
+    monkeypatch.setattr(sandbox, "_compilers", sandbox._Compilers())
+    monkeypatch.setattr(sandbox, "_END_S", 0.1)
+
+    def compile_with(program: str, wall_s: float) -> str:
+        monkeypatch.setattr(sandbox._Compiler, "program", program)
+        monkeypatch.setattr(sandbox, "_GRACE_S", wall_s - 1)
+        with pytest.raises(Refusal) as refused:
+            sandbox.build_confined(tmp_path / "x.xml", tmp_path / "snapshot", (tmp_path,), Limits(model_wall_s=1))
+        return refused.value.message
+
+    yield compile_with
+    sandbox._compilers.close()
+
+
 def test_a_process_that_never_answers_is_waited_for_once(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    compile_with: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[subprocess.Popen[bytes]] = []
-
-    class Hanging(sandbox._Child):
-        def _start(self) -> subprocess.Popen[bytes]:
-            hangs = [sys.executable, "-c", "import time; time.sleep(600)"]
-            self._process = subprocess.Popen(hangs, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-            started.append(self._process)
-            return self._process
-
-    monkeypatch.setattr(sandbox, "_GRACE_S", -0.9)
-    monkeypatch.setattr(sandbox, "_child", Hanging())
-    with pytest.raises(Refusal, match=r"plain\.xml: compilation took longer than the limit model_wall_s, 1 s"):
-        sandbox.build_confined(folder / "plain.xml", tmp_path / "snapshot", (folder,), Limits(model_wall_s=1))
+    started: list[sandbox._Compiler] = []
+    start = sandbox._Compiler.__init__
+    monkeypatch.setattr(sandbox._Compiler, "__init__", lambda self: (started.append(self), start(self))[1])
+    assert compile_with(HANGING, 0.1).endswith("x.xml: compilation took longer than the limit model_wall_s, 1 s")
     assert len(started) == 1
+
+
+@pytest.mark.parametrize(
+    ("program", "wall_s", "reason"),
+    [
+        (LEFT_WITH_THE_PIPE, 1.0, "model_wall_s"),
+        (LEFT_ITS_GROUP, 1.0, "model_wall_s"),
+        (LEFT_AT_WORK, 600.0, "ended without an answer"),
+    ],
+    ids=["holds the pipe", "left its group", "at work"],
+)
+def test_what_a_killed_process_has_forked_delays_no_answer_and_is_ended(
+    program: str, wall_s: float, reason: str, tmp_path: Path, compile_with: Callable[..., str]
+) -> None:
+    os.mkfifo(tmp_path / "alive")
+    alive = os.open(tmp_path / "alive", os.O_RDONLY | os.O_NONBLOCK)
+    assert reason in compile_with(program.replace("{alive}", str(tmp_path / "alive")), wall_s)
+    os.set_blocking(alive, True)
+    with os.fdopen(alive, "rb") as pipe:
+        if program is LEFT_ITS_GROUP:  # no model can; it is the answer that matters
+            os.kill(int(os.read(alive, 64)), signal.SIGKILL)
+        assert pipe.read() == b""  # none of them has it open any longer
+
+
+def test_models_do_not_wait_for_each_other(tmp_path: Path, compile_with: Callable[..., str]) -> None:
+    os.mkfifo(tmp_path / "begun")
+    begun = os.open(tmp_path / "begun", os.O_RDWR)
+    program = f"""
+import fcntl, os, sys
+sys.stdin.readline()
+os.write(os.open({str(tmp_path / "begun")!r}, os.O_WRONLY), b".")
+fcntl.flock(os.open({str(tmp_path)!r}, os.O_RDONLY), fcntl.LOCK_SH)
+print('{{"refused": "done"}}', flush=True)
+sys.stdin.read()
+"""
+    import fcntl  # not on Windows
+
+    held = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with ThreadPoolExecutor(3) as threads:
+        outcomes = [threads.submit(compile_with, program, 60.0) for _ in range(3)]
+        for _ in outcomes:  # all of them, before any has its answer
+            os.read(begun, 1)
+        os.close(held)
+        assert [outcome.result().endswith("x.xml: done") for outcome in outcomes] == [True] * 3
+    os.close(begun)
 
 
 BODY = '<worldbody><body name="b"><joint name="j"/><geom name="g" size=".1"/></body></worldbody>'
@@ -293,7 +371,7 @@ def test_what_is_not_understood_is_refused(text: str, reason: str, wire: Wire, f
 def test_a_process_that_compiles_starts_without_a_word(
     wire: Wire, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    sandbox._child.close()
+    sandbox._compilers.close()
     model = folder / "root" / "first.xml"
     model.write_text(f"<mujoco>{BODY}</mujoco>")
     assert wire.ask("import_xml", path=str(model))["imported_now"] is True
@@ -475,8 +553,8 @@ def test_a_child_that_was_killed_is_replaced(wire: Wire, folder: Path) -> None:
     model = folder / "root" / "again.xml"
     model.write_text('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
     wire.ask("import_xml", path=str(model))
-    child = sandbox._child._process
-    assert child is not None
+    assert sandbox._compilers._idle is not None
+    child = sandbox._compilers._idle.process
     child.kill()
     child.wait(30)
     assert wire.ask("import_xml", path=str(model), force_reimport=True)["imported_now"] is True
@@ -505,8 +583,8 @@ async def test_physics_and_streams_go_on_while_a_model_compiles(folder: Path) ->
     ):
         await client.discover()
         await client.scene.import_xml(str(quick))
-        child = sandbox._child._process
-        assert child is not None
+        assert sandbox._compilers._idle is not None
+        child = sandbox._compilers._idle.process
         child.send_signal(signal.SIGSTOP)  # it takes as long as the rest does
         try:
             compiling = asyncio.create_task(client.scene.import_xml(str(bomb), timeout=None))

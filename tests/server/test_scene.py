@@ -70,15 +70,15 @@ def test_everything_an_articulation_owns_has_its_prefix(two_bots: CompiledScene)
     for count, element in kinds:
         found = names(model, count, element)
         assert count
-        assert all(name.startswith(("bot_", "bot_1_")) for name in found)
+        assert all(name.startswith(("bot_", "copy1_bot_")) for name in found)
         assert len(set(found)) == count
-    assert names(model, model.nbody, model.body) == ["world", "bot_base", "bot_arm", "bot_1_base", "bot_1_arm"]
+    assert names(model, model.nbody, model.body) == ["world", "bot_base", "bot_arm", "copy1_bot_base", "copy1_bot_arm"]
 
 
 def test_articulations_are_told_apart_by_key_and_id(two_bots: CompiledScene) -> None:
     assert [(index.key, index.prefix, index.actor_id) for index in two_bots.articulations] == [
         ("bot", "bot_", "id0"),
-        ("bot_1", "bot_1_", "id1"),
+        ("copy1_bot", "copy1_bot_", "id1"),
     ]
     assert [index.model_name for index in two_bots.articulations] == ["bot", "bot"]
     assert all(not any(index.original_names.values()) for index in two_bots.articulations)
@@ -87,10 +87,10 @@ def test_articulations_are_told_apart_by_key_and_id(two_bots: CompiledScene) -> 
 def test_actors_stand_where_they_were_placed(two_bots: CompiledScene) -> None:
     model = two_bots.model
 
-    np.testing.assert_allclose(model.body("bot_1_base").pos, [2, 0, 1])
+    np.testing.assert_allclose(model.body("copy1_bot_base").pos, [2, 0, 1])
     np.testing.assert_allclose(model.qpos0[two_bots.articulations[1].qpos_adr[:7]], [2, 0, 1, 1, 0, 0, 0])
-    assert model.geom("bot_1_floor").bodyid[0] == 0
-    np.testing.assert_allclose(model.geom("bot_1_floor").pos, [2, 0, 0])
+    assert model.geom("copy1_bot_floor").bodyid[0] == 0
+    np.testing.assert_allclose(model.geom("copy1_bot_floor").pos, [2, 0, 0])
 
 
 def test_a_rotated_actor_is_compiled_rotated(workspace: Workspace) -> None:
@@ -209,8 +209,8 @@ def test_keyframes_hold_their_owners_part_only(two_bots: CompiledScene) -> None:
     model = two_bots.model
     first, second = two_bots.articulations
 
-    assert names(model, model.nkey, model.key) == ["bot_home", "bot_1_home"]
-    home = key(two_bots, "bot_1_home")
+    assert names(model, model.nkey, model.key) == ["bot_home", "copy1_bot_home"]
+    home = key(two_bots, "copy1_bot_home")
     assert home.time[0] == 1.5
     # The free joint's part is as the MJCF has it, not moved by the actor's pose.
     np.testing.assert_array_equal(home.qpos[second.qpos_adr], [0, 0, 1, 1, 0, 0, 0, 0.5])
@@ -243,7 +243,7 @@ def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
     model = scene.model
     first_ball, first, _, second = scene.articulations
 
-    full = key(scene, "keyed_1_full")
+    full = key(scene, "copy1_keyed_full")
     np.testing.assert_array_equal(full.qpos[second.qpos_adr], [0.1, 5, 6, 7, 1, 0, 0, 0, 0, 1, 0, 0])
     np.testing.assert_array_equal(full.qvel[second.qvel_adr], np.arange(1.0, 11.0))
     np.testing.assert_array_equal(full.ctrl[second.ctrl_adr], [0.2, 0.4])
@@ -258,8 +258,8 @@ def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
     np.testing.assert_array_equal(joints.qpos[first.qpos_adr], [0.1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0])
     np.testing.assert_array_equal(joints.qvel[first.qvel_adr], [1, 0, 0, 0, 0, 0, 0, 8, 9, 10])
 
-    np.testing.assert_array_equal(key(scene, "keyed_1_nothing").qpos, model.qpos0)
-    begin = key(scene, "keyed_1_begin").qpos[second.qpos_adr]
+    np.testing.assert_array_equal(key(scene, "copy1_keyed_nothing").qpos, model.qpos0)
+    begin = key(scene, "copy1_keyed_begin").qpos[second.qpos_adr]
     np.testing.assert_array_equal(begin, [0.25, *model.qpos0[second.qpos_adr][1:]])
 
 
@@ -338,7 +338,7 @@ def test_one_prefix_may_begin_with_another(scene_of: SceneOf) -> None:
 
     scene = scene_of(("robot", robot), ("other", other), ("robot", robot))
 
-    assert [index.key for index in scene.articulations] == ["robot", "robot_1_2", "robot_1"]
+    assert [index.key for index in scene.articulations] == ["robot", "robot_1_2", "copy1_robot"]
     for index in scene.articulations:
         assert index.body_names == ("base",)
         assert len(index.joints) == len(index.actuators) == 1
@@ -449,7 +449,7 @@ def test_cameras_have_a_useful_size_and_a_vertical_view(scene_of: SceneOf) -> No
     assert (by_name["plain"].resolution, by_name["plain"].fovy) == ((640, 480), 45.0)
     assert (by_name["wide"].resolution, by_name["wide"].fovy) == ((1280, 720), 60.0)
     assert by_name["lens"].fovy == pytest.approx(90.0)
-    assert scene.model.camera(by_name["lens"].id).name == "eyes_1_lens"
+    assert scene.model.camera(by_name["lens"].id).name == "copy1_eyes_lens"
     assert scene.model.vis.global_.offwidth >= 1280
     assert scene.model.vis.global_.offheight >= 720
 
@@ -553,11 +553,11 @@ def test_a_converted_mesh_file_is_scaled(workspace: Workspace) -> None:
 def test_floors_that_coincide_are_named_and_drawn_once(two_bots: CompiledScene) -> None:
     model = two_bots.model
 
-    assert any("2 floors coincide (bot_floor, bot_1_floor)" in warning for warning in two_bots.warnings)
-    drawn = model.geom_rgba[[model.geom("bot_floor").id, model.geom("bot_1_floor").id], 3]
+    assert any("2 floors coincide (bot_floor, copy1_bot_floor)" in warning for warning in two_bots.warnings)
+    drawn = model.geom_rgba[[model.geom("bot_floor").id, model.geom("copy1_bot_floor").id], 3]
     assert drawn.tolist() == [1, 0]
     np.testing.assert_allclose(model.geom("bot_floor").size[:2], [7, 5])  # reaches as far as both did
-    assert model.geom("bot_1_floor").contype[0] == 1
+    assert model.geom("copy1_bot_floor").contype[0] == 1
 
 
 def test_floors_apart_are_left_alone(scene_of: SceneOf) -> None:

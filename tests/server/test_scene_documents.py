@@ -78,9 +78,9 @@ def test_a_scene_attaches_a_document_for_each_robot(workspace: Workspace) -> Non
 
     text, files = scene.export(attached=True)
 
-    assert {"crab_model.xml", "bot_model.xml", "crab_1_model.xml"} <= files.keys()
-    assert '<model name="crab_1_" file="crab_1_model.xml"' in text
-    assert '<attach model="crab_1_" prefix="crab_1_"' in text
+    assert {"crab_model.xml", "bot_model.xml", "copy1_crab_model.xml"} <= files.keys()
+    assert '<model name="copy1_crab_" file="copy1_crab_model.xml"' in text
+    assert '<attach model="copy1_crab_" prefix="copy1_crab_"' in text
     assert len(files) == 5  # the claw is there once, and the rock
     assert all("/" not in name for name in files)
     built = mujoco.MjModel.from_xml_string(text, files)

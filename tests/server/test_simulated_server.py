@@ -355,10 +355,11 @@ def test_every_bundled_robot_plays(connect: Connect) -> None:
         assert wire.ask("step", n_steps=100)["step"] == 100.0
 
 
-def test_ids_and_keys_of_equal_models(serve: Serve) -> None:
-    wire = serve("bot", "bot", "prop", "bot", play=True)
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_ids_and_keys_of_equal_models(serve: Serve, dialect: str) -> None:
+    wire = serve("bot", "bot", "prop", "bot", play=True, dialect=dialect)
     keys = {entry["actor_id"]: entry["prefix"] for entry in wire.hello()["articulations"]}
-    assert keys == {"bot": "bot", "bot_1": "bot_1", "prop": "prop", "bot_2": "bot_2"}
+    assert keys == {"bot": "bot", "copy1_bot": "copy1_bot", "prop": "prop", "copy2_bot": "copy2_bot"}
 
 
 def test_names_as_the_plugin_gives_them(serve: Serve) -> None:
@@ -506,7 +507,7 @@ def test_controllers_by_id_key_and_star(serve: Serve) -> None:
     configs = {"bot": ControllerConfig(kp=1.0), "bot_C_1": ControllerConfig(kp=2.0), "*": ControllerConfig(kp=3.0)}
     wire = serve("bot", "bot", "limited", play=True, controllers=configs, actor_names="plugin")
     gains = {entry["actor_id"]: entry["controller"]["params"]["kp"]["m"] for entry in wire.hello()["articulations"]}
-    assert gains == {"bot": 1.0, "bot_1": 2.0, "limited": 3.0}
+    assert gains == {"bot": 1.0, "copy1_bot": 2.0, "limited": 3.0}
 
 
 def test_cameras_as_configured(serve: Serve) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from raw_shm import RawShm
-from wire import Wire
+from wire import Wire, files_of_at_most
 
 from urlab_client.server import Limits, SimulatedServer
 from urlab_client.server.assets.uploads import IDLE_S, MAX_OPEN
@@ -93,6 +93,9 @@ def test_a_model_is_sent_and_spawned(wire: Wire) -> None:
     ("change", "code"),
     [
         ({"xml_sha256": "abc"}, "bad_request"),
+        ({"xml_sha256": None}, "bad_request"),
+        *(({"assets": [asset]}, "bad_request") for asset in ({}, None, "a.stl", {"name": "a.stl", "size": 0})),
+        ({"assets": [{"name": "a.stl", "sha256": digest(b"")}]}, "payload_too_large"),
         ({"xml_sha256": digest(XML).upper()}, "bad_request"),
         ({"total_bytes": 2**30}, "payload_too_large"),
         *(
@@ -191,18 +194,81 @@ def test_a_model_that_runs_is_described(wire: Wire) -> None:
     assert wire.ask("set_mode", mode="live")["previous_mode"] == "direct"
 
 
-def test_the_cache_gives_way(tmp_path: Path) -> None:
-    with (
-        SimulatedServer(dialect="beta", saved_dir=tmp_path, limits=Limits(upload_cache_bytes=len(XML))) as server,
-        Wire(server) as wire,
-    ):
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Wire]:
+    """A client of a server whose cache holds two documents and a half."""
+    limits = Limits(upload_cache_bytes=len(XML) * 5 // 2)
+    with SimulatedServer(dialect="beta", saved_dir=tmp_path, limits=limits) as server, Wire(server) as wire:
         wire.hello()
-        for data in (XML, XML + b" "):
-            upload = wire.ask("upload_model_manifest", **manifest(data))["upload_id"]
-            wire.ask("upload_model_chunk", **chunk(upload, data))
-            wire.refused("upload_model_commit", upload_id=upload)  # the mesh is missing, the upload is closed
-        assert sum(file.stat().st_size for file in (tmp_path / "Uploads" / "cache").iterdir()) <= 2 * len(XML) + 1
-        assert wire.ask("upload_model_manifest", **manifest(XML))["need_xml"] is True
+        yield wire
+
+
+def used(wire: Wire, xml: bytes) -> bool:
+    """Use a document for an upload, send it if it must be sent, and return whether it had to be."""
+    opened = wire.ask("upload_model_manifest", **manifest(xml))
+    if opened["need_xml"]:
+        wire.ask("upload_model_chunk", **chunk(opened["upload_id"], xml))
+    wire.refused("upload_model_commit", upload_id=opened["upload_id"])  # the mesh is missing, the upload is closed
+    return opened["need_xml"]
+
+
+def test_the_document_used_longest_ago_gives_way(small: Wire) -> None:
+    one, two, three = XML, XML.replace(b"sent", b"two_"), XML.replace(b"sent", b"more")
+    assert [used(small, xml) for xml in (one, two, one, three, one, two)] == [True, True, False, True, False, True]
+
+
+def test_what_is_under_way_is_bounded_too(small: Wire, tmp_path: Path) -> None:
+    def held() -> list[int]:
+        return [file.stat().st_size for file in tmp_path.rglob("Uploads/**/*") if file.is_file()]
+
+    assert used(small, XML)
+    other = [XML.replace(b"sent", name) for name in (b"two_", b"more", b"last")]
+    for xml in other[:2]:  # most of each, for which the document in the cache gives way
+        upload = small.ask("upload_model_manifest", **manifest(xml))["upload_id"]
+        small.ask("upload_model_chunk", **chunk(upload, xml[:-1], total=len(xml)))
+    assert held() == [len(XML) - 1] * 2
+    upload = small.ask("upload_model_manifest", **manifest(other[2]))["upload_id"]
+    code, message = small.refusal("upload_model_chunk", **chunk(upload, other[2]))
+    assert (code, "upload_cache_bytes" in message) == ("payload_too_large", True)
+    assert held() == [len(XML) - 1] * 2
+
+
+def test_a_file_that_a_full_disk_cuts_short_does_not_stay_on_it(wire: Wire, tmp_path: Path) -> None:
+    upload = wire.ask("upload_model_manifest", **manifest())["upload_id"]
+    half = len(XML) // 2
+    wire.ask("upload_model_chunk", **chunk(upload, XML[:half], total=len(XML)))
+    with files_of_at_most(half + 1):
+        assert "File too large" in wire.refusal("upload_model_chunk", **chunk(upload, XML))[1]
+        assert not [file for file in tmp_path.rglob("Uploads/**/*") if file.is_file()]
+    assert wire.ask("upload_model_chunk", **chunk(upload, XML))["complete"]
+
+
+def test_no_upload_begins_where_nothing_can_be_stored(wire: Wire, tmp_path: Path) -> None:
+    (tmp_path / "saved").mkdir(exist_ok=True)
+    (tmp_path / "saved" / "Uploads").touch()
+    code, message = wire.refusal("upload_model_manifest", **manifest())
+    assert (code, message.startswith("the upload cannot be stored: ")) == ("internal_error", True)
+
+
+@pytest.mark.parametrize("damage", [b"", b"<mujoco/>", XML.replace(b"sent", b"bent")])
+@pytest.mark.parametrize("part", ["document", "mesh"])
+def test_a_damaged_file_in_the_cache_is_asked_for_again(part: str, damage: bytes, wire: Wire, tmp_path: Path) -> None:
+    document = XML.replace(b"hinge", b"slide")
+    said = manifest(document, part_obj=MESH)
+    data, name = (document, "") if part == "document" else (MESH, "part.obj")
+    damaged = tmp_path / "saved" / "Uploads" / "cache" / digest(data)
+    upload = wire.ask("upload_model_manifest", **said)["upload_id"]
+    wire.ask("upload_model_chunk", **chunk(upload, document))
+    wire.ask("upload_model_chunk", **chunk(upload, MESH, "part.obj"))
+    damaged.write_bytes(damage[: len(data)].ljust(len(data) if damage else 0))
+    again = wire.ask("upload_model_manifest", **said)
+    assert (again["need_xml"], again["need_assets"]) == ((not name), [name] if name else [])
+    wire.ask("upload_model_chunk", **chunk(upload, data, name))
+    damaged.write_bytes(damage[: len(data)].ljust(len(data) if damage else 0))
+    code, message = wire.refusal("upload_model_commit", upload_id=upload)
+    assert (code, f"{name or '<xml>'} must be sent first" in message) == ("bad_request", True)
+    wire.ask("upload_model_chunk", **chunk(upload, data, name))
+    assert wire.ask("upload_model_commit", upload_id=upload)["imported"]
 
 
 def test_a_large_chunk_goes_over_zmq_alone(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -422,7 +422,7 @@ def model_of(reply: dict[str, Any], folder: Path) -> mujoco.MjModel:
 
 @pytest.fixture
 def pair(editor: Wire, models: Path) -> Wire:
-    """Two robots `a0` and `a1`, keys `bot` and `bot_1`, in play."""
+    """Two robots `a0` and `a1`, keys `bot` and `copy1_bot`, in play."""
     spawn(editor, models / "bot.xml", "a0")
     spawn(editor, models / "bot.xml", "a1", location=[2, 0, 0])
     play(editor)
@@ -465,18 +465,18 @@ def test_sim_01_to_07_names_and_placement(pair: Wire, tmp_path: Path) -> None:
     reply = pair.hello()
     model = model_of(reply, tmp_path)
     keys = {entry["actor_id"]: entry["prefix"] for entry in reply["articulations"]}
-    assert keys == {"a0": "bot", "a1": "bot_1"}
+    assert keys == {"a0": "bot", "a1": "copy1_bot"}
     assert {row["actor_id"]: row["name"] for row in rows(pair).values()} == keys
     for key in keys.values():
         for kind, name in (("body", "base"), ("body", "arm"), ("joint", "root"), ("joint", "j"), ("geom", "floor")):
             assert getattr(model, kind)(f"{key}_{name}").id >= 0
         for kind, name in (("actuator", "m"), ("sensor", "s"), ("key", "home")):
             assert getattr(model, kind)(f"{key}_{name}").id >= 0
-    assert model.body("bot_1_base").pos.tolist() == [2.0, 0.0, 1.0]
-    start = model.jnt_qposadr[model.joint("bot_1_root").id]
+    assert model.body("copy1_bot_base").pos.tolist() == [2.0, 0.0, 1.0]
+    start = model.jnt_qposadr[model.joint("copy1_bot_root").id]
     assert model.qpos0[start : start + 7].tolist() == [2.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
-    assert model.geom_bodyid[model.geom("bot_1_floor").id] == 0
-    assert model.geom("bot_1_floor").pos.tolist() == [2.0, 0.0, -5.0]
+    assert model.geom_bodyid[model.geom("copy1_bot_floor").id] == 0
+    assert model.geom("copy1_bot_floor").pos.tolist() == [2.0, 0.0, -5.0]
 
 
 def test_sim_04_actors_without_an_id(editor: Wire, models: Path) -> None:
@@ -513,7 +513,7 @@ def test_sim_14_a_restart_takes_edits_over(pair: Wire, models: Path) -> None:
 def test_sim_15_to_17_keyframes(pair: Wire, tmp_path: Path) -> None:
     model = model_of(pair.hello(), tmp_path)
     keys = pair.ask("list_keyframes")["keyframes"]
-    assert [key["name"] for key in keys] == ["bot_home", "bot_1_home"]
+    assert [key["name"] for key in keys] == ["bot_home", "copy1_bot_home"]
     for key in keys:
         assert key["time"] == 1.5
         assert (len(key["qpos"]), len(key["qvel"]), len(key["ctrl"])) == (model.nq, model.nv, model.nu)
@@ -875,8 +875,8 @@ def test_sim_73_wrenches_that_are_none(ball: Wire) -> None:
 def test_sim_74_live_takes_positions_only(pair: Wire) -> None:
     pair.ask("set_paused", paused=False)
     lift = {"ctrl_map": {"m": 1}, "xfrc_applied": {"base": [0, 0, 1e4, 0, 0, 0]}}
-    for reply in pair.until("step", per_articulation={"bot": lift, "bot_1": {"ctrl": [0.5]}}):
-        if reply["per_articulation"]["bot_1"]["ctrl"] == [0.5]:
+    for reply in pair.until("step", per_articulation={"bot": lift, "copy1_bot": {"ctrl": [0.5]}}):
+        if reply["per_articulation"]["copy1_bot"]["ctrl"] == [0.5]:
             break
     assert bot(reply)["ctrl"] == [0.0]
     assert bot(reply)["qpos"][2] <= 1.0
@@ -1032,6 +1032,13 @@ def test_sim_91_a_cap_on_contacts(serve: Serve) -> None:
     reply = wire.ask("get_contacts", max_contacts=1)
     assert (reply["n_contacts"], reply["truncated"], len(reply["contacts"])) == (1.0, True, 1)
     assert wire.ask("get_contacts", max_contacts=4)["truncated"] is False
+
+
+def test_sim_91_the_cap_is_64_unless_told(serve: Serve) -> None:
+    wire = serve(*["resting"] * 9, play=True)
+    reply = wire.ask("get_contacts")
+    assert (reply["n_contacts"], reply["truncated"]) == (64.0, True)
+    assert wire.ask("get_contacts", max_contacts=81)["n_contacts"] == 81.0, "each of nine balls on each of nine floors"
 
 
 def test_sim_107_cameras(shared_play: Wire) -> None:

@@ -16,7 +16,7 @@ from worlds import BALL_BODY, BOT, Workspace, mjcf, write_obj
 
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import compile_scene
-from urlab_client.server.editor.world import Actor, ActorKind, EditorWorld
+from urlab_client.server.editor.world import Actor, ActorKind, ActorNames, EditorWorld
 from urlab_client.server.handlers.scene import _row as snapshot_row
 from urlab_client.server.refusal import Refusal
 
@@ -341,6 +341,7 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
     [
         ("{", "is not a level"),
         ("[]", "is not a level"),
+        ('{"x": ' + "[" * 100_000, "is not a level"),
         ('{"format": "other"}', 'it lacks "format": "urlab-level"'),
         (HEAD | {"version": 2, "actors": []}, "version 2"),
         (HEAD, "actors"),
@@ -440,9 +441,9 @@ def test_the_model_name_names_actors(workspace: Workspace, bot: str, world: Edit
 
     placed = [world.spawn_actor(path).actor.name for path in (bot, bot, nameless, spaced, bot)]
 
-    assert placed == ["bot", "bot_1", "my_file", "my_robot_", "bot_2"]
-    world.destroy_actor("bot_1")
-    assert world.spawn_actor(bot).actor.name == "bot_1"
+    assert placed == ["bot", "copy1_bot", "my_file", "my_robot_", "copy2_bot"]
+    world.destroy_actor("copy1_bot")
+    assert world.spawn_actor(bot).actor.name == "copy1_bot"
 
 
 def test_actors_can_be_named_as_the_plugin_does(tmp_path: Path) -> None:
@@ -458,10 +459,29 @@ def test_names_whose_compiled_names_would_repeat_are_passed_over(workspace: Work
         "tricky", mjcf('<body name="base"><geom size="0.1"/><body name="1_base"><geom size="0.1"/></body></body>')
     )
 
-    placed = [world.spawn_actor(tricky).actor.name for _ in range(3)]
+    alike = workspace.blueprint("alike", mjcf(BALL_BODY.replace("ball", "base"), model="tricky_1"))
 
-    assert placed == ["tricky", "tricky_2", "tricky_3"]  # tricky_1 + base would be tricky + 1_base
-    assert compile_scene(world.freeze()).model.nbody == 7
+    placed = [world.spawn_actor(blueprint).actor.name for blueprint in (tricky, alike)]
+
+    assert placed == ["tricky", "copy1_tricky_1"]  # tricky_1 + base would be tricky + 1_base
+    assert compile_scene(world.freeze()).model.nbody == 4
+
+
+@pytest.mark.parametrize("naming", ["model", "plugin"])
+def test_no_copy_has_a_name_that_begins_with_that_of_another_robot(tmp_path: Path, naming: ActorNames) -> None:
+    workspace = Workspace(tmp_path, actor_names=naming)
+    world = workspace.world
+    robot, copy = (workspace.blueprint(name, mjcf(BALL_BODY, model=name)) for name in ("robot", "copy2"))
+    world.spawn_actor(robot, "copy1_rob")
+    world.spawn_actor(copy, world.unused_id("robot"))
+    for blueprint in (robot, copy, robot, copy):
+        world.spawn_actor(blueprint, world.unused_id("robot"))
+
+    names = [actor.name for actor in world.list_actors()]
+    ids = [actor.actor_id for actor in world.list_actors()]
+    for known in (names, ids):
+        assert len(set(known)) == 6
+        assert [(a, b) for a in known for b in known if a != b and a.startswith(b)] == []
 
 
 def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: EditorWorld) -> None:
@@ -532,7 +552,7 @@ def test_a_grid_is_placed_x_first(ball: str, world: EditorWorld) -> None:
 
     assert [cell.actor.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
     assert placed[3].actor.location == (11, 22, 30)
-    assert names(world.list_actors()) == ["ball", "ball_1", "ball_2", "ball_3", "ball_4", "ball_5"]
+    assert names(world.list_actors()) == ["ball", "copy1_ball", "copy2_ball", "copy3_ball", "copy4_ball", "copy5_ball"]
     again = world.spawn_grid(ball, "g", 3, 1)
     assert [cell.was_existing for cell in again] == [True, True, False]
     assert len(world.list_actors()) == 7
@@ -611,14 +631,16 @@ def test_a_transform_changes_the_parts_it_names(bot: str, world: EditorWorld) ->
 
 
 def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: EditorWorld) -> None:
-    world.spawn_actor(bot, "bot_1")
-    world.spawn_actor(bot, "other")  # its object name is bot_1
+    world.spawn_actor(bot, "gone")
+    world.spawn_actor(bot, "bot")  # its object name is copy1_bot
+    world.destroy_actor("gone")
+    world.spawn_actor(bot, "other")  # its object name is bot
 
-    assert world.set_actor_transform("bot_1").name == "bot"
-    assert world.set_actor_transform("other").name == "bot_1"
-    assert world.actor("bot_1").name == "bot"  # type: ignore[union-attr]  # by id
-    assert world.actor("bot_1", by_name=True).actor_id == "other"  # type: ignore[union-attr]
-    assert world.actor("bot") is None
+    assert world.set_actor_transform("bot").name == "copy1_bot"
+    assert world.set_actor_transform("other").name == "bot"
+    assert world.actor("bot").name == "copy1_bot"  # type: ignore[union-attr]  # by id
+    assert world.actor("bot", by_name=True).actor_id == "other"  # type: ignore[union-attr]
+    assert world.actor("copy1_bot") is None
 
 
 def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, world: EditorWorld) -> None:
@@ -665,7 +687,7 @@ def test_one_actor_is_selected(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "b")
 
     world.select_actor("a")
-    assert world.select_actor("b").name == world.selected == "bot_1"
+    assert world.select_actor("b").name == world.selected == "copy1_bot"
     assert refusal(world.select_actor, "c").code == "select_failed"
 
 
@@ -816,7 +838,7 @@ def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: EditorW
         "ball_ball",
         "bot_base",
         "bot_arm",
-        "ball_1_ball",
+        "copy1_ball_ball",
     ]
     assert model.nq == 7 + 8 + 7
     assert mujoco.mj_version() > 0

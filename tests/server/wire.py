@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 import zmq
+from waiting import DEADLINE_S
 
 from urlab_client.server import SimulatedServer
 
@@ -98,16 +101,35 @@ def server_threads() -> set[threading.Thread]:
     return {thread for thread in urlab if thread.name != "urlab-io"}  # a client's
 
 
+@contextlib.contextmanager
+def files_of_at_most(size: int) -> Generator[None]:
+    """Let no file of this process grow beyond a size: to a program that is much like a full disk."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 class Wire:
     """Talks to a server; checks of every reply what holds for all."""
 
     def __init__(self, server: SimulatedServer, *, encoding: str = "", timeout_s: float = 30) -> None:
         self._context = zmq.Context()
+        self._server = server
         self._endpoint = f"{server.address}:{server.step_port}"
         self._timeout_s = timeout_s
         self._socket = self._connect()
         self._encoding = encoding
         self.session_id = ""
+
+    @property
+    def core(self) -> Any:
+        """The inside of the server, where no op shows what is asked about."""
+        return self._server._running._core  # type: ignore[union-attr]
 
     def __enter__(self) -> Self:
         return self
@@ -166,9 +188,11 @@ class Wire:
         return reply["code"], reply["message"]
 
     def until(self, op: str, /, **fields: Any) -> Iterator[dict[str, Any]]:
-        """Ask again and again, until the caller has seen enough."""
-        while True:
+        """Ask again and again, until the caller has seen enough; fail when that takes too long."""
+        deadline = time.monotonic() + DEADLINE_S
+        while time.monotonic() < deadline:
             yield self.ask(op, **fields)
+        raise AssertionError(f"no reply to {op} within {DEADLINE_S:g} s was what the test waits for")
 
 
 def check_numbers(frame: bytes) -> None:

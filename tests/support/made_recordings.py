@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -104,3 +105,42 @@ def with_later_pictures(source: Path, target: Path, by_ns: int) -> None:
         for metadata in reader.iter_metadata():
             writer.add_metadata(metadata.name, metadata.metadata)
         writer.finish()
+
+
+class Message(NamedTuple):
+    """A message, and the channel that it is on."""
+
+    topic: str
+    schema: str
+    time: int
+    data: bytes
+    metadata: dict[str, str]
+    publish_time: int = 0
+
+
+def messages_of(path: Path) -> list[Message]:
+    with path.open("rb") as file:
+        return [
+            Message(channel.topic, schema.name, one.log_time, one.data, channel.metadata, one.publish_time)
+            for schema, channel, one in make_reader(file).iter_messages(log_time_order=False)
+            if schema is not None
+        ]
+
+
+def write_messages(path: Path, content: Sequence[Message], **options: Any) -> Path:
+    """Write messages into one chunk with right checksums."""
+    with path.open("wb") as file:
+        writer = Writer(file, **{"chunk_size": 1 << 40, "compression": CompressionType.ZSTD, **options})
+        writer.start(profile="", library="tests")
+        schemas: dict[str, int] = {}
+        channels: dict[Any, int] = {}
+        for one in content:
+            if one.schema not in schemas:
+                schemas[one.schema] = writer.register_schema(one.schema, "jsonschema", b"{}")
+            channel = one.topic, one.schema, *sorted(one.metadata.items())
+            if channel not in channels:
+                channels[channel] = writer.register_channel(one.topic, "json", schemas[one.schema], one.metadata)
+            writer.add_message(channels[channel], one.time, one.data, one.publish_time)
+        writer.add_metadata("urlab", {"format": "1"})
+        writer.finish()
+    return path

@@ -20,7 +20,6 @@ from urlab_client.protocol.registry import dialect_ops
 __all__ = ["ScriptedServer", "client_of", "meta_ok", "names"]
 
 HELLO = hello_ok(manager_present=False)
-NOWHERE = {"op": "error", "code": "not_ready", "message": "there is no state yet"}
 
 
 def meta_ok(dialect: DialectName) -> dict[str, Any]:
@@ -51,7 +50,6 @@ class ScriptedServer:
         self.answers: dict[str, Answer] = {
             "hello": lambda _: HELLO,
             "meta": lambda _: meta_ok("alpha"),
-            "forward": lambda _: NOWHERE,
         }
         self.held: queue.Queue[list[bytes]] = queue.Queue()
         self._context = zmq.Context()

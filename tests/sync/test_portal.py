@@ -22,7 +22,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, eventually
 
 from urlab_client import URLabClient
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
@@ -97,6 +97,36 @@ class TestCall:
             list(pool.map(call, range(64)))
             threads = [thread for thread in set(threading.enumerate()) - before if thread.name == "urlab-io"]
         assert [thread.daemon for thread in threads] == [True]
+
+    @pytest.mark.parametrize("part", ["_run_loop", "_await_turn", "_main", "_end"])
+    async def test_calls_fail_with_the_cause_when_the_thread_dies(
+        self, part: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        method, first = getattr(_loop.CallerDrivenLoop, part), iter([True])
+
+        def die(*arguments: Any) -> Any:
+            if next(first, False):
+                raise MemoryError("none left")
+            return method(*arguments)
+
+        async def die_later(*arguments: Any) -> Any:
+            return await die(*arguments)
+
+        portal = Portal()
+        monkeypatch.setattr(_loop.CallerDrivenLoop, part, die_later if part in {"_main", "_end"} else die)
+        with ThreadPoolExecutor(1) as pool:
+            waiting = pool.submit(portal.call, asyncio.sleep, 3600)
+            if part == "_end":
+                eventually(lambda: portal._io)
+                portal.close()
+            with pytest.raises(ClientClosed) as caught:
+                waiting.result(DEADLINE_S)
+        if part != "_end":
+            assert isinstance(caught.value.__cause__, MemoryError)
+            with pytest.raises(ClientClosed, match="urlab-io, which runs its event loop, died of MemoryError"):
+                portal.call(answer)
+        portal.close()
+        assert "urlab-io ended unexpectedly" in caplog.text
 
     def test_the_thread_ends_with_its_portal_though_a_signal_strikes_the_finalizer(
         self, monkeypatch: pytest.MonkeyPatch
@@ -800,6 +830,38 @@ class TestInterrupt:
             portal.close()
         """)
         assert outcome(process) == (0, ["True", "True"], "")
+
+    @pytest.mark.parametrize("loops", ["asyncio", "uvloop"])
+    def test_signals_of_an_event_loop_interrupt_no_system_call_after_a_call_either(self, loops: str) -> None:
+        process = child(f"""
+            import ctypes, {loops}, os, time
+            read = ctypes.CDLL(None, use_errno=True).read
+            reading, writing = os.pipe()
+
+            def signals(thread):
+                for _ in range(100):
+                    signal.pthread_kill(thread, signal.SIGUSR1)
+                    time.sleep(0)  # the other thread has its turn
+                os.write(writing, b"x")
+
+            async def main():
+                got = asyncio.Event()
+                asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, got.set)
+                portal = Portal()
+                portal.call(answer)
+                sending = threading.Thread(target=signals, args=[threading.get_ident()])
+                sending.start()
+                say(read(reading, ctypes.create_string_buffer(1), 1))
+                sending.join()
+                await got.wait()
+                say("got")
+                portal.close()
+
+            loop = {loops}.new_event_loop()
+            loop.run_until_complete(main())
+            loop.close()
+        """)
+        assert outcome(process) == (0, ["1", "got"], "")
 
     def test_at_any_moment_leaves_the_portal_usable(self) -> None:
         # An exception may strike between any two instructions of the portal; hundreds of timer signals try.

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from urlab_client import URLabClient, URLabError
+from urlab_client.integrations.gym import URLabEnv
 from urlab_client.server import SimulatedServer
 from urlab_client.sync._facade import aio_of, portal_of
 
@@ -80,4 +81,29 @@ def test_the_error_says_what_was_wrong(client: URLabClient, part: str, flavour: 
                         unnamed.append(f"{shown}: {error}")
                 except Exception as error:  # noqa: BLE001
                     unnamed.append(f"{shown}: {error!r}")
+    assert not unnamed, "\n".join(unnamed)
+
+
+@pytest.fixture
+def fresh() -> Iterator[URLabClient]:
+    """A client that no other test has left in another mode or with wrenches to send."""
+    with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as made:
+        made.discover()
+        yield made
+
+
+def test_an_environment_says_what_was_wrong(fresh: URLabClient) -> None:
+    unnamed: list[str] = []
+    for name in list(inspect.signature(URLabEnv).parameters)[1:]:
+        for value in (*STRANGE, [1], [None], [[]], b"x", -1):
+            drawn = {"render_mode": "rgb_array"} if name == "render_camera" else {}
+            try:
+                URLabEnv(fresh, **{**drawn, name: value}).reset(options=value if name == "task" else None)
+            except (URLabError, ValueError, KeyError, OSError):
+                pass
+            except TypeError as error:
+                if PYTHONS_OWN.search(str(error)):
+                    unnamed.append(f"{name}={value!r}: {error}")
+            except Exception as error:  # noqa: BLE001
+                unnamed.append(f"{name}={value!r}: {error!r}")
     assert not unnamed, "\n".join(unnamed)

@@ -6,17 +6,20 @@ import asyncio
 import contextlib
 import logging
 import os
+import signal
 import tempfile
 import threading
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 
 import pytest
+from children import in_background
 from made_recordings import Robot, write_recording
+from starlette.applications import Starlette
 from waiting import until
 
 from urlab_client.aio import URLabClient
-from urlab_client.cli._pages import bound, serve
+from urlab_client.cli._pages import bound, graceful_exit, serve
 from urlab_client.integrations.record import Run, export
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app, model_upload
@@ -48,6 +51,18 @@ async def ask(port: int, key: str, head: str, body: bytes = b"") -> tuple[asynci
     return reader, writer
 
 
+def test_in_the_background_sigterm_ends_it_and_ctrl_c_is_ignored() -> None:
+    handlers: list[object] = []
+
+    def started() -> None:
+        handlers.append(signal.getsignal(signal.SIGINT))
+        signal.raise_signal(signal.SIGTERM)
+
+    with in_background(), bound("127.0.0.1", 0) as listener, graceful_exit():
+        asyncio.run(serve(Starlette(), listener, started))
+    assert handlers == [signal.SIG_IGN]
+
+
 @pytest.fixture
 def converting(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """A conversion that writes half a file, says so, and goes on until its progress breaks it off."""
@@ -64,16 +79,15 @@ def converting(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 @pytest.fixture
-def unpacking(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A model's archive that takes as long to unpack; return the folder for temporary files."""
+def compiling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A model's archive that takes as long to compile; return the folder for temporary files."""
 
-    def unpack(_archive: Path, folder: Path, progress: Callable[[int], None]) -> Path:
-        folder.mkdir()
+    def flatten(file: Path, progress: Callable[[int], object]) -> None:
         while True:
             progress(0)
-            (folder / "part").touch()
+            file.with_name("part").touch()
 
-    monkeypatch.setattr(model_upload, "_unpacked", unpack)
+    monkeypatch.setattr(model_upload, "flatten_confined", flatten)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path.parent / f"{tmp_path.name}-temporary"))
     Path(tempfile.gettempdir()).mkdir()
     return Path(tempfile.gettempdir())
@@ -89,7 +103,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 async def test_ending_breaks_off_what_takes_long_without_a_trace(
-    folder: Path, converting: threading.Event, unpacking: Path, caplog: pytest.LogCaptureFixture
+    folder: Path, converting: threading.Event, compiling: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ended = asyncio.Event()
     with caplog.at_level(logging.WARNING):
@@ -100,7 +114,7 @@ async def test_ending_breaks_off_what_takes_long_without_a_trace(
             conversion = await ask(port, key, "GET /api/recordings/short.mcap?as=csv")
             download = await ask(port, key, f"GET /api/recordings/{LONG}")
             assert await download[0].readline() == b"HTTP/1.1 200 OK\r\n"
-            await until(lambda: converting.is_set() and len(os.listdir(folder)) == 5 and any(unpacking.rglob("part")))
+            await until(lambda: converting.is_set() and len(os.listdir(folder)) == 5 and any(compiling.rglob("part")))
             ended.set()
             for reader, _ in (conversion, uploading, again, importing):
                 assert await reader.readline() == b"HTTP/1.1 503 Service Unavailable\r\n"
@@ -111,7 +125,7 @@ async def test_ending_breaks_off_what_takes_long_without_a_trace(
         *["the upload of other.mcap was broken off"] * 2,
     ]
     assert sorted(os.listdir(folder)) == [LONG, "short.mcap"]
-    assert [name for name in os.listdir(unpacking) if name.startswith("urlab-model-")] == []
+    assert [name for name in os.listdir(compiling) if name.startswith("urlab-model-")] == []
     for _, writer in (importing, uploading, again, conversion, download):
         writer.close()
 

@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,12 @@ pytestmark = pytest.mark.browser
 COVER = "document.querySelector('#view .cover')"
 MODEL = "document.querySelector('.stage iframe')?.contentWindow.eval('currentModelCrc')"
 PRESS = "document.querySelector(arguments[0]).click()"
+CONFIRM = """(() => {  // in one go: the question lasts four seconds, which a busy machine may take between two calls
+  const button = document.querySelector('#restart');
+  const asked = button.textContent.includes('?');
+  button.click();
+  return asked;
+})()"""
 UNFADED = """for (const [name, value] of [["transition", "none"], ["opacity", "1"], ["filter", "none"]])
   document.querySelector("main").style.setProperty(name, value, "important")"""
 
@@ -77,7 +84,7 @@ def test_the_3d_view_shows_the_next_model(playing: Page) -> None:
     page.driver.execute_script(PRESS, "#restart")
     page.until("document.querySelector('#restart').textContent.includes('?')")
     assert page.look(MODEL) == first, "it asks before it throws a simulation away"
-    page.driver.execute_script(PRESS, "#restart")
+    page.until(CONFIRM)
     page.until("document.querySelectorAll('[data-robot]').length === 2")
     page.until(f"({MODEL} ?? 0) > 0 && {MODEL} !== {first}")
     drawn(page)
@@ -124,6 +131,22 @@ def test_nobody_removes_the_manager_and_a_level_without_one_offers_it(playing: P
     page.driver.execute_script(PRESS, "#add-manager")
     page.until("document.querySelector('#no-manager').hidden")
     assert any("Manager" in actor["class"] for actor in page.ask("api/ops/list_actors", {})["actors"])
+
+
+def test_the_page_asks_before_a_model_replaces_another(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "crate.xml").write_text("<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>")
+    names = "[...document.querySelectorAll('#blueprint option')].map(one => one.text)"
+    for _ in range(2):
+        page.until("document.querySelector('#would-replace')?.hidden === true")
+        page.find("#model-file").send_keys(str(tmp_path / "crate.xml"))
+        page.until(f"{names}.includes('crate')")
+    page.until("!document.querySelector('#would-replace').hidden")
+    asked = page.find("#would-replace").text
+    assert "There is already a blueprint 'crate'" in asked
+    assert "Replace crate" in asked
+    page.driver.execute_script(PRESS, "#would-replace button")
+    page.until("document.querySelector('#would-replace').hidden")
+    page.asked("api/log", lambda entries: [entry["what"] for entry in entries].count("import model") == 2)
 
 
 def test_no_message_covers_stop_on_a_phone(page: Page) -> None:

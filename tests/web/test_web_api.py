@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
-import zipfile
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from made_recordings import Robot, with_later_pictures, write_recording
+from made_recordings import Message, Robot, messages_of, with_later_pictures, write_messages, write_recording
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.routing import Mount
@@ -35,10 +35,14 @@ def server() -> Iterator[SimulatedServer]:
 
 
 def mounted(
-    server: SimulatedServer, at: str, access: Access | None = None, recordings: str | Path = "recordings"
+    server: SimulatedServer,
+    at: str,
+    access: Access | None = None,
+    recordings: str | Path = "recordings",
+    **options: Any,
 ) -> Starlette:
     """Mount the console in an application of one's own, which owns the client."""
-    client = URLabClient(**server.client_options())
+    client = URLabClient(**server.client_options(), **options)
     inner = app(client, access=access, lease_seconds=600.0, recordings=recordings)
 
     @contextlib.asynccontextmanager
@@ -439,6 +443,39 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         http.post("/api/ops/set_mode", json={"mode": "live"})
 
 
+def test_a_recording_of_wrong_contents_costs_its_reader_an_explanation(http: TestClient, tmp_path: Path) -> None:
+    poses = [({"arm": Robot([angle, *[0.0] * 7])}, {}) for angle in (0.0, 0.1, 0.2)]
+    write_recording(tmp_path / "good.mcap", poses)
+    good = messages_of(tmp_path / "good.mcap")
+    _, middle, last = (one._replace(data=one.data.replace(b'"sample":', b'"sample":"1","x":')) for one in good)
+    bomb = good[2]._replace(data=b" " * (150 << 20) + good[2].data)
+
+    def put(content: list[Message]) -> Any:
+        file = write_messages(tmp_path / "odd.mcap", content)
+        return http.put("/api/recordings/odd.mcap", content=file.read_bytes())
+
+    for content, said in (
+        ([good[0], good[1], last], "message 3 of /state/arm cannot be read: Expected `int`, got `str`"),
+        ([good[0], good[1], bomb], "unpacks to 157"),
+    ):
+        refused = put(content)
+        assert refused.status_code == 502
+        assert said in refused.json()["error"]["message"]
+    try:
+        assert put([good[0], middle, good[2]]).status_code == 200
+        assert http.post("/api/replay", json={"name": "odd.mcap", "playing": False}).status_code == 200
+        for tried in (
+            http.post("/api/replay", json={"time": 0.01}),
+            http.get("/api/replay/states?seconds=1"),
+            http.get("/api/recordings/odd.mcap?as=csv"),
+        ):
+            assert (tried.status_code, "message 2 of /state/arm" in tried.json()["error"]["message"]) == (502, True)
+        assert http.post("/api/replay", json={"time": 0.02}).json()["time"] == 0.02
+    finally:
+        http.delete("/api/replay")
+        http.delete("/api/recordings/odd.mcap")
+
+
 def test_a_replay_that_is_at_its_end_plays_from_the_start(http: TestClient, tmp_path: Path) -> None:
     poses = [({"arm": Robot([angle, *[0.0] * 7])}, {}) for angle in np.linspace(0.0, 1.0, 101).tolist()]
     write_recording(tmp_path / "odd.mcap", poses, period_ns=10_000_001)  # 1.0000001 s
@@ -453,43 +490,6 @@ def test_a_replay_that_is_at_its_end_plays_from_the_start(http: TestClient, tmp_
     finally:
         http.delete("/api/replay")
         http.delete("/api/recordings/odd.mcap")
-
-
-def test_a_model_is_taken_in_as_a_file_or_an_archive(tmp_path: Path) -> None:
-    mjcf = "<mujoco><worldbody><body name='b'><joint name='j'/><geom {}/></body></worldbody></mujoco>"
-    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    with_mesh = mjcf.replace("<worldbody>", "<asset><mesh file='m/t.obj'/></asset><worldbody>").format(
-        "type='mesh' mesh='t'"
-    )
-
-    def packed(**files: str) -> bytes:
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w") as archive:
-            for name, content in files.items():
-                archive.writestr(name.replace("__", "/").replace("_dot_", "."), content)
-        return buffer.getvalue()
-
-    with SimulatedServer(dialect="beta") as server:
-        site = mounted(server, "/", Access(hosts=["localhost"], tokens=False), tmp_path)
-        with TestClient(site, base_url="http://localhost") as http:
-            with http.websocket_connect("ws://localhost/api/live") as live:
-                heard(live, "status", lambda status: status["link"]["state"] == "connected")
-            plain = http.put("/api/models/stick.xml", content=mjcf.format("size='.1'"))
-            assert plain.status_code == 200, plain.text
-            archive = packed(robot__robot_dot_xml=with_mesh, robot__m__t_dot_obj=tetrahedron)
-            made = http.put("/api/models/robot.zip", content=archive).json()
-            answer = http.post("/api/ops/spawn_actor", json={"blueprint": made["blueprint"], "actor_id": "it"})
-            assert answer.status_code == 200, answer.text
-            for name, content, said in (
-                ("robot.zip", packed(a_dot_xml="", b_dot_xml=""), "one .xml file"),
-                ("robot.zip", packed(**{"..__a_dot_xml": ""}), "outside its own folder"),
-                ("robot.zip", b"nonsense", "not a ZIP archive"),
-                ("robot.urdf", b"<robot/>", "not the name of a model"),
-                ("robot.xml", b"<mujoco><nonsense/></mujoco>", "nonsense"),
-            ):
-                refused = http.put(f"/api/models/{name}", content=content)
-                assert refused.status_code in {400, 409, 502}
-                assert said in refused.json()["error"]["message"]
 
 
 def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
@@ -662,6 +662,25 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+async def test_controls_that_were_taken_while_a_block_waited_are_not_taken_back() -> None:
+    lease = DrivingLease(10.0, clock=lambda: 0.0)
+    agent, ann = Viewer("a", "agent", yields=True), Viewer("b", "Ann")
+    ran: list[str] = []
+
+    async def waiting() -> None:
+        async with lease.hold(agent):
+            ran.append("agent")
+
+    async with lease._one:  # an earlier block is cleaning up
+        second = asyncio.create_task(waiting())
+        await asyncio.sleep(0)
+        assert lease.holder is agent
+        lease.use(ann)
+    with pytest.raises(NotDriving, match="Ann"):
+        await second
+    assert (ran, lease.holder) == ([], ann)
 
 
 def test_agents_give_way_to_people_and_not_to_each_other() -> None:

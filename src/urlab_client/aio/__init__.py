@@ -5,6 +5,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabController, URLabPDController
 from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.launch import check_address
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.aio.streams import Stream
 
@@ -21,4 +22,5 @@ __all__ = [
     "URLabController",
     "URLabEntity",
     "URLabPDController",
+    "check_address",
 ]

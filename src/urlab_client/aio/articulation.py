@@ -271,14 +271,14 @@ class URLabArticulation(URLabEntity):
     def ctrl_array(self) -> Floats:
         """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place.
 
-        Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
+        Writing makes this client control the robot, and reading does not. Assigning to the property checks the values;
+        `step()` refuses NaN and infinities that were written in place.
 
         Raises:
             TypeError: On assigning values that are not numbers.
             ValueError: On assigning NaN, infinities or the wrong number of values.
         """
-        self._record.drive()  # the caller may write to the view at any time
-        return self._record.ctrl
+        return self._record.set_points
 
     @ctrl_array.setter
     def ctrl_array(self, values: Sequence[float] | Floats) -> None:

@@ -7,10 +7,9 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
+from copy import copy
 from types import TracebackType
-from typing import NoReturn, Self, TypeVar
-
-from msgspec import structs
+from typing import NoReturn, Self, TypeVar, cast
 
 from urlab_client.aio.address import transport_to
 from urlab_client.aio.arguments import integer
@@ -40,13 +39,13 @@ from urlab_client.aio.state.resetting import take_reset
 from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.aio.state.stepping import take_steps
+from urlab_client.aio.state.stepping import send_step, take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import CallRecord, ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
@@ -76,9 +75,9 @@ class URLabClient(ClientState):
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
         state_port: State stream, used in live mode. If the server announces another port, that port replaces the
-            default.
-        ctrl_port: Streaming control.
-        info_port: Actuator and camera descriptions.
+            default, but not a port that is given here, even if it has the same number.
+        ctrl_port: Without effect: the client sends set-points with `step()`, not to the server's control socket.
+        info_port: Without effect: actuators and cameras are described in the handshake.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
             works with a model compiled here.
         local_model: Load the handshake's compiled model into `model` and `data`.
@@ -121,7 +120,7 @@ class URLabClient(ClientState):
         *,
         step_mode: str | StepMode = "auto",
         step_port: int = 5559,
-        state_port: int = 5555,
+        state_port: int = STATE_PORT,
         ctrl_port: int = 5556,
         info_port: int = 5557,
         mujoco_version_check: bool = True,
@@ -144,7 +143,7 @@ class URLabClient(ClientState):
             address=address,
             step_mode=StepMode(step_mode),
             step_port=step_port,
-            state_port=state_port,
+            state_port=None if state_port is STATE_PORT else state_port,
             ctrl_port=ctrl_port,
             info_port=info_port,
             mujoco_version_check=mujoco_version_check,
@@ -191,11 +190,15 @@ class URLabClient(ClientState):
             keys=keys,
             memory=memory,
         )
+        session.tell = self._publishers.events.publish
+        if memory is not None:
+            memory.tell = session.tell
         if not read_only:
             self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
         self._motion = Motion(
             self,
             driven=lambda: any(record.driven for record in self._state.objects.records.values()),
+            locate=self._locate,
             stall_timeout=rcv_timeout_ms / 1000,
             session=session,
         )
@@ -222,8 +225,8 @@ class URLabClient(ClientState):
         self._debug = DebugNamespace(session)
         self._viewport = ViewportNamespace(session)
         self._farm = FarmNamespace(session)
-        self._recording = RecordingNamespace(session)
-        self._replay = ReplayNamespace(session)
+        self._recording = RecordingNamespace(session, state)
+        self._replay = ReplayNamespace(session, state)
 
     # Namespaces
 
@@ -284,6 +287,10 @@ class URLabClient(ClientState):
         """Open a session, load the model, and build the wrappers of articulations, entities and cameras.
 
         Safe to repeat: wrappers of objects that still exist stay valid. Takes the server over from any other client.
+
+        Changes nothing in the simulation. The state is that of the first published snapshot, for which the client waits
+        up to a second. A server that publishes only in live mode sends none in the other modes; the state is then the
+        last one known of this world, or the model's initial state, until the first reply.
 
         Args:
             observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
@@ -394,6 +401,10 @@ class URLabClient(ClientState):
         queries the server's step counter and time without stepping, and updates the state. It opens a new session if
         the old one is gone, or if a lost request may still be in transit, so that the server refuses that request when
         it arrives. It never sends a step or reset again; whether to repeat them is the caller's decision.
+
+        Other abandoned calls that change what the client mirrors are settled as well, such as `set_paused()`,
+        `set_sim_options()`, `sim.stop()`, `claim()` and `recording.start()`: the client sends them once more, or reads
+        the result.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -575,7 +586,7 @@ class URLabClient(ClientState):
 
         Args:
             kinds: Kinds of events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
-                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
+                `session_opened`, `session_lost`, `play_started`, `play_ended`, `task_failed`. Empty for all.
             buffer: Maximum number of buffered events. Beyond it the oldest are dropped; `dropped` of the next event
                 counts them.
 
@@ -589,10 +600,18 @@ class URLabClient(ClientState):
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without updating client state.
 
+        The request stays as it is, so several clients may send the same one.
+
         Raises:
             URLabRPCError: The server refused the request.
+            ValueError: A `Step` has numbers that are not finite, or 0 steps in direct mode, where the server would take
+                one; nothing was sent.
         """
-        return await self._session.call(request, timeout=timeout)
+        request = copy(request)  # the session stamps its id on what it sends, and the owner of the robots
+        if not isinstance(request, Step):
+            return await self._session.call(request, timeout=timeout)
+        async with self._session.turn(Step, timeout=timeout) as turn:
+            return cast("R", await send_step(self._state, turn, request))
 
     async def explain(self) -> Diagnosis:
         """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
@@ -600,8 +619,7 @@ class URLabClient(ClientState):
         Takes a few seconds at most, returns the problems that it finds rather than raising, and changes nothing on the
         server.
         """
-        config = structs.replace(self._config, state_port=self._state_port())
-        return await diagnose(config, self._session, self._state)
+        return await diagnose(self._config, self._session, self._state, self._state_port())
 
     async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers. Needs no session."""
@@ -649,11 +667,15 @@ class URLabClient(ClientState):
             "Send client.config and create a client from it: URLabClient(**config.options())."
         )
 
+    async def _locate(self) -> None:
+        if not self._state.located:
+            await self._runtime.forward()
+
     def _state_port(self) -> int:
-        hello = self._state.hello
-        announced = None if hello is None or hello.instance is None else hello.instance.state_port
         # The user's choice takes precedence over the server's announcement: there may be a tunnel in between.
         chosen = self._config.state_port
-        if announced and chosen == ClientConfig().state_port:
-            chosen = announced
+        if chosen is None:
+            hello = self._state.hello
+            announced = None if hello is None or hello.instance is None else hello.instance.state_port
+            chosen = announced or STATE_PORT
         return self._transport.state_port or chosen

@@ -12,16 +12,24 @@ import math
 import os
 import secrets
 import socket
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
-from typing import Final, Protocol, TypeVar, cast
+from typing import Any, Final, Protocol, TypeVar, cast
 
+from urlab_client.aio.background import Tell, background_task
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.protocol.base import ControlRequest, Reply, Request
 from urlab_client.protocol.errors import ControlClaimed, NotControlOwner, URLabError
 from urlab_client.protocol.features import Features
-from urlab_client.protocol.messages.control import UNCLAIMED, ClaimControl, ClaimControlOk, ReleaseControl
+from urlab_client.protocol.messages.control import (
+    UNCLAIMED,
+    ClaimControl,
+    ClaimControlOk,
+    ReleaseControl,
+    ReleaseControlOk,
+)
 from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
 from urlab_client.protocol.messages.session import Step
 
@@ -55,6 +63,16 @@ class ControlledSession(Protocol):
 
     session_id: str
     features: Features
+    tell: Tell
+
+    @property
+    def unsettled(self) -> Mapping[str, object]:
+        """What abandoned requests may have changed."""
+        ...
+
+    def settling(self, what: str, settle: Callable[[Any], Awaitable[object]]) -> AbstractContextManager[None]:
+        """Keep `settle` for `resync()` if the body leaves open whether the server executed its request."""
+        ...
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send a request in its own turn."""
@@ -126,8 +144,8 @@ class Control:
         request.control_owner = self.owner
         if isinstance(request, ClaimControl):
             return cast("R", await self._claim(request, ask, limits))
-        for key in self._released(request):
-            self._held.pop(key, None)  # otherwise the claim would be renewed
+        if isinstance(request, ReleaseControl):
+            return cast("R", await self._release(request, ask, limits))
         robots = self._robots(request)
         if self._wanted and robots:
             now = asyncio.get_running_loop().time()
@@ -165,7 +183,8 @@ class Control:
 
     async def release(self, key: str, *, timeout: Timeout) -> None:
         """Release a robot if this client owns it."""
-        if self._held.pop(key, None) is None or not self._session.features.claims:
+        held = self._held.pop(key, None) is not None or _control_of(key) in self._session.unsettled
+        if not held or not self._session.features.claims:
             return
         try:
             await self._session.call(ReleaseControl(articulation=key), timeout=timeout)
@@ -207,9 +226,6 @@ class Control:
             case _:
                 return []
 
-    def _released(self, request: ControlRequest[Reply]) -> list[str]:
-        return self._known([request.articulation]) if isinstance(request, ReleaseControl) else []
-
     def _known(self, names: Iterable[str]) -> list[str]:
         return [key for name in names if (key := self.resolve(name)) is not None]
 
@@ -220,27 +236,42 @@ class Control:
 
     async def _claim(self, request: ClaimControl, ask: Asks[L], limits: L) -> ClaimControlOk:
         key = self.resolve(request.articulation) or request.articulation
+        session, what, ttl = self._session, _control_of(key), request.ttl_s
         try:
-            reply = await ask(request, limits)
+            with session.settling(what, lambda turn: turn.call(ClaimControl(articulation=key, ttl_s=ttl))):
+                reply = await ask(request, limits)
         except ControlClaimed as refusal:
             if request.force or refusal.owner not in self._names:
                 raise self._refused([key], refusal) from None
             # The owner is this client in an earlier session, so forcing takes the robot from no other client.
             request.force = True
             reply = await ask(request, limits)
-        self._note_claim(key, request.ttl_s, reply)
-        return reply
-
-    def _note_claim(self, key: str, ttl: float, reply: ClaimControlOk) -> None:
-        session = self._session
+        except BaseException:
+            if what in session.unsettled:
+                self._hold(key, ttl)  # most likely, so that `aclose` releases it
+            raise
         session.features = session.features.with_claim(self.owner, reply)
         if reply.owner == session.session_id:
             self._names.add(reply.owner)
+        self._hold(key, ttl)
+        return reply
+
+    async def _release(self, request: ReleaseControl, ask: Asks[L], limits: L) -> ReleaseControlOk:
+        key = self.resolve(request.articulation) or request.articulation
+        self._held.pop(key, None)  # otherwise the claim would be renewed
+        again = ReleaseControl(articulation=key)
+        try:
+            with self._session.settling(_control_of(key), lambda turn: turn.call(again)):
+                return await ask(request, limits)
+        except NotControlOwner as refusal:
+            raise self._refused([key], refusal) from None
+
+    def _hold(self, key: str, ttl: float) -> None:
         now = asyncio.get_running_loop().time()
         self._held[key] = _Claim(ttl, now + ttl if ttl > 0 else math.inf)
         self._others.pop(key, None)
         if ttl > 0 and (self._renewal is None or self._renewal.done()):
-            self._renewal = asyncio.create_task(self._renew(), name="urlab-claims")
+            self._renewal = background_task("urlab-claims", self._renew(), tell=self._session.tell)
 
     def _note_write(self, robots: Iterable[str]) -> None:
         now = asyncio.get_running_loop().time()
@@ -279,3 +310,7 @@ class Control:
             log.warning("%s is now controlled by %s", key, refusal.owner)
         except URLabError as error:
             log.debug("the claim of %s could not be renewed: %s", key, error)
+
+
+def _control_of(key: str) -> str:
+    return f"control of {key!r}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,7 +15,7 @@ from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
 
 if TYPE_CHECKING:
-    from urlab_client.aio.session import Session
+    from urlab_client.aio.session import Session, Turn
 
 __all__ = ["URLabController", "URLabPDController", "check_controller", "make_controller"]
 
@@ -68,12 +69,16 @@ class URLabController:
 
     async def _push(self, params: dict[str, Any], timeout: Timeout) -> dict[str, Any]:
         async with self._session.turn(ConfigureController, timeout=timeout) as turn:
-            reply = await turn.call(ConfigureController(articulation=self._prefix, params=params))
-            _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
-            # In place, so that views handed out before stay current.
-            self._info.params.clear()
-            self._info.params.update(reply.params)
+            await self._exchange(params, turn)
             return dict(self._info.params)
+
+    async def _exchange(self, params: dict[str, Any], turn: Turn) -> None:
+        with self._session.settling(f"controller of {self._prefix!r}", partial(self._exchange, {})):
+            reply = await turn.call(ConfigureController(articulation=self._prefix, params=params))
+        _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
+        # In place, so that views handed out before stay current.
+        self._info.params.clear()
+        self._info.params.update(reply.params)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.kind} of {self._prefix!r}>"

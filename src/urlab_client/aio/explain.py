@@ -54,14 +54,14 @@ async def watched(look: Callable[[], Awaitable[S]], first: S) -> S:
     return last
 
 
-async def diagnose(config: ClientConfig, session: Session, state: SimState) -> Diagnosis:
+async def diagnose(config: ClientConfig, session: Session, state: SimState, state_port: int) -> Diagnosis:
     """Examine a client's server, play session and articulations."""
-    return Diagnosis([finding async for finding in _examine(config, session, state)])
+    return Diagnosis([finding async for finding in _examine(config, session, state, state_port)])
 
 
-async def _examine(config: ClientConfig, session: Session, state: SimState) -> AsyncIterator[Finding]:
+async def _examine(config: ClientConfig, session: Session, state: SimState, state_port: int) -> AsyncIterator[Finding]:
     loop = running_loop()
-    async for finding in _reachability(config, session):
+    async for finding in _reachability(config, session, state_port):
         yield finding
     before = loop.time()
     try:
@@ -134,14 +134,14 @@ def _control(config: ClientConfig, session: Session, state: SimState) -> Iterato
             yield Finding(Verdict.NOTE, key, "This client does not control it yet. The first write claims it.")
 
 
-async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator[Finding]:
+async def _reachability(config: ClientConfig, session: Session, state_port: int) -> AsyncIterator[Finding]:
     scheme, _, rest = session.transport.endpoint.partition("://")
     host = rest.rpartition(":")[0]
     if scheme != "tcp":
         return
     ports = {"RPC": int(rest.rpartition(":")[2])}
     if config.step_mode in (StepMode.LIVE, StepMode.AUTO) and config.address.startswith("tcp://"):
-        ports |= {"state stream": config.state_port}
+        ports |= {"state stream": state_port}
     for what, port in ports.items():
         problem = await _connect(host, port)
         if problem is None:

@@ -16,26 +16,28 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import warnings
-from collections.abc import Callable, Sequence
-from typing import IO
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import IO, TypeVarTuple
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
 from msgspec import Struct
 
 from urlab_client._children import APART
+from urlab_client.aio.background import Tell, background_task, background_thread
 from urlab_client.aio.transport.base import LateReply, TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
-from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
+from urlab_client.protocol.errors import ClientClosed, ServerUnreachable, URLabError
 from urlab_client.protocol.messages.session import Hello, HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = [
     "SCHEME",
     "LaunchedTransport",
+    "check_address",
     "serve_arguments",
     "start_seconds",
     "with_model_options",
@@ -45,10 +47,14 @@ __all__ = [
 
 log: logging.Logger = logging.getLogger("urlab_client.launch")
 
+Ts = TypeVarTuple("Ts")
+
 SCHEME = "sim://"
 _START_S = 60.0
 _START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
+_LOOK_S = 0.05
+_OPENING = frozenset({"allow-any-client", "allow-client", "insecure-no-auth", "server-key"})
 _STOP_S = 10.0  # it takes 0.2 s on an idle machine, and 3 s with eight programs per processor
 
 
@@ -69,18 +75,60 @@ def serve_arguments(address: str) -> list[str]:
     is for the client that starts the server; see `start_seconds`.
 
     Raises:
-        ValueError: No model is named.
+        ValueError: No model is named, or an option would open the server to others.
     """
+    models, options = _parsed(address)
+    for key, _ in options:
+        if key in _OPENING:
+            raise ValueError(
+                f"{address!r}: '{key}' is for a server that others use, and this one is for its client alone; start it "
+                "with `urlab serve`"
+            )
+    arguments = [f"--{key}={value}" if value else f"--{key}" for key, value in options if key != _START_TIMEOUT]
+    return [*models, *arguments]
+
+
+def _parsed(address: str) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return the models of a `sim://` address and its options."""
     model, _, query = address.removeprefix(SCHEME).partition("?")
-    if not model:
-        raise ValueError(f"{address!r} names no model; write for example sim://arm or sim:///path/to/robot.xml")
-    models, options = [model], list[str]()
-    for key, value in parse_qsl(query, keep_blank_values=True):
-        if key == "model":
-            models.append(value)
-        elif key != _START_TIMEOUT:
-            options.append(f"--{key}={value}" if value else f"--{key}")
-    return [*models, *options]
+    items = parse_qsl(query, keep_blank_values=True)
+    models = [model, *(value for key, value in items if key == "model")]
+    for name in models:
+        if not name or name.startswith("-"):  # an option, to the command line
+            raise ValueError(
+                f"{address!r} names no model{name and f' but the option {name!r}'}; write for example sim://arm or "
+                "sim:///path/to/robot.xml"
+            )
+    return models, [(key, value) for key, value in items if key != "model"]
+
+
+def check_address(
+    address: str, *, models: Collection[str] = (), options: Collection[str] = (), servers: Collection[str] = ()
+) -> str:
+    """Return an address that comes from outside, such as a form of a web page, if all that it says is allowed.
+
+    Without this, a `sim://` address reads and writes files of this machine, because it is a command line, and the
+    other addresses reach every server that this machine reaches.
+
+    Args:
+        address: The address.
+        models: Models that a `sim://` address may name, such as `arm`.
+        options: Options that it may set, to any value, such as `camera-size`.
+        servers: Other addresses that are allowed, such as `tcp://localhost`.
+
+    Raises:
+        ValueError: The address says something else, which the message names.
+    """
+    if not address.startswith(SCHEME):
+        if address not in servers:
+            raise ValueError(f"the server {address!r} is not one of those that are allowed")
+        return address
+    named, given = _parsed(address)
+    for what, used, allowed in (("model", named, models), ("option", [key for key, _ in given], options)):
+        if refused := [name for name in used if name not in allowed]:
+            raise ValueError(f"{address!r}: the {what} {refused[0]!r} is not one of those that are allowed")
+    serve_arguments(address)
+    return address
 
 
 def start_seconds(address: str) -> float:
@@ -165,6 +213,11 @@ class LaunchedTransport:
         """Whether the server is running and connected."""
         return self._inner is not None and self._inner.connected
 
+    @property
+    def owed(self) -> bool:
+        """See `RequestTransport.owed`."""
+        return self._inner is not None and self._inner.owed
+
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
@@ -221,12 +274,13 @@ class LaunchedTransport:
             log.warning("%s: the server did not exit within %g s and was killed", self._address, _STOP_S)
         finally:  # also if cancelled: no process or pipe may be left behind
             _kill(process)
-            await process.wait()
-            # asyncio warns later about a pipe that is still open when its loop is closed.
-            with contextlib.suppress(TimeoutError):
+            # Until Python 3.13 the wait ends with the pipes, which what the server has forked may hold for longer.
+            with contextlib.suppress(TimeoutError, URLabError):  # a pipe that could not be read was reported
                 async with asyncio.timeout(_STOP_S):
+                    await process.wait()
+                    # asyncio warns later about a pipe that is still open when its loop is closed.
                     if drain is not None:
-                        await drain
+                        await asyncio.wait((drain,))
                     for pipe in (process.stdout, process.stderr):
                         if pipe is not None:
                             await pipe.read()
@@ -266,30 +320,30 @@ class LaunchedTransport:
 
     async def _launch(self, op: Op) -> ZmqTransport:
         command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
-        process = await _start(command)
+        process = await _start(command, self.on_event)
         self._process = process
         try:
-            line = await self._first_line(process, op)
+            ready = await self._ready_line(process, op)
         except BaseException:  # also if cancelled: the next call starts another server
             _kill(process)
             raise
-        ready = msgspec.json.decode(line, type=_Ready)
         if process.stderr is not None:
-            self._drain = asyncio.create_task(_log_lines(process.stderr), name="urlab-server-log")
+            self._drain = background_task("urlab-server-log", _log_lines(process.stderr), tell=self.on_event)
         transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
         transport.stats = self.stats
         transport.on_event = self.on_event
         transport.lost_at = self._lost_at
         transport.refused = True
-        self._watch = asyncio.create_task(self._tell_end(process, transport), name="urlab-server-end")
+        ending = self._tell_end(process, transport)
+        self._watch = background_task("urlab-server-end", ending, tell=self.on_event, failed=transport.fail_waiting)
         self._state_port = ready.state_port
         self.scene_warnings = ready.scene_warnings
         for warning in ready.scene_warnings:
             warnings.warn(f"{self._address}: {warning}", stacklevel=2)
         return transport
 
-    async def _first_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> bytes:
-        """Return the ready line, or raise with the server's error output."""
+    async def _ready_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> _Ready:
+        """Return what the server says when it is ready, or raise with the server's error output."""
         output, errors = process.stdout, process.stderr
         if output is None or errors is None:
             raise TypeError("the server's output must be a pipe")
@@ -297,22 +351,25 @@ class LaunchedTransport:
             async with asyncio.timeout(self._start_s):
                 line = await output.readline()
                 if line:
-                    return line
+                    return msgspec.json.decode(line, type=_Ready)
                 reason = (await errors.read()).decode(errors="replace").strip()
                 await process.wait()
         except TimeoutError:
             reason = f"not ready within {self._start_s:g} s; add ?{_START_TIMEOUT}=SECONDS to the address for more"
+        except (ValueError, RecursionError) as error:
+            reason = f"its first line is not a server's: {error}"
         raise ServerUnreachable(
             f"{op.name}: no simulated server for {self._address}: {reason or 'it exited without output'}", op=op.name
         )
 
 
-async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watched:
+async def _start(command: Sequence[str], tell: Tell | None) -> asyncio.subprocess.Process | _Watched:
     pipe = subprocess.PIPE
     try:
         return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)
     except NotImplementedError:  # asyncio raises it on a loop that cannot start processes
-        return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART))  # noqa: ASYNC220, S603
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)  # noqa: ASYNC220, S603
+        return _Watched(process, tell)
 
 
 class _Watched:
@@ -322,7 +379,7 @@ class _Watched:
     without a child watcher, such as uvloop's.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], tell: Tell | None) -> None:
         self.pid = process.pid
         self.stdin = process.stdin
         self.stdout = asyncio.StreamReader()
@@ -330,12 +387,11 @@ class _Watched:
         self._process = process
         self._loop = asyncio.get_running_loop()
         self._ended = asyncio.Event()
-        for target, *arguments in (
-            (self._watch,),
-            (self._feed, self.stdout, process.stdout),
-            (self._feed, self.stderr, process.stderr),
-        ):
-            threading.Thread(target=target, args=arguments, name="urlab-server", daemon=True).start()
+        background_thread("urlab-server", self._watch, tell=tell, failed=lambda _: self._soon(self._ended.set)).start()
+        for reader, pipe in ((self.stdout, process.stdout), (self.stderr, process.stderr)):
+            if pipe is not None:
+                fail = partial(self._fail, reader)
+                background_thread("urlab-server", self._feed, reader, pipe, tell=tell, failed=fail).start()
 
     @property
     def returncode(self) -> int | None:
@@ -349,17 +405,25 @@ class _Watched:
     async def wait(self) -> None:
         """Wait for the exit of the process."""
         await self._ended.wait()
+        while self._process.poll() is None:  # noqa: ASYNC110 - the thread that waits for it died
+            await asyncio.sleep(_LOOK_S)
 
     def _feed(self, reader: asyncio.StreamReader, pipe: IO[bytes]) -> None:
-        with contextlib.suppress(RuntimeError), pipe:  # the loop is closed
+        with pipe:
             while data := os.read(pipe.fileno(), _CHUNK_BYTES):
-                self._loop.call_soon_threadsafe(reader.feed_data, data)
-            self._loop.call_soon_threadsafe(reader.feed_eof)
+                self._soon(reader.feed_data, data)
+        self._soon(reader.feed_eof)
+
+    def _fail(self, reader: asyncio.StreamReader, error: URLabError) -> None:
+        self._soon(reader.set_exception, error)
 
     def _watch(self) -> None:
         self._process.wait()
+        self._soon(self._ended.set)
+
+    def _soon(self, callback: Callable[[*Ts], object], *arguments: *Ts) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            self._loop.call_soon_threadsafe(self._ended.set)
+            self._loop.call_soon_threadsafe(callback, *arguments)
 
 
 def _memory_directory() -> str:

@@ -7,7 +7,7 @@ time, so they mean the same on a slow machine. A wall-clock timeout detects simu
 from __future__ import annotations
 
 import inspect
-from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Protocol
 
@@ -66,16 +66,24 @@ class Motion:
     Args:
         simulation: The client.
         driven: Returns whether the client has set-points of its own, which must be sent in live mode.
+        locate: Asks the server for the state if it is not known yet.
         stall_timeout: Wall-clock seconds within which simulation time must advance; None waits without limit.
         session: The client's session, which counts restarts of the server.
     """
 
     def __init__(
-        self, simulation: Simulation, *, driven: Callable[[], bool], stall_timeout: float | None, session: Session
+        self,
+        simulation: Simulation,
+        *,
+        driven: Callable[[], bool],
+        locate: Callable[[], Awaitable[None]],
+        stall_timeout: float | None,
+        session: Session,
     ) -> None:
         self._simulation = simulation
         self._session = session
         self._driven = driven
+        self._locate = locate
         self._stall_timeout = stall_timeout
 
     async def run_for(self, seconds: float) -> float:
@@ -139,6 +147,8 @@ class Motion:
         """Let time pass until `done` or the limit; return the seconds that passed, and the last result of `done`."""
         simulation = self._simulation
         live = simulation.step_mode is StepMode.LIVE
+        if simulation.step_mode is StepMode.DIRECT:  # in puppet mode the state is the client's own
+            await self._locate()
         if done():
             return 0.0, True
         start = simulation.sim_time

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
+from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
+from urlab_client.aio.background import Tell
 from urlab_client.aio.call_records import CallRecords, Observe
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -17,7 +18,7 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.aio.turn import Limits, Turn, require_reply
+from urlab_client.aio.turn import Limits, Settle, Turn, require_reply
 from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import (
     check_finite,
@@ -29,11 +30,15 @@ from urlab_client.protocol.codec import (
 )
 from urlab_client.protocol.errors import (
     ConnectionLost,
+    GameThreadTimeout,
+    InternalError,
     NoSession,
     ReadOnlyClient,
     ServerRestarted,
     ServerUnreachable,
     SessionTakenOver,
+    ShuttingDown,
+    StepTimeout,
     UnknownOp,
     URLabError,
     URLabRPCError,
@@ -43,7 +48,7 @@ from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 
-__all__ = ["Session", "Turn", "server_restarted"]
+__all__ = ["STOP", "Session", "Turn", "leaves_open", "server_restarted"]
 
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
@@ -51,6 +56,12 @@ R = TypeVar("R", bound=Reply)
 _HELLO = op_of(Hello)
 _COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
 """Session whose scene the running task changes by several ops."""
+# These refusals leave open whether the op was executed. All others mean that it was not.
+_UNDECIDED = (StepTimeout, GameThreadTimeout, ShuttingDown, InternalError)
+
+STOP: Final = "end of play"
+"""The end of play among what may be `unsettled`."""
+
 _UNLISTED = frozenset({"hello", "meta"})  # every server offers them and none lists them
 
 
@@ -73,6 +84,10 @@ class Session:
             lost connection another server may listen, which only a refused or accepted session id shows.
         was_down: Whether no server listened at the address for a while since the last answer within this session.
         restarts: Number of sessions that ended because the server restarted.
+        tell: Publishes an event of the client.
+        unkept: Why the session is no longer kept open although `keep_session` is set; otherwise None.
+        unsettled: How to settle what the client mirrors and an abandoned request may have changed, by its name.
+        unsettled_on: Number of connections opened when the latest of these requests was abandoned.
         line: Held while a request is in progress, from its encoding to its reply.
         turns: Held by the current `Turn`.
         editing: Held while the editor runs a job.
@@ -96,6 +111,10 @@ class Session:
         self.confirmed: bool = False
         self.was_down: bool = False
         self.restarts: int = 0
+        self.tell: Tell = lambda _: None
+        self.unkept: URLabError | None = None
+        self.unsettled: dict[str, Settle] = {}
+        self.unsettled_on: int = 0
         self._lost_to_restart = ""
         self._transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
@@ -216,8 +235,8 @@ class Session:
         Returns:
             The reply, or None if the request was cancelled or not sent.
         """
-        if self.line.locked() or self._queued:
-            return None
+        if self.line.locked() or self._queued or self._aside is not None:
+            return None  # two at a time could not both be cancelled for the next call
         task = asyncio.create_task(self.call(request, timeout=timeout), name="urlab-probe")
         self._aside = task
         try:
@@ -226,6 +245,21 @@ class Session:
         finally:
             task.cancel()
             self._aside = None
+
+    @contextmanager
+    def settling(self, what: str, settle: Settle) -> Generator[None]:
+        """Keep `settle` for `resync()` if the body leaves open whether the server executed its request."""
+        before = self._transport.stats.sent
+        try:
+            yield
+        except BaseException as error:
+            if not leaves_open(error):
+                self.unsettled.pop(what, None)
+            elif self._transport.stats.sent > before:
+                self.unsettled[what] = settle
+                self.unsettled_on = self._transport.stats.connects
+            raise
+        self.unsettled.pop(what, None)
 
     async def hello(self, turn: Turn, request: Hello) -> HelloOk:
         """Open a session; the previous one becomes invalid, here and for any other client."""
@@ -340,7 +374,7 @@ class Session:
             if self.on_refusal is not None:
                 self.on_refusal(refusal)
             if self.was_down:
-                raise self._after_restart(stamped, op, refusal.message) from None
+                raise self._after_restart(stamped, op, refusal.message) from self.unkept
             if self._unanswered:
                 raise _maybe_own_handshake(refusal) from None
             raise
@@ -374,6 +408,8 @@ class Session:
     def _open(self, hello: HelloOk) -> None:
         self.session_id = hello.session_id
         self.confirmed = True
+        if self.was_down:
+            self.unsettled.clear()  # the server has been restarted
         self.was_down = False
         self._given_up = None
         self._unanswered = False
@@ -444,6 +480,13 @@ class Session:
             ) from None
         finally:
             self._queued -= 1
+
+
+def leaves_open(error: BaseException) -> bool:
+    """Return whether a request that was sent and failed with this error may have been executed."""
+    if isinstance(error, URLabRPCError):
+        return isinstance(error, _UNDECIDED)
+    return not isinstance(error, (ServerUnreachable, TypeError, ValueError))
 
 
 def op_reply(request: Request[R], op: Op) -> type[R]:

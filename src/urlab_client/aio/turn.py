@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeAlias, TypeVar, cast
 
@@ -15,7 +15,7 @@ from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.jobs import OpStarted
 
-__all__ = ["Limits", "Turn", "require_reply"]
+__all__ = ["Limits", "Settle", "Turn", "require_reply"]
 
 R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
@@ -177,6 +177,10 @@ class Turn:
         counted = self._first or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
         return self._session.limits(op, self._timeout, since, takes)
+
+
+Settle: TypeAlias = Callable[[Turn], Awaitable[object]]
+"""Makes certain, within a turn, what a request with an unknown outcome was about."""
 
 
 async def _await_reply(op: Op, answer: Awaitable[R | OpStarted]) -> R:

@@ -48,6 +48,7 @@ _COMMANDS = (
 
 _FAILED = 2
 _INTERRUPTED = 128 + signal.SIGINT
+_UNREAD = 128 + 13  # SIGPIPE, which Windows lacks
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,7 +57,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name. Defaults to those of this process.
     """
-    argv = sys.argv[1:] if argv is None else argv
+    try:
+        try:
+            return _run(sys.argv[1:] if argv is None else argv)
+        finally:
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                stream.flush()
+    except OSError as error:  # of the output; commands report their own
+        _discard_output()
+        if _is_broken_pipe(error):
+            return _UNREAD
+        sys.stderr.write(f"urlab: {one_line(error)}\n")
+        return _FAILED
+
+
+def _run(argv: Sequence[str]) -> int:
     if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
         reconfigure(errors="backslashreplace")  # not every terminal can encode every file name
     if not argv:
@@ -79,13 +94,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
         if _is_broken_pipe(error):
-            # The reader of the output has gone; discard what the interpreter would flush at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _FAILED
+            raise
         sys.stderr.write(f"{name}: {one_line(error)}\n")
         return _FAILED
     finally:
         logging.getLogger("urlab_client").removeHandler(handler)
+
+
+def _discard_output() -> None:
+    """Discard what cannot be written: the interpreter would try again at exit, complain, and change the exit code."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _is_broken_pipe(error: Exception) -> bool:
@@ -101,7 +123,7 @@ def _parser(*commands: str) -> Parser:
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
         epilog="Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
-        "failure explained on standard error, 130 Ctrl-C.",
+        "failure explained on standard error, 130 Ctrl-C, 141 the output's reader has gone.",
         examples=(
             ("urlab demo", "see a robot move; needs no Unreal"),
             ("urlab robots", "list the bundled robots"),

@@ -49,7 +49,7 @@ Example = tuple[str, str]
 C = TypeVar("C")
 E = TypeVar("E", bound=StrEnum)
 
-_STEP_PORT, _STATE_PORT = 5559, 5555
+_STEP_PORT = 5559
 _LARGEST_IMAGE = 16384
 
 
@@ -122,7 +122,7 @@ class ServerArguments(argparse.Namespace):
     handshake: Path | None
     mjcf_options: bool
     step_port: int
-    state_port: int
+    state_port: int | None
     server_key: str | None
     client_key: str | None
 
@@ -145,11 +145,12 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
         if address.startswith("sim://"):
             raise CommandError("--handshake is for a server that another client drives, not for sim://MODEL")
         options = {**options, "read_only": True}
+    if arguments.state_port is not None:
+        options = {**options, "state_port": arguments.state_port}
     try:
         return flavour(
             address,
             step_port=arguments.step_port,
-            state_port=arguments.state_port,
             server_key=arguments.server_key,
             client_key=arguments.client_key,
             **{"mujoco_version_check": False, **options},
@@ -221,12 +222,11 @@ def add_ports(parser: argparse.ArgumentParser, *, state: bool = True) -> None:
         parser.add_argument(
             "--state-port",
             type=port,
-            default=_STATE_PORT,
             metavar="PORT",
-            help="port of the server's state stream (default: %(default)s)",
+            help="port of the server's state stream (default: the one that the server announces, otherwise 5555)",
         )
     else:
-        parser.set_defaults(state_port=_STATE_PORT)
+        parser.set_defaults(state_port=None)
 
 
 def add_step_mode(parser: argparse.ArgumentParser) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
+import msgspec
+
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["counted", "output", "progress_bar"]
+__all__ = ["counted", "json_line", "output", "progress_bar"]
 
 _COLUMNS = 120  # where the output is not a terminal
 
@@ -24,18 +27,25 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
 
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(description, total=total)
         yield lambda done: progress.update(task, completed=done)
 
 
 def output() -> Console:
-    """Return a console that writes tables to standard output."""
+    """Return a console that writes tables to standard output, with brackets and colons in names as they are."""
     from rich.console import Console  # noqa: PLC0415
 
-    console = Console()
-    return console if console.is_terminal else Console(width=_COLUMNS)
+    console = Console(markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = _COLUMNS
+    return console
+
+
+def json_line(value: object) -> str:
+    """Return a value as JSON in ASCII, which every terminal and locale can encode; NaN is null."""
+    return json.dumps(msgspec.json.decode(msgspec.json.encode(value, enc_hook=str)))
 
 
 def counted(number: int, noun: str) -> str:

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import socket
 from collections.abc import Callable, Generator
 
 import uvicorn
 from starlette.types import ASGIApp
 
-from urlab_client.cli._ending import sigterm_interrupts
+from urlab_client.aio.background import background_task
+from urlab_client.cli._connections import bounded_connections
+from urlab_client.cli._ending import in_background, sigterm_interrupts
 from urlab_client.cli._requests import RunningRequests
 
 __all__ = ["bound", "graceful_exit", "serve"]
 
 _FINISHING_S = 0.2  # for requests to finish before they are cancelled
 _GRACE_S = 10.0  # for cancelled requests to clean up
+_HEAD_S = 10.0
+_BODY_S = 30.0
+_CONNECTIONS = 500
 
 
 @contextlib.contextmanager
@@ -55,6 +61,9 @@ async def serve(
     ended: asyncio.Event | None = None,
     *,
     lifespan: bool = True,
+    head_s: float = _HEAD_S,
+    body_s: float = _BODY_S,
+    connections: int = _CONNECTIONS,
 ) -> None:
     """Serve until SIGINT or SIGTERM. Requests that do not finish then are cancelled, and a warning names each.
 
@@ -64,10 +73,14 @@ async def serve(
         started: Callback invoked once Ctrl-C ends the server cleanly.
         ended: Event that ends the server, too.
         lifespan: Whether the server runs the application's lifespan; otherwise the caller does.
+        head_s: See `bounded_connections`.
+        body_s: Likewise.
+        connections: Likewise, `most`.
     """
     requests = RunningRequests(application)
     config = uvicorn.Config(
         requests,
+        http=bounded_connections(head_s, body_s, connections),
         log_config=None,
         access_log=False,
         ws="websockets-sansio",
@@ -78,9 +91,13 @@ async def serve(
         lifespan="on" if lifespan else "off",
     )
 
+    background = in_background()
+
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
+            if background:
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # which uvicorn has replaced, and puts back at its end
             if self.started:
                 started()
 
@@ -96,10 +113,12 @@ async def serve(
     server = Server(config)
 
     async def end(event: asyncio.Event) -> None:
-        await event.wait()
-        server.should_exit = True
+        try:
+            await event.wait()
+        finally:
+            server.should_exit = True
 
-    ending = None if ended is None else asyncio.create_task(end(ended))
+    ending = None if ended is None else background_task("urlab-end", end(ended))
     try:
         await server.serve(sockets=[listener])
         await asyncio.sleep(0)

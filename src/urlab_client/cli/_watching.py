@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
+from urlab_client.cli._ending import in_background
 from urlab_client.cli._failure import CommandError
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import OutcomeUnknown, URLabTimeoutError
@@ -25,14 +26,16 @@ _AWAY_S = 5.0
 
 @contextlib.contextmanager
 def interruptible() -> Generator[asyncio.Event]:
-    """Yield an event that Ctrl-C sets while the block runs, instead of interrupting it."""
+    """Yield an event that Ctrl-C or SIGTERM sets while the block runs, instead of interrupting it."""
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
     # Event loops on Windows have no add_signal_handler.
-    before = signal.signal(signal.SIGINT, lambda _number, _frame: loop.call_soon_threadsafe(stop.set))
+    numbers = [signal.SIGTERM] if in_background() else [signal.SIGTERM, signal.SIGINT]
+    before = [signal.signal(number, lambda _, __: loop.call_soon_threadsafe(stop.set)) for number in numbers]
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 async def run_session(

@@ -5,9 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import sys
-
-import msgspec
 
 from urlab_client._installation import conflict
 from urlab_client.cli._arguments import (
@@ -23,6 +20,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._output import json_line
 from urlab_client.protocol.client_types import Diagnosis
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
@@ -79,7 +77,7 @@ def run(arguments: DoctorArguments) -> int:
         logger.warning("%s", found)
     import_mujoco()
     diagnosis = asyncio.run(_diagnose(arguments))
-    sys.stdout.write(f"{msgspec.json.encode(diagnosis).decode() if arguments.json else diagnosis}\n")
+    print(json_line(diagnosis) if arguments.json else diagnosis)
     return 0 if diagnosis.healthy else _UNHEALTHY
 
 

@@ -5,19 +5,16 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
-import sys
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
-import msgspec
-
 from urlab_client.aio.launch import with_model_options, with_option
 from urlab_client.cli._arguments import Commands, count, seconds
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import output, progress_bar
+from urlab_client.cli._output import json_line, output, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -129,7 +126,7 @@ def run(arguments: EvaluateArguments) -> int:
         else:
             found = _in_task(arguments, arguments.task, declared, show)
     if arguments.json:
-        sys.stdout.write(f"{msgspec.json.encode(found).decode()}\n")
+        print(json_line(found))
     else:
         _print(arguments, found)
     return 0

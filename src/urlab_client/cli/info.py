@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
-
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._output import counted, output, progress_bar
+from urlab_client.cli._output import counted, json_line, output, progress_bar
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary
@@ -67,7 +64,7 @@ def run(arguments: InfoArguments) -> int:
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
         summary = recording.summary(progress, verify=arguments.verify)
     if arguments.json:
-        sys.stdout.write(f"{msgspec.json.encode(summary, enc_hook=str).decode()}\n")
+        print(json_line(summary))
     else:
         _print(summary)
     return 0 if summary.complete and not (summary.dropped_states or summary.dropped_frames) else _UNFINISHED
@@ -124,4 +121,5 @@ def _print_varied(summary: Summary) -> None:
             elements.setdefault(key, set()).update(quantity.drawn)
     for (what, by), values in spans.items():
         where = counted(len(elements[what, by]), "element")
-        print(f"varied: {what}, {by} {min(values):.4g} to {max(values):.4g} on {where}")
+        if values:
+            print(f"varied: {what}, {by} {min(values):.4g} to {max(values):.4g} on {where}")

@@ -192,9 +192,7 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
     if not arguments.console:
         await serve_stdio(agent)
         return
-    # A second agent on this machine serves a console, too.
-    number = 0 if arguments.port == AGENT_PORT else arguments.port
-    with bound(arguments.host, number) as listener:
+    with bound(arguments.host, _console_port(arguments)) as listener:
         served = asyncio.create_task(serve_stdio(agent))
         ended = asyncio.Event()
         served.add_done_callback(lambda _: ended.set())
@@ -206,6 +204,11 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
             await asyncio.wait((served,))
     if not served.cancelled():
         await served  # raises its failure
+
+
+def _console_port(arguments: McpArguments) -> int:
+    # A second agent on this machine serves a console, too. A port that was given is another object than the default.
+    return 0 if arguments.port is AGENT_PORT else arguments.port
 
 
 async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:

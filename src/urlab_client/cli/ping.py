@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 import statistics
 import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-import msgspec
 from msgspec import Struct
 
 from urlab_client.aio.explain import watched
@@ -26,7 +24,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import counted
+from urlab_client.cli._output import counted, json_line
 from urlab_client.protocol.errors import (
     ModeLocked,
     URLabConnectionError,
@@ -155,12 +153,12 @@ def run(arguments: PingArguments) -> int:
     """
     if arguments.all:
         servers = asyncio.run(_registered(arguments))
-        print(json.dumps(msgspec.to_builtins(servers)) if arguments.json else _list(servers))
+        print(json_line(servers) if arguments.json else _list(servers))
         return 0
     if not arguments.no_session:
         import_mujoco()  # beforehand: a slow import would block the event loop
     report = asyncio.run(_ping(arguments))
-    print(json.dumps(msgspec.to_builtins(report)) if arguments.json else _text(report))
+    print(json_line(report) if arguments.json else _text(report))
     return 0
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-import msgspec
 from msgspec import Struct
 
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._output import json_line
 
 __all__ = ["add_parser", "run"]
 
@@ -56,7 +55,7 @@ def run(arguments: RobotsArguments) -> int:
     from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
 
     robots = [_read(name, path) for name, path in bundled_models().items()]
-    print(json.dumps(msgspec.to_builtins(robots)) if arguments.json else _table(robots))
+    print(json_line(robots) if arguments.json else _table(robots))
     return 0
 
 

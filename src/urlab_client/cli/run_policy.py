@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 
 from urlab_client.aio.launch import with_model_options
@@ -28,7 +26,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import check_ending
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import output, progress_bar
+from urlab_client.cli._output import json_line, output, progress_bar
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
@@ -157,7 +155,7 @@ def run(arguments: RunPolicyArguments) -> int:
             raise CommandError(f"--goal: {error}") from None
     runs = asyncio.run(_run(arguments, policy))
     if arguments.json:
-        sys.stdout.write(f"{msgspec.json.encode(runs).decode()}\n")
+        print(json_line(runs))
     else:
         _print(runs)
     return _FELL if runs["policy"].falls else 0

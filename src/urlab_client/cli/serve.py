@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import queue
-import threading
 from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,6 +28,7 @@ __all__ = ["add_parser", "run"]
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
+_SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
@@ -265,7 +265,7 @@ def run(arguments: ServeArguments) -> int:
     events: Events = queue.SimpleQueue()
     stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
     if arguments.until_eof:
-        threading.Thread(target=watch_input, args=[events], name="urlab-stdin", daemon=True).start()
+        watch_input(events)
     import_mujoco()
     _check_paths(arguments)
     from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
@@ -276,7 +276,6 @@ def run(arguments: ServeArguments) -> int:
     with TemporaryFolder() as temporary:
         server = _server(arguments, arguments.saved_dir or temporary.path)
         starter = Starter(server, events)
-        starter.start()
         if next_event(events) is Event.STARTED:
             if starter.error is not None:
                 raise starter.error
@@ -288,8 +287,8 @@ def run(arguments: ServeArguments) -> int:
                 if event is Event.FAILED:
                     raise CommandError(str(server.failure))
             return 0
-        starter.join(_START_GRACE_S)
-        stuck = starter.is_alive()
+        starter.thread.join(_START_GRACE_S)
+        stuck = starter.thread.is_alive()
         if not stuck:
             server.close()
     if stuck:
@@ -367,6 +366,9 @@ def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[in
         http, thread = start_http_server(arguments.metrics_port, addr="127.0.0.1")
     except OSError as error:
         raise CommandError(f"--metrics-port {arguments.metrics_port} cannot be used: {error.strerror}") from None
+    # Each connection has a thread, which would wait for a silent peer for ever.
+    handler = cast("Any", http.RequestHandlerClass)
+    http.RequestHandlerClass = cast("Any", type("Handler", (handler,), {"timeout": _SILENT_S}))
     try:
         yield http.server_port
     finally:

@@ -17,7 +17,7 @@ import anyio.to_thread
 from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Setup, seed_of
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.cluster.worker_pool import WorkerPool
-from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.errors import URLabError, refused_for_good
 
 __all__ = ["Rollouts", "rollouts"]
 
@@ -204,8 +204,8 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         except _ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
             self._idle.append(running.worker)
-            if not isinstance(cause, URLabError):
-                # A policy that raises would raise again.
+            if not isinstance(cause, URLabError) or refused_for_good(cause):
+                # A policy that raises would raise again, and what was refused would be refused again.
                 raise RolloutError(f"Episode {running.job.id} raised {type(cause).__name__}: {cause}") from error
             self._again(running.job, cause)
         except _ray.exceptions.RayError as error:  # the worker, its node or the result is lost

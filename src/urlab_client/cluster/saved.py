@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
+import zlib
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final, cast
@@ -13,12 +15,17 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._whole_files import replaced
 from urlab_client.cluster.episodes import Episode, seed_of
 
 __all__ = ["load_episodes", "missing_ids", "save_episode"]
 
 _ARRAYS: Final = ("observations", "actions", "rewards")
 _ABOUT: Final = "about"
+_DAMAGED: Final = (
+    *(ValueError, TypeError, AttributeError, LookupError, EOFError, OverflowError, MemoryError, RecursionError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 
 
 def save_episode(episode: Episode, folder: str | os.PathLike[str]) -> Path:
@@ -46,13 +53,8 @@ def save_episode(episode: Episode, folder: str | os.PathLike[str]) -> Path:
             places.append([*place])
     about = {field.name: getattr(episode, field.name) for field in fields(episode) if field.name not in _ARRAYS}
     arrays[_ABOUT] = np.array(json.dumps({**about, "arrays": places}))
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            np.savez(file, **cast("Any", arrays))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replaced(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **cast("Any", arrays))
     return path
 
 
@@ -64,15 +66,15 @@ def load_episodes(folder: str | os.PathLike[str]) -> Iterator[Episode]:
         ValueError: A file does not contain an episode.
     """
     for path in _saved(folder):
-        about, file = _opened(path)
-        with file:
+        with _opened(path) as (about, file):
             values: dict[str, Any] = {}
             for number, (*place, last) in enumerate(about.pop("arrays")):
                 at = values
                 for key in place:
                     at = at.setdefault(key, {})
                 at[last] = file[str(number)]
-        yield Episode(**about, **values)
+            episode = Episode(**about, **values)
+        yield episode
 
 
 def missing_ids(folder: str | os.PathLike[str], n: int, *, seed: int = 0) -> list[int]:
@@ -88,10 +90,9 @@ def missing_ids(folder: str | os.PathLike[str], n: int, *, seed: int = 0) -> lis
     """
     saved = set[int]()
     for path in _saved(folder) if Path(folder).exists() else []:
-        about, file = _opened(path)
-        file.close()
-        i = int(about["id"])
-        if i >= n or about["seed"] != seed_of(seed, i):
+        with _opened(path) as (about, _):
+            i, own = int(about["id"]), about["seed"]
+        if not 0 <= i < n or own != seed_of(seed, i):
             raise ValueError(f"{path} does not belong to a run of {n} episodes with seed {seed}: use another folder")
         saved.add(i)
     return [i for i in range(n) if i not in saved]
@@ -105,14 +106,17 @@ def _saved(folder: str | os.PathLike[str]) -> list[Path]:
     return sorted(path for path in Path(folder).iterdir() if path.match("episode_*.npz"))
 
 
-def _opened(path: Path) -> tuple[dict[str, Any], Any]:
-    file = None
+@contextlib.contextmanager
+def _opened(path: Path) -> Generator[tuple[dict[str, Any], Any]]:
+    """Yield what an episode's file says and its arrays.
+
+    Raises:
+        ValueError: The file does not contain an episode.
+    """
     try:
-        file = np.load(path, allow_pickle=False)
-        return json.loads(str(file[_ABOUT])), file
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        if file is not None:
-            file.close()
+        with np.load(path, allow_pickle=False) as file:
+            yield json.loads(str(file[_ABOUT])), file
+    except _DAMAGED as error:
         raise ValueError(f"{path} does not contain an episode: {error}") from error
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from urlab_client.cluster.episodes import Episode, Job, Policy, Setup, seed_of
 from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
+from urlab_client.protocol.errors import refused_for_good
 
 __all__ = ["Worker", "run_episode"]
 
@@ -51,8 +52,9 @@ class Worker:
                         return self._run(policy, setup, job, lease)
                 finally:
                     self.close()  # before another holder gets the address
-        except BaseException:
-            self.close()  # the next attempt starts from scratch
+        except BaseException as error:
+            if not refused_for_good(error):
+                self.close()  # the next attempt starts from scratch
             raise
 
     def close(self) -> None:

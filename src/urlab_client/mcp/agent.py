@@ -46,7 +46,7 @@ _RESOURCES = {
 _TOOLS = declared(looking, moving, editing)
 _LARGE = 1e3
 _MOST_CALLERS = 100  # each client of the older protocol opens a session, and may not report its end
-_FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
+_FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError, RecursionError)
 _NO_PLAY = "No play session runs, so there are no robots. Call play with action='start'."
 _METHODS = {
     "client.sim.start()": "play with action='start'",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import anyio
 from msgspec import Struct
 
+from urlab_client.aio.background import background_task
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.web.console_session import ConsoleSession
@@ -161,7 +162,7 @@ class Call:
 
     async def _reported(self, work: Callable[[], Awaitable[T]]) -> T:
         """Do something, report its progress, and leave the simulation at rest if it is aborted."""
-        reporting = asyncio.create_task(self._report())
+        reporting = background_task("urlab-mcp-progress", self._report())
         try:
             if self.console.controls.running:  # real-time stepping, started by a caller that has left
                 await self.console.controls.run(self.caller, running=False)

@@ -89,7 +89,7 @@ class Declared:
         plain = {name: _from_text(value) for name, value in given.items()}
         try:
             made = msgspec.convert(plain, self._arguments(), strict=False)
-        except msgspec.ValidationError as error:
+        except (ValueError, RecursionError) as error:
             taken = ", ".join(one.name for one in self._parameters)
             raise ValueError(f"{self.name}: {error}. It takes: {taken or 'no arguments'}.") from None
         return {one.name: getattr(made, one.name) for one in self._parameters}
@@ -136,6 +136,6 @@ def _from_text(value: Any) -> Any:
     if isinstance(value, str) and value[:1] in {"{", "["}:
         try:
             return json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             return value
     return value

@@ -31,13 +31,17 @@ async def import_model(call: Call, model: str) -> Edited:
     if model not in call.models:
         raise LookupError(f"No model is called {model!r}.{did_you_mean(model, call.models)} See `models` in look.")
     scene, file = call.client.scene, call.models[model]
+    done = "The blueprint {!r} is there; spawn places it."
     try:
         blueprint = await scene.import_xml(str(file))
     except ImportFailed:
         if not call.client.server.features.uploads:
             raise
+        before = [one.short_name for one in await call.client.outliner.list_blueprints()]
         blueprint = await scene.upload_model(file)  # the server does not have the file, or may not read it
-    return _edited(call, f"The blueprint {blueprint.short_name!r} is there; spawn places it.")
+        if blueprint.short_name in before:
+            done += " It has replaced the model that was sent before: this server keeps one."
+    return _edited(call, done.format(blueprint.short_name))
 
 
 @tool(Needs.EDIT, play=False)

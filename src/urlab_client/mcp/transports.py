@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import sys
-import threading
 from collections.abc import AsyncGenerator
 from typing import Any, cast
 
@@ -15,7 +14,9 @@ from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from urlab_client.aio.background import background_thread
 from urlab_client.mcp.agent import Agent
+from urlab_client.protocol.errors import URLabError
 from urlab_client.web.access import Access, Guarded
 
 __all__ = ["http_application", "serve_stdio"]
@@ -41,20 +42,25 @@ class _Lines:
     def __init__(self, file: int) -> None:
         self._file = file
         self._loop = asyncio.get_running_loop()
-        self._lines: asyncio.Queue[str | None] = asyncio.Queue()
-        threading.Thread(target=self._read, name="urlab-mcp-stdin", daemon=True).start()
+        self._lines: asyncio.Queue[str | URLabError | None] = asyncio.Queue()
+        background_thread("urlab-mcp-stdin", self._read, failed=self._put).start()
 
     def _read(self) -> None:
         rest = b""
-        with contextlib.suppress(RuntimeError, OSError):  # the loop has ended
-            while chunk := os.read(self._file, _CHUNK_BYTES):
-                *lines, rest = (rest + chunk).split(b"\n")
-                for line in lines:
-                    self._loop.call_soon_threadsafe(self._lines.put_nowait, line.decode("utf-8", "replace"))
-            self._loop.call_soon_threadsafe(self._lines.put_nowait, None)
+        while chunk := os.read(self._file, _CHUNK_BYTES):
+            *lines, rest = (rest + chunk).split(b"\n")
+            for line in lines:
+                self._put(line.decode("utf-8", "replace"))
+        self._put(None)
+
+    def _put(self, line: str | URLabError | None) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._lines.put_nowait, line)
 
     async def __aiter__(self) -> AsyncGenerator[str]:
         while (line := await self._lines.get()) is not None:
+            if isinstance(line, URLabError):
+                raise line
             yield line
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 from msgspec import Struct
 from msgspec.structs import asdict
@@ -15,9 +15,11 @@ from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
+    "STATE_PORT",
     "CallOutcome",
     "CallRecord",
     "ClientConfig",
+    "DefaultPort",
     "Diagnosis",
     "Finding",
     "Resync",
@@ -146,13 +148,21 @@ class CallRecord(Serializable, Struct, frozen=True, kw_only=True):
     error: str = ""
 
 
+class DefaultPort(int):
+    """Type of `STATE_PORT`, which tells the default of a port from the same number given by the user."""
+
+
+STATE_PORT: Final = DefaultPort(5555)
+"""Port of the state stream, unless the server announces another one."""
+
+
 class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
-    """The arguments of a client; see `URLabClient`."""
+    """The arguments of a client; see `URLabClient`. `state_port` is None if it was not given."""
 
     address: str = "tcp://localhost"
     step_mode: StepMode = StepMode.AUTO
     step_port: int = 5559
-    state_port: int = 5555
+    state_port: int | None = None
     ctrl_port: int = 5556
     info_port: int = 5557
     mujoco_version_check: bool = True
@@ -172,7 +182,7 @@ class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
 
     def options(self) -> dict[str, Any]:
         """Return the constructor's arguments: `URLabClient(**config.options())`."""
-        return asdict(self)
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 class ServerInfo(Serializable, Struct, frozen=True, kw_only=True):

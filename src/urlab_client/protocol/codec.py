@@ -8,6 +8,7 @@ key plus `__b64__`. Unknown fields are ignored, so that an old client can talk t
 from __future__ import annotations
 
 import base64
+import copy
 import math
 import re
 import struct
@@ -128,13 +129,15 @@ def encode_message(message: Struct) -> bytes:
 
 
 def encode_request(request: Request[Any], session_id: str, *, json: bool = False) -> bytes:
-    """Set `session_id` on `request` and return the bytes to send.
+    """Return the bytes of `request` with this `session_id`.
 
     Raises:
         TypeError: A field contains a value that cannot be sent.
         ValueError: The request is larger than `MAX_REQUEST_BYTES`.
     """
-    request.session_id = session_id
+    if request.session_id != session_id:
+        request = copy.copy(request)
+        request.session_id = session_id
     try:
         frame = _json_ascii(request) if json else _encoder.encode(request)
     except TypeError as error:
@@ -322,13 +325,8 @@ def _restore_binary(value: Any) -> Any:
 
 
 def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
-    """Return the bytes of a reply as the plugin sends it, with every number as a float64.
-
-    Modifies `reply`: its integers are widened in place.
-    """
-    widen = _widener(type(reply))
-    if widen is not None:
-        widen(reply)
+    """Return the bytes of a reply as the plugin sends it, with every number as a float64."""
+    reply = _widen_struct(reply)
     if not json:
         return _encoder.encode(reply)
     plain = msgspec.to_builtins(reply, builtin_types=(bytes, msgspec.Raw), enc_hook=_to_wire)
@@ -361,17 +359,18 @@ Widener = Callable[[Any], Any]
 
 @cache
 def _widener(struct: type[Struct]) -> Widener | None:
-    """Return a function that widens the integers of a `struct` in place, or None if it cannot contain any."""
+    """Return a function that returns a `struct` with widened integers, or None if it cannot contain any."""
     plan = [(f.name, widen) for f in msgspec.structs.fields(struct) if (widen := _plan(f.type, struct)) is not None]
     if not plan:
         return None
 
     def apply(value: Any) -> Any:
+        widened = copy.copy(value)  # what is encoded belongs to others, too: a picture also to the camera's stream
         for name, widen in plan:
             item = getattr(value, name)
             if item is not None:
-                force_setattr(value, name, widen(item))  # public types in replies are frozen
-        return value
+                force_setattr(widened, name, widen(item))  # public types in replies are frozen
+        return widened
 
     return apply
 

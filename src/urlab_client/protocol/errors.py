@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from urlab_client.protocol.client_errors import (
     AuthenticationFailed,
@@ -32,6 +32,7 @@ from urlab_client.protocol.enums import PIEState, StepMode
 
 __all__ = [
     "RPC_ERRORS",
+    "UNCLAIMED",
     "ActorHierarchyFailed",
     "AddQuickConvertFailed",
     "AuthenticationFailed",
@@ -121,6 +122,9 @@ __all__ = [
     "rpc_error",
 ]
 
+
+UNCLAIMED: Final = "(unclaimed)"
+"""Owner that a server reports for a robot without one."""
 
 RPC_ERRORS: dict[str, type[URLabRPCError]] = {}
 """Wire code to exception class; codes not listed here raise `URLabRPCError` itself."""
@@ -326,10 +330,25 @@ class NotControlOwner(
 ):
     """Another client controls the robot, or no client does; nothing was written."""
 
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        op: str | None = None,
+        hint: str | None = None,
+        details: Mapping[str, Any] | None = None,
+    ) -> None:
+        # A server words its message as it likes, and need not name the owner there.
+        owner = str((details or {}).get("owner") or "")
+        if owner not in {"", UNCLAIMED} and not re.search(rf"(?<!\w){re.escape(owner)}(?!\w)", message):
+            message = f"{message.rstrip('.')}. The owner is {owner!r}.".removeprefix(". ")
+        super().__init__(code, message, op=op, hint=hint, details=details)
+
     @property
     def owner(self) -> str:
         """The client that controls the robot, or `(unclaimed)`; empty if the server does not send it."""
-        return str(self.details.get("owner", ""))
+        return str(self.details.get("owner") or "")
 
 
 class ControlClaimed(NotControlOwner, code="control_claimed"):
@@ -348,7 +367,7 @@ class LeaseBusy(
 
 
 class UnknownJob(URLabRPCError, code="unknown_job"):
-    """The editor does not know this job: it never existed, or its result was already fetched."""
+    """The editor does not know this job: it never existed, or its result was already fetched or has expired."""
 
 
 class UnknownUpload(URLabRPCError, code="unknown_upload"):
@@ -523,3 +542,23 @@ class NoBounds(URLabRPCError, code="no_bounds"):
 
 class InvalidMode(URLabRPCError, code="invalid_mode"):
     """Unknown viewport mode."""
+
+
+# These show that the session, play or the server is not well, or that another client holds what the request needs.
+_PASSING = (
+    SessionTakenOver,
+    URLabPIEError,
+    NoActiveManager,
+    NotReady,
+    StepTimeout,
+    GameThreadTimeout,
+    ShuttingDown,
+    InternalError,
+    NotControlOwner,
+    LeaseBusy,
+)
+
+
+def refused_for_good(error: BaseException) -> bool:
+    """Return whether a well server refused a request, so that neither another server nor a repetition would help."""
+    return isinstance(error, URLabRPCError) and not isinstance(error, _PASSING)

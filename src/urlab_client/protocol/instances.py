@@ -1,7 +1,8 @@
 """The registry of running servers: location and format of its files. No I/O except reading the environment.
 
 Each server keeps one JSON file in a folder shared by all servers of a machine. A file shows that the server existed
-when it was last written; only a request shows whether it still does.
+when it was last written; only a request shows whether it still does. Beside the files is the folder through which
+programs hand models to servers of the same user.
 """
 
 from __future__ import annotations
@@ -17,7 +18,15 @@ import msgspec
 from urlab_client.protocol.base import doc
 from urlab_client.protocol.messages.session import InstanceInfo
 
-__all__ = ["REWRITE_S", "STALE_S", "RegisteredInstance", "decode", "encode", "registry_directory"]
+__all__ = [
+    "REWRITE_S",
+    "STALE_S",
+    "RegisteredInstance",
+    "decode",
+    "encode",
+    "import_directory",
+    "registry_directory",
+]
 
 REWRITE_S: Final = 10.0
 """Seconds after which a server renews its file."""
@@ -60,6 +69,17 @@ def registry_directory() -> Path:
     return base / "URLab" / "registry"
 
 
+def import_directory() -> Path | None:
+    """Return the folder from which every simulated server of this user imports models; it may not exist.
+
+    None for a user without a home folder.
+    """
+    try:
+        return registry_directory() / "imports"
+    except RuntimeError:
+        return None
+
+
 def encode(instance: InstanceInfo, now: dt.datetime) -> bytes:
     """Return the contents of a server's file."""
     told = {name: getattr(instance, name) for name in instance.__struct_fields__}
@@ -73,4 +93,7 @@ def decode(data: bytes) -> RegisteredInstance:
     Raises:
         ValueError: The file is not a server's file.
     """
-    return msgspec.json.decode(data, type=RegisteredInstance, strict=False)
+    try:
+        return msgspec.json.decode(data, type=RegisteredInstance, strict=False)
+    except RecursionError as error:
+        raise ValueError(str(error)) from None

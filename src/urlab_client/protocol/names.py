@@ -1,6 +1,6 @@
-"""Names: look-up by name or alias, and which articulation a compiled name belongs to. No I/O.
+"""Names: look-up by name or alias, which articulation a compiled name belongs to, and names of files. No I/O.
 
-For the wrappers of both clients, whose maps of articulations, joints and so on are `NameMap`s.
+For the wrappers of both clients, whose maps of articulations, joints and so on are `NameMap`s, and for uploads.
 """
 
 from __future__ import annotations
@@ -9,14 +9,30 @@ import difflib
 import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "compiled_names", "did_you_mean", "owner_of", "split_prefix", "unknown_name"]
+__all__ = [
+    "WINDOWS_DEVICES",
+    "NameMap",
+    "UnknownName",
+    "compiled_names",
+    "did_you_mean",
+    "is_file_name",
+    "owner_of",
+    "split_prefix",
+    "unknown_name",
+]
 
 T = TypeVar("T")
 D = TypeVar("D")
 
+WINDOWS_DEVICES: Final = frozenset(
+    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
+)
+"""Names that Windows keeps for devices, whatever follows their first dot."""
+
 _LISTED = 20
+_MAX_FILE_NAME_BYTES: Final = 240
 
 
 class UnknownName(KeyError):
@@ -80,6 +96,16 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, owner: str = 
     names = tuple(known)
     close = difflib.get_close_matches(name, names) if isinstance(name, str) else []
     return UnknownName(kind, name, (), names, tuple(close), owner=owner)
+
+
+def is_file_name(name: str) -> bool:
+    """Return whether a name is that of a file on every system: no path, no device, not too long."""
+    return (
+        name not in ("", ".", "..")
+        and not any(character in '/\\:*?"<>|' or ord(character) < ord(" ") for character in name)
+        and len(name.encode()) <= _MAX_FILE_NAME_BYTES
+        and name.partition(".")[0].rstrip(" ").upper() not in WINDOWS_DEVICES
+    )
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -98,8 +98,9 @@ def _in_place(pixels: Pixels) -> Image.Image:
     need("PIL", extra="pillow")
     from PIL import Image  # noqa: PLC0415
 
-    height, width = pixels.shape[:2]
-    return Image.frombuffer("RGBX", (width, height), np.ascontiguousarray(pixels), "raw", "RGBX", 0, 1)
+    height, width, channels = pixels.shape
+    kind = "RGB" if channels == 3 else "RGBX"
+    return Image.frombuffer(kind, (width, height), np.ascontiguousarray(pixels), "raw", kind, 0, 1)
 
 
 def _image(array: NDArray[Any]) -> Image.Image:

@@ -55,7 +55,7 @@ def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for ea
     if kind is float and isinstance(data, str) and data in _NAMES:
         return _NAMES[data]
     if kind is float and type(data) in {int, float}:
-        return float(data)
+        return _said(where, lambda: float(data))
     if kind is Any or (type(data) is kind and kind in _AS_THEY_ARE):
         return data
     raise ValueError(f"{where}: {data!r:.80} does not fit {_named(kind)}")
@@ -68,7 +68,7 @@ _NAMES: Final[Mapping[Any, float]] = {"NaN": math.nan, "Infinity": math.inf, "-I
 def _said(where: str, make: Callable[[], Any]) -> Any:
     try:
         return make()
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 
@@ -116,15 +116,15 @@ def _read_struct(struct: type[Struct], data: Any, where: str) -> Struct:
     given = dict(cast("Mapping[str, Any]", data))
     if kinds := kinds_of(struct):
         tag = given.get(str(next(iter(kinds.values())).__struct_config__.tag_field))
-        if tag not in kinds:
+        if not isinstance(tag, str) or tag not in kinds:
             raise ValueError(f"{where}: {tag!r} is none of {', '.join(sorted(kinds))}.{did_you_mean(str(tag), kinds)}")
-        return _read_struct(kinds[str(tag)], data, where)
+        return _read_struct(kinds[tag], data, where)
     config, known = struct.__struct_config__, _fields(struct)
     if config.tag_field is not None and given.pop(config.tag_field, config.tag) != config.tag:
         raise ValueError(f"{where}: {config.tag_field} is {data[config.tag_field]!r}, not {config.tag!r}")
     for name in given:
         if name not in known:
-            raise ValueError(f"{where}: there is no field {name!r}.{did_you_mean(name, known)}")
+            raise ValueError(f"{where}: there is no field {name!r}.{did_you_mean(str(name), known)}")
     missing = [name for name, field in known.items() if field.required and name not in given]
     if missing:
         raise ValueError(f"{where}: the field {missing[0]!r} is missing")

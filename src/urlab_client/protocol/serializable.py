@@ -72,7 +72,7 @@ class Serializable:
         """
         try:
             data = msgspec.json.decode(text)
-        except msgspec.DecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{cls.__name__}: {error}") from None
         return cls.from_dict(data)
 

@@ -325,11 +325,15 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
 
         Raises:
             OSError: The file cannot be read.
+            TypeError: It is none of these.
             ValueError: The declaration is invalid.
         """
         if isinstance(given, Randomisation):
             return given
-        text = os.fspath(given)
+        try:
+            text = os.fsdecode(given)
+        except TypeError:
+            raise TypeError(f"a randomisation is a Randomisation, JSON or a TOML file, got {given!r:.80}") from None
         return cls.from_json(text) if text.lstrip().startswith("{") else cls.load(text)
 
     def to_json(self) -> str:
@@ -340,7 +344,7 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
     def _decoded(cls, text: str | bytes, decode: Callable[..., Any], source: str) -> Self:
         try:
             return decode(text, type=cls)
-        except (msgspec.ValidationError, msgspec.DecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{source}: {error}") from None
 
 

@@ -129,12 +129,12 @@ class ServerCore:
     dialect: Dialect = ALPHA
     shm_directory: str | None = None
     session: ServerSession = field(default_factory=ServerSession)
-    play: Play = field(default_factory=Play)
+    play: Play = field(init=False)
     viewport: Viewport = field(default_factory=Viewport)
     drawings: Drawings = field(init=False)
     health: Health = field(default_factory=Health)
     compiled: _Compiled | None = None
-    jobs: EditorJobs = field(default_factory=EditorJobs)
+    jobs: EditorJobs = field(init=False)
     lease: DriverLease = field(default_factory=DriverLease)
     instance: Callable[[], InstanceInfo] | None = None
     uploads: Uploads = field(init=False)
@@ -144,6 +144,8 @@ class ServerCore:
         return encode_reply(ErrorReply(code=code, message=message), json=self.session.json)
 
     def __post_init__(self) -> None:
+        self.play = Play(self.health)
+        self.jobs = EditorJobs(self.health)
         self.drawings = Drawings(limit=self.limits.markers)
         self.uploads = Uploads(self.world.content.root / UPLOADS, self.limits.upload_cache_bytes)
 

@@ -486,7 +486,7 @@ def _shut(descriptor: int) -> None:
 def _op_of(frame: bytes) -> str:
     try:
         return (_JSON if frame[:1] == b"{" else _MSGPACK).decode(frame).op
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (ValueError, RecursionError):
         return ""  # not a request; the server reports that
 
 

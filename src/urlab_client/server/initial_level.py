@@ -55,20 +55,12 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
-    actor = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem)).actor
+    actor = world.spawn_actor(blueprint.class_path, world.unused_id(Path(path).stem)).actor
     if edge is not None:
         bounds = world.get_actor_bounds(actor.name, components_only=True)
         if bounds.extents != (0.0, 0.0, 0.0):
             world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
     return actor.name
-
-
-def _free_id(world: EditorWorld, stem: str) -> str:
-    name, count = stem, 0
-    while world.actor(name) is not None:
-        count += 1
-        name = f"{stem}_{count}"
-    return name
 
 
 def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | None:

@@ -40,6 +40,7 @@ class DriverLease:
         """
         with self._lock:
             if self._holds():
+                # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
                 raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
             self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
             return self._id
@@ -52,7 +53,7 @@ class DriverLease:
         """
         with self._lock:
             if not self._holds() or lease_id != self._id:
-                raise Refusal("bad_request", f"'{lease_id}' is not the lease that is held")
+                raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
             self._id = ""
 
     def touch(self) -> None:

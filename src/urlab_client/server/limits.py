@@ -36,7 +36,8 @@ class Limits:
         model_memory_bytes: Memory that its compilation may use in addition.
         model_cpu_s: Processor time of its compilation, seconds.
         model_wall_s: Wall time of its compilation, seconds.
-        upload_cache_bytes: Size of the cache of files that clients have sent.
+        upload_cache_bytes: Size of the files that clients have sent, and of those that they are sending; the least
+            recently used give way.
         camera_side: Width and height of a camera's pictures, pixels.
     """
 

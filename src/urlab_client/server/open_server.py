@@ -239,7 +239,7 @@ class OpenServer:
         self._watchdog.start()
         self._endpoint.start()
         if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
-            self._registration = Registration(registry_directory(), self._instance)
+            self._registration = Registration(registry_directory(), self._instance, self.health)
             self._registration.start()
         if memory is not None:
             in_memory = partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES)
@@ -269,6 +269,7 @@ class OpenServer:
                 *(["render_sync", "render_async"] if core is not None and core.dialect.draws_for_steps else []),
                 *(["shm_rpc"] if self._memory else []),
                 "model_upload",
+                "content_cache",
             ],
         )
 

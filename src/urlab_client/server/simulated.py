@@ -124,7 +124,7 @@ class SimulatedServer:
                 with software rendering, `high` on a graphics card.
             mjcf_options: Use the `<option>` of the first model. Otherwise the alpha ignores all, and the beta merges
                 them.
-            actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
+            actor_names: Name articulations after their MJCF's model name (`robot`, `copy1_robot`) or as the plugin does
                 (`robot_C_0`, `robot_C_1`).
             faults: Faults injected into replies and published messages, for tests; they may change while the server
                 runs.

@@ -1,6 +1,7 @@
 """The blocking façade: the async core's API without `await`, for scripts and notebooks."""
 
 from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.launch import check_address
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -21,4 +22,5 @@ __all__ = [
     "URLabController",
     "URLabEntity",
     "URLabPDController",
+    "check_address",
 ]

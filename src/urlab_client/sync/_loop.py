@@ -29,7 +29,8 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
-from urlab_client.protocol.errors import ClientClosed
+from urlab_client.aio.background import background_thread
+from urlab_client.protocol.errors import ClientClosed, URLabError
 from urlab_client.sync._caller_loop import CallerLoop
 from urlab_client.sync._signals import DeferredSignals
 
@@ -123,7 +124,8 @@ class CallerDrivenLoop:
         self._owner = owner
         # Not new_event_loop(): the user's loop policy is for the user's loop, and pyzmq needs a selector on Windows.
         self._loop = CallerLoop()
-        self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
+        self._thread = background_thread("urlab-io", self._run, failed=self._die)
+        self._failure: BaseException | None = None
         self._pid = os.getpid()
         self._at_stop = at_stop
         self._stop_requested = asyncio.Event()
@@ -211,7 +213,7 @@ class CallerDrivenLoop:
         """Register `job` unless others are in progress; return whether it was registered."""
         with self._lock:
             if self._stopping:
-                raise client_closed()
+                raise self._closed()
             if self._jobs:
                 return False
             self._jobs.add(job)
@@ -220,7 +222,7 @@ class CallerDrivenLoop:
     def _submit(self, job: Job[Any]) -> None:
         with self._lock:
             if self._stopping:
-                raise client_closed()
+                raise self._closed()
             self._jobs.add(job)
             self._loop.call_soon_threadsafe(self._start_job, job)
         self._ensure_driver()
@@ -355,7 +357,7 @@ class CallerDrivenLoop:
         self._finish_job(job)
 
     def _break_off(self, job: Job[Any]) -> None:
-        job.error = client_closed("during this call")
+        job.error = self._closed("during this call")
         if not job.started:
             job.coro.close()
         self._finish_job(job)
@@ -381,16 +383,44 @@ class CallerDrivenLoop:
                 self._turn.release()
                 self._await_turn()
                 self._thread_drives = True
-        # Between two runs of the loop: while it runs, Python 3.14 lists only the tasks that this thread has created.
-        end = self._loop.create_task(self._end(asyncio.all_tasks(self._loop)))
-        end.add_done_callback(lambda _: self._loop.stop())
-        while not end.done():
-            self._run_loop()
+        main.result()  # raises what ended it, before calls are cancelled: they fail with the cause
+        self._cancel_all()
         with self._lock:
             for job in tuple(self._jobs):
                 self._break_off(job)
             self._loop.close()
         self._turn.release()
+
+    def _cancel_all(self) -> None:
+        # Between two runs of the loop: while it runs, Python 3.14 lists only the tasks that this thread has created.
+        end = self._loop.create_task(self._end(asyncio.all_tasks(self._loop)))
+        end.add_done_callback(lambda _: self._loop.stop())
+        while not end.done():
+            self._run_loop()
+        end.result()  # raises what ended it
+
+    def _die(self, error: URLabError) -> None:
+        """Fail all calls, because nobody runs the loop between them any more."""
+        with self._lock:
+            self._failure = error.__cause__
+            self._stopping = self._ended = True
+            for job in tuple(self._jobs):
+                self._break_off(job)
+        self._poke(self._loop.stop)  # a caller that runs it leaves
+        if self._thread_drives or self._turn.acquire(timeout=GRACE):
+            try:
+                self._cancel_all()
+            except BaseException as again:  # noqa: BLE001  # the cause has been logged
+                _log.debug("the tasks of the loop could not be cancelled", exc_info=again)
+            self._loop.close()
+            self._turn.release()
+
+    def _closed(self, when: str = "before this call") -> ClientClosed:
+        if self._failure is None:
+            return client_closed(when)
+        closed = client_closed(f"because urlab-io, which runs its event loop, died of {self._failure!r}")
+        closed.__cause__ = self._failure
+        return closed
 
     def _await_turn(self) -> None:
         """Sleep until the thread has the turn again."""

@@ -20,6 +20,9 @@ _signal: Any = importlib.import_module("_signal")
 _get_handler: Callable[[int], Any] = _signal.getsignal
 _set_handler: Callable[[int, Any], Any] = _signal.signal
 _raise_soon: Callable[[int], None] = importlib.import_module("_thread").interrupt_main
+# Where the handlers of event loops are defined. They only note the signal, so there is nothing to defer; and to put one
+# back would make its signal interrupt system calls, which its loop has forbidden (`siginterrupt`).
+_OF_LOOPS = frozenset({"asyncio.unix_events", "uvloop.loop"})
 # Exhausts an iterator of C calls in one C call, so that no signal handler runs in between.
 _consume: Callable[[Iterable[object]], None] = deque[object](maxlen=0).extend
 
@@ -46,7 +49,11 @@ class DeferredSignals:
 
     def __enter__(self) -> Self:
         if threading.get_ident() == threading.main_thread().ident:
-            self._numbers = numbers = [number for number in _SIGNALS if callable(_get_handler(number))]
+            self._numbers = numbers = [
+                number
+                for number in _SIGNALS
+                if callable(handler := _get_handler(number)) and getattr(handler, "__module__", "") not in _OF_LOOPS
+            ]
             try:
                 # After an exception the list contains exactly the handlers that were replaced.
                 self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))

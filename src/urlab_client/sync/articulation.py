@@ -189,7 +189,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     def ctrl_array(self) -> Floats:
         """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place.
 
-        Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
+        Writing makes this client control the robot, and reading does not. Assigning to the property checks the values;
+        `step()` refuses NaN and infinities that were written in place.
 
         Raises:
             TypeError: On assigning values that are not numbers.

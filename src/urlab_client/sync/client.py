@@ -14,7 +14,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import CallRecord, Diagnosis, Resync
+from urlab_client.protocol.client_types import STATE_PORT, CallRecord, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
@@ -47,9 +47,9 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
         state_port: State stream, used in live mode. If the server announces another port, that port replaces the
-            default.
-        ctrl_port: Streaming control.
-        info_port: Actuator and camera descriptions.
+            default, but not a port that is given here, even if it has the same number.
+        ctrl_port: Without effect: the client sends set-points with `step()`, not to the server's control socket.
+        info_port: Without effect: actuators and cameras are described in the handshake.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
             works with a model compiled here.
         local_model: Load the handshake's compiled model into `model` and `data`.
@@ -95,7 +95,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         *,
         step_mode: str | StepMode = "auto",
         step_port: int = 5559,
-        state_port: int = 5555,
+        state_port: int = STATE_PORT,
         ctrl_port: int = 5556,
         info_port: int = 5557,
         mujoco_version_check: bool = True,
@@ -196,6 +196,10 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Safe to repeat: wrappers of objects that still exist stay valid. Takes the server over from any other client.
 
+        Changes nothing in the simulation. The state is that of the first published snapshot, for which the client waits
+        up to a second. A server that publishes only in live mode sends none in the other modes; the state is then the
+        last one known of this world, or the model's initial state, until the first reply.
+
         Args:
             observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
                 actuator forces).
@@ -288,6 +292,10 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         queries the server's step counter and time without stepping, and updates the state. It opens a new session if
         the old one is gone, or if a lost request may still be in transit, so that the server refuses that request when
         it arrives. It never sends a step or reset again; whether to repeat them is the caller's decision.
+
+        Other abandoned calls that change what the client mirrors are settled as well, such as `set_paused()`,
+        `set_sim_options()`, `sim.stop()`, `claim()` and `recording.start()`: the client sends them once more, or reads
+        the result.
 
         Args:
             timeout: Seconds to wait; None waits without limit.
@@ -446,7 +454,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Args:
             kinds: Kinds of events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
-                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
+                `session_opened`, `session_lost`, `play_started`, `play_ended`, `task_failed`. Empty for all.
             buffer: Maximum number of buffered events. Beyond it the oldest are dropped; `dropped` of the next event
                 counts them.
 
@@ -460,8 +468,12 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
     def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without updating client state.
 
+        The request stays as it is, so several clients may send the same one.
+
         Raises:
             URLabRPCError: The server refused the request.
+            ValueError: A `Step` has numbers that are not finite, or 0 steps in direct mode, where the server would take
+                one; nothing was sent.
         """
         return self._portal.call(self._aio.call, request, timeout=timeout)
 

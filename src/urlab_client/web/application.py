@@ -286,8 +286,8 @@ class _Site:
                 if now != status:
                     status = now
                     await socket.send_text(now.decode())
-                news = [entry for entry in console.entries if entry.n > line]
-                if news:
+                if console.entries and console.entries[-1].n > line:
+                    news = [entry for entry in console.entries if entry.n > line]
                     line = news[-1].n
                     await socket.send_text(encode(Log(news)).decode())
                 if (

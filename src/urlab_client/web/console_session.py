@@ -10,7 +10,7 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Generator, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,9 @@ import anyio
 import anyio.to_thread
 from msgspec import structs
 
+from urlab_client.aio.background import kept_running
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, URLabError, URLabTimeoutError
+from urlab_client.protocol.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,
@@ -136,13 +137,31 @@ class ConsoleSession:
                 self.replay.keep_playing,
             )
             for job in (self._keep, self._receive, self._pulse, *jobs):
-                tasks.start_soon(job)
+                tasks.start_soon(self._run, job)
             try:
                 yield
             finally:
                 tasks.cancel_scope.cancel()
                 with anyio.CancelScope(shield=True):
                     await self.recordings.end()
+
+    async def _run(self, job: Callable[[], Awaitable[None]]) -> None:
+        """Run a job for as long as the console is open. Its failure is not that of the application around it."""
+        name = job.__name__.lstrip("_")
+        await kept_running(f"urlab-web-{name}", job, lambda error: self.note("error", "console", name, str(error)))
+
+    async def opened(self) -> None:
+        """Wait until the session has been opened for the first time.
+
+        Raises:
+            ServerUnreachable: The server cannot be reached; nothing was sent.
+        """
+        with self.bell() as changed:
+            while not self._ready.is_set():
+                if self.link.reason:  # a first attempt has failed; each has its own deadline
+                    raise ServerUnreachable(f"There is no session with the server: {self.link.reason}")
+                changed.clear()
+                await changed.wait()
 
     async def _keep(self) -> None:
         """Open the session, and reopen it whenever necessary."""
@@ -177,7 +196,7 @@ class ConsoleSession:
                     await self._discover()
             else:
                 await self._discover()
-        except (URLabError, OSError, ValueError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever it is, the next attempt may do better
             self._want = "discover" if want == "discover" else "resync"
             if self.link.reason != str(error):
                 self._set_link("lost" if self._ready.is_set() else "connecting", str(error))
@@ -371,6 +390,8 @@ class ConsoleSession:
 
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
         """Add a line to the log."""
+        if (kind, who) == ("error", "console"):
+            log.warning("%s: %s", what, text)
         self._n += 1
         self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
         self.tell()
@@ -392,7 +413,10 @@ class ConsoleSession:
         if view is None:
             return None
         if path not in self._feeds or self._feeds[path].view is not view:
-            self._feeds[path] = Feed(self.client, view, path, self.replay)
+            said = f"camera {path}"
+            self._feeds[path] = Feed(
+                self.client, view, path, self.replay, lambda error: self.note("error", "console", said, str(error))
+            )
         return self._feeds[path]
 
     def camera(self, path: str) -> URLabCameraView | None:

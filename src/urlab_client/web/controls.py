@@ -179,9 +179,10 @@ class Controls:
                 if key in self._client.articulations
             }
             try:
-                await self._client.call(Step(per_articulation=commands))
-            except URLabError as error:
-                self._console.note("error", "console", "set-points", str(error))
+                await self._client.call(Step(n_steps=0, per_articulation=commands))  # refused by the client if it steps
+            except (URLabError, ValueError) as error:
+                if self._client.step_mode is StepMode.LIVE:  # otherwise the next step takes them along
+                    self._console.note("error", "console", "set-points", str(error))
 
     async def step(self, viewer: Viewer, n_steps: int) -> dict[str, Any]:
         """Step in direct mode, with the set-points and pictures of the cameras that are watched.
@@ -229,9 +230,12 @@ class Controls:
                 await self._wake_runner.wait()
                 continue
             began = time.monotonic()
+            stepped = False
             try:
                 await self._step(max(1, round(_PERIOD_S / (self._console.world.timestep or _PERIOD_S))))
-            except (URLabError, KeyError) as error:
-                self.running = False
+                stepped = True
+            except (URLabError, ValueError, KeyError) as error:  # the program that mounts the console may write a NaN
                 self._console.note("error", "console", "step", str(error))
+            finally:
+                self.running = self.running and stepped
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import time
 from collections.abc import AsyncGenerator, Callable
 
 import anyio
+
+from urlab_client.aio.background import background_task
 
 __all__ = ["DrivingLease", "NotDriving", "Viewer"]
 
@@ -94,12 +95,15 @@ class DrivingLease:
         self.use(viewer)
         async with self._one:
             self.use(viewer)
-            with anyio.CancelScope() as body:
-                keeping = asyncio.create_task(self._keep(viewer, body))
+            body = anyio.CancelScope()
+            keeping = background_task("urlab-web-lease", self._keep(viewer, body), failed=lambda _: body.cancel())
+            with body:
                 try:
                     yield
                 finally:
                     keeping.cancel()
+            if body.cancelled_caught and keeping.done():
+                keeping.result()  # raises what ended it
             if body.cancelled_caught and (holder := self.holder) is not None:
                 raise NotDriving(f"{holder.name} took the controls.")
 

@@ -1,30 +1,56 @@
-"""Model uploads in the HTTP API: an MJCF file, or a ZIP archive of an MJCF file and its meshes."""
+"""Model uploads in the HTTP API: an MJCF file, or a ZIP archive of an MJCF file and its meshes.
+
+What viewers send is unpacked and compiled in a confined process only. The server gets what that made of it.
+"""
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
 import tempfile
-import zipfile
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import anyio.to_thread
 from starlette.requests import Request
 from starlette.responses import Response
 
-from urlab_client.protocol.errors import RPC_ERRORS
+from urlab_client.aio.model.compilation import flatten_confined
+from urlab_client.aio.model.upload import FlatModel, upload
+from urlab_client.protocol.errors import ImportFailed
+from urlab_client.protocol.instances import import_directory
+from urlab_client.protocol.names import is_file_name
+from urlab_client.protocol.scene_types import URLabBlueprint
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import JOB, Handler, RouteGroup
-from urlab_client.web.stoppable import Progress, stoppable
+from urlab_client.web.stoppable import stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
-    from urlab_client.protocol.scene_types import URLabBlueprint
 
-__all__ = ["ModelRoutes", "take_model"]
+__all__ = ["ModelRoutes", "WouldReplace", "import_model", "received_model"]
 
 _LARGEST_FILE = 256 << 20
-_LARGEST_CONTENT = 1 << 30
+_NAME_CHARACTERS: Final = 64
+_PREFIX: Final = "urlab-model-"
+_LEFT_S: Final = 3600.0
+_UPLOADED: Final = "model"
+"""What servers call the blueprint of every upload: the wire has no name for it."""
+
+
+class WouldReplace(Exception):
+    """A model was not imported because another blueprint would be lost.
+
+    Attributes:
+        name: The blueprint.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"There is already a blueprint {name!r}, which importing this model would replace.")
+        self.name = name
 
 
 class ModelRoutes(RouteGroup):
@@ -38,29 +64,31 @@ class ModelRoutes(RouteGroup):
         viewer, name = self._viewer(request), request.path_params["name"]
         request.scope[JOB] = f"the import of {name}"
         async with self._console.lease.hold(viewer):  # large models take longer than the controls are kept
-            made = await take_model(self._console.client, name, request.stream())
+            await self._console.opened()
+            model = await received_model(name, request.stream())
+            try:
+                made = await import_model(self._console.client, name, model, request.query_params.get("replace", ""))
+            except WouldReplace as error:
+                hint = f"Send it again with ?replace={error.name} to replace it."
+                said = {"code": "would_replace", "message": str(error), "hint": hint, "name": error.name}
+                return Response(encode({"error": said}), 409, media_type="application/json")
         self._console.note("call", viewer.name, "import model", name)
         return Response(encode({"blueprint": made.class_path, "name": made.short_name}), media_type="application/json")
 
 
-async def take_model(client: URLabClient, name: str, chunks: AsyncIterator[bytes]) -> URLabBlueprint:
-    """Receive a model and make a blueprint of it.
-
-    Servers that accept uploads receive it over the wire; others read it from this machine's disk, if they run here.
+async def received_model(name: str, chunks: AsyncIterator[bytes]) -> FlatModel:
+    """Receive a model, and check and compile it in a confined process.
 
     Args:
-        client: The client.
         name: The file's name, which ends with `.xml` or `.zip`.
         chunks: Its bytes.
 
     Raises:
-        ValueError: It is neither, is too large, or the archive has no MJCF file to begin with.
-        URLabError: The server rejects it.
+        ValueError: It is neither, exceeds a limit, names files that did not come with it, or MuJoCo rejects it.
     """
-    ending = PurePosixPath(name).suffix.lower()
-    if ending not in {".xml", ".zip"} or PurePosixPath(name).name != name or "\\" in name:
+    if not is_file_name(name) or PurePosixPath(name).suffix.lower() not in {".xml", ".zip"}:
         raise ValueError(f"{name!r} is not the name of a model: send an .xml file, or a .zip archive with one")
-    with tempfile.TemporaryDirectory(prefix="urlab-model-", ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True) as folder:
         file = Path(folder) / name
         size = 0
         with file.open("wb") as target:
@@ -69,33 +97,67 @@ async def take_model(client: URLabClient, name: str, chunks: AsyncIterator[bytes
                 if size > _LARGEST_FILE:
                     raise ValueError(f"a model is at most {_LARGEST_FILE} bytes")
                 await anyio.to_thread.run_sync(target.write, chunk)
-        if ending == ".zip":
-            archive, content = file, Path(folder) / "content"
-            file = await stoppable(lambda told: _unpacked(archive, content, told))
+        return await stoppable(lambda told: flatten_confined(file, told))
+
+
+async def import_model(client: URLabClient, name: str, model: FlatModel, replace: str) -> URLabBlueprint:
+    """Make a blueprint of a model.
+
+    A server of this user on this machine imports it from the disk, under the name of its file. Another one receives it
+    over the wire, if it accepts uploads.
+
+    Args:
+        client: The client.
+        name: The file's name.
+        model: The model.
+        replace: Name of the blueprint that may be replaced; empty for none.
+
+    Raises:
+        WouldReplace: Another blueprint would be replaced.
+        URLabError: The server rejects the model.
+    """
+    stem = re.sub(r"\W", "_", PurePosixPath(name).stem)[:_NAME_CHARACTERS]
+    with tempfile.TemporaryDirectory(prefix=_PREFIX, dir=_import_folder(), ignore_cleanup_errors=True) as folder:
+        file = Path(folder) / f"{stem}.xml"
+        await anyio.to_thread.run_sync(_write, model, file)
         try:
-            return await client.scene.upload_model(file)
-        except RPC_ERRORS["unknown_op"]:
-            return await client.scene.import_xml(str(file))
+            made = await client.scene.import_xml(str(file), force_reimport=replace.casefold() == stem.casefold())
+        except ImportFailed as refusal:
+            if not client.server.features.uploads:
+                said = refusal.message.replace(f"{file.parent}{os.sep}", "")  # where the console keeps its files
+                raise ImportFailed(refusal.code, said, op=refusal.op, hint=refusal.hint) from None
+        else:
+            if not made.imported_now:
+                raise WouldReplace(made.short_name)
+            return made
+    known = [one.short_name for one in await client.outliner.list_blueprints()]
+    there = next((one for one in known if one.casefold() == _UPLOADED), None)
+    if there is not None and replace != there:
+        raise WouldReplace(there)
+    reply = await upload(model, client.call, None)
+    return URLabBlueprint(
+        class_path=reply.blueprint_class_path, short_name=reply.blueprint_short_name, imported_now=reply.imported
+    )
 
 
-def _unpacked(archive: Path, folder: Path, progress: Progress) -> Path:
-    """Unpack an archive and return its MJCF file: the one at the top, of several the one called like it."""
+def _import_folder() -> Path | None:
+    """Return the folder from which servers on this machine import; None for any, where that cannot be used."""
+    folder = import_directory()
     try:
-        with zipfile.ZipFile(archive) as packed:
-            names = [PurePosixPath(info.filename) for info in packed.infolist()]
-            if any(name.is_absolute() or ".." in name.parts for name in names):
-                raise ValueError(f"{archive.name} has files outside its own folder")
-            if sum(info.file_size for info in packed.infolist()) > _LARGEST_CONTENT:
-                raise ValueError(f"{archive.name} unpacks to more than {_LARGEST_CONTENT} bytes")
-            for number, info in enumerate(packed.infolist()):
-                progress(number)
-                packed.extract(info, folder)
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{archive.name} is not a ZIP archive: {error}") from None
-    found = sorted(folder.rglob("*.xml"), key=lambda file: len(file.parts))
-    top = [file for file in found if len(file.parts) == len(found[0].parts)]
-    like = [file for file in top if file.stem in {archive.stem, "scene"}]
-    if len(like or top) == 1:
-        return (like or top)[0]
-    names = ", ".join(file.name for file in top) or "none"
-    raise ValueError(f"{archive.name} must have one .xml file at its top, or one called {archive.stem}.xml: {names}")
+        if folder is not None:
+            folder = folder.resolve()  # as servers name it
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for left in folder.glob(f"{_PREFIX}*"):  # by a console that was killed
+                if left.stat().st_mtime < time.time() - _LEFT_S:
+                    shutil.rmtree(left, ignore_errors=True)
+    except OSError:
+        return None  # the plugin reads from anywhere
+    return folder
+
+
+def _write(model: FlatModel, document: Path) -> None:
+    for name, data in model.files.items():
+        if not is_file_name(name) or name.casefold() == document.name.casefold():
+            raise ValueError(f"the model has a file {name[:80]!r}; call it otherwise")
+        document.with_name(name).write_bytes(data)
+    document.write_bytes(model.xml)

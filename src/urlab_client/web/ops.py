@@ -238,7 +238,10 @@ _PATHS: dict[str, Any] = {
     "/api/run": _path("post", "run", "Run or stop physics: `{running: bool}`. Anyone may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Requires the controls."),
     "/api/models/{name}": _path(
-        "put", "import_model", "Import a model: the bytes of an .xml or .zip file. Requires the controls."
+        "put",
+        "import_model",
+        "Import a model: the bytes of an .xml or .zip file. `?replace=NAME` allows it to replace that blueprint. "
+        "Requires the controls.",
     ),
     "/api/recording": {
         **_path("post", "record", "Record to an MCAP file: `{cameras: bool}`. Requires the controls."),

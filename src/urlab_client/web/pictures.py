@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 import anyio
 import anyio.to_thread
 import msgspec
+import numpy as np
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.aio.background import background_task, kept_running
+from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.protocol.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.protocol.picture_files import jpeg
@@ -78,18 +80,27 @@ class Feed:
         view: The camera.
         path: Its name, as `ARTICULATION/CAMERA`.
         recording: The replay, which may be inactive.
+        failed: Called with each unexpected error; the feed begins anew after a pause.
 
     Attributes:
         newest: The newest picture, or None.
         view: The camera.
     """
 
-    def __init__(self, client: URLabClient, view: URLabCameraView, path: str, recording: PictureRecording) -> None:
+    def __init__(
+        self,
+        client: URLabClient,
+        view: URLabCameraView,
+        path: str,
+        recording: PictureRecording,
+        failed: Callable[[URLabError], None],
+    ) -> None:
         self.newest: EncodedPicture | None = None
         self._client = client
         self.view = view
         self._path = path
         self._recording = recording
+        self._failed = failed
         self._watchers = 0
         self._changed = asyncio.Condition()
         self._task: asyncio.Task[None] | None = None
@@ -105,14 +116,18 @@ class Feed:
     async def watch(self) -> AsyncGenerator[Feed]:
         """Keep the feed running while the block runs."""
         self._watchers += 1
-        if self._task is None:
-            self._task = asyncio.create_task(self._run(), name="urlab-web-camera")
+        self._start()
         try:
             yield self
         finally:
             self._watchers -= 1
             if not self._watchers:
                 await self._stop()
+
+    def _start(self) -> None:
+        if self._task is None:
+            running = kept_running("urlab-web-camera", self._run, self._failed)
+            self._task = background_task("urlab-web-camera", running)
 
     async def _stop(self) -> None:
         task, self._task = self._task, None
@@ -124,8 +139,8 @@ class Feed:
         """Begin anew: pictures come from a recording now, or no longer."""
         await self._stop()
         self.newest = self._last = None
-        if self._watchers and self._task is None:
-            self._task = asyncio.create_task(self._run(), name="urlab-web-camera")
+        if self._watchers:
+            self._start()
 
     async def after(self, seq: int) -> EncodedPicture:
         """Return the newest picture once it is newer than number `seq`."""
@@ -200,5 +215,8 @@ class Feed:
 
 def _jpeg_of(picture: RecordedPicture) -> bytes:
     """Return a recorded picture as a browser shows it; one that is a JPEG already as it is."""
-    format_ = getattr(picture.message, "format", "")
-    return picture.message.data if format_ == "jpeg" else jpeg(picture.pixels(), picture.mode, _QUALITY)
+    if getattr(picture.message, "format", "") == "jpeg":
+        return picture.message.data
+    pixels = picture.pixels()
+    # Recorded colours are RGB or RGBA in every mode, unlike those of a camera.
+    return jpeg(pixels, CameraMode.DEPTH if pixels.dtype == np.float32 else CameraMode.REAL, _QUALITY)

@@ -276,14 +276,17 @@ class Replay:
                 continue
             self._at = min(self._at + self._rate * (time.monotonic() - began), self._seconds)
             self._playing = self._at < self._seconds
+            shown = False
             try:
                 await self._show()
+                shown = True
             except (URLabError, OSError) as error:
-                self._playing = False
                 self._console.note("error", "console", "replay", str(error))
+            finally:
+                self._playing = self._playing and shown
             try:
                 await self._place()
-            except URLabError as error:
+            except (URLabError, ValueError) as error:
                 self._before = None
                 await self._console.renew_pictures()
                 self._console.note("error", "console", "replay", str(error))

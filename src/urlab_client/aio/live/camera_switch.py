@@ -14,8 +14,9 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 
+from urlab_client.aio.background import background_task
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, leaves_open
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraStreaming, CameraTransports, SetCameraStreaming
 from urlab_client.protocol.messages.session import CameraInfo
@@ -29,6 +30,7 @@ _OFF_S = 1.0
 # Name both transports: the server switches off any that is missing.
 _ON = CameraTransports(zmq=True, shm=True)
 _OFF = CameraTransports(zmq=False, shm=False)
+_UNKNOWN = CameraTransports()  # the outcome of a request is, so the next one is due in any case
 
 
 class CameraSwitch:
@@ -49,6 +51,7 @@ class CameraSwitch:
         self._on: dict[str, CameraTransports] = {}  # through this client
         self._sending = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
+        self._failure: URLabError | None = None
         self._closed = False
 
     def use(self, info: CameraInfo, *, asked: bool) -> None:
@@ -108,8 +111,7 @@ class CameraSwitch:
             try:
                 return await self._send(wanted, timeout)
             except BaseException:
-                for topic in wanted:  # the server may have applied it despite the error
-                    self._on.pop(topic, None)
+                for topic in wanted:
                     if topic in before:
                         self._set[topic] = before[topic]
                     else:
@@ -118,10 +120,24 @@ class CameraSwitch:
             finally:
                 self._follow()
 
+    async def settle(self) -> None:
+        """Send again what an abandoned request may have changed, and wait for it."""
+        self._follow()
+        await self.settled()
+
     async def settled(self) -> None:
-        """Wait until the current settings have been sent to the server."""
+        """Wait until the current settings have been sent to the server, or refused.
+
+        Raises:
+            URLabError: Sending failed unexpectedly.
+        """
         if self._task is not None:
             await asyncio.wait((self._task,))
+            if self._failure is not None:
+                raise self._failure
+
+    def _die(self, error: URLabError) -> None:
+        self._failure = error
 
     async def aclose(self, *, connected: bool) -> None:
         """Switch off the cameras that are on only for streams, if the server is connected. Idempotent."""
@@ -142,7 +158,8 @@ class CameraSwitch:
         if self._closed or not self._session.features.camera_switch or not self._due():
             return
         if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._switch(), name="urlab-cameras")
+            self._failure = None
+            self._task = background_task("urlab-cameras", self._switch(), tell=self._session.tell, failed=self._die)
 
     def _due(self) -> dict[str, CameraTransports]:
         return {topic: wanted for topic in self._infos if (wanted := self._wanted(topic)) != self._on.get(topic, _OFF)}
@@ -169,7 +186,12 @@ class CameraSwitch:
     async def _send(
         self, due: Mapping[str, CameraTransports], timeout: Timeout = DEFAULT
     ) -> dict[str, CameraStreaming]:
-        reply = await self._session.call(SetCameraStreaming(cameras=dict(due)), timeout=timeout)
+        try:
+            reply = await self._session.call(SetCameraStreaming(cameras=dict(due)), timeout=timeout)
+        except BaseException as error:
+            if leaves_open(error):
+                self._on |= dict.fromkeys(due, _UNKNOWN)
+            raise
         for topic, wanted in due.items():
             if wanted == _OFF:
                 self._on.pop(topic, None)

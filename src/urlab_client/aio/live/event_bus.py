@@ -24,6 +24,7 @@ from urlab_client.protocol.messages.streams import (
     SessionLost,
     SessionOpened,
     StreamPolicy,
+    TaskFailed,
 )
 from urlab_client.protocol.names import did_you_mean
 
@@ -39,6 +40,7 @@ _Event = (
     | SessionLost
     | PlayStarted
     | PlayEnded
+    | TaskFailed
 )
 _EVENTS = msgspec.msgpack.Decoder(_Event)
 _KINDS = {str(kind.__struct_config__.tag): kind for kind in get_args(_Event)}
@@ -81,8 +83,8 @@ class EventBus:
         topic = str(event.__struct_config__.tag).encode()
         message = msgspec.msgpack.encode(event)  # each listener decodes its own copy
         for handler in handlers:
-            handler.on_message(topic, message)
-            handler.on_drained()
+            handler.take(topic, message)
+            handler.drain()
 
     def close(self) -> None:
         """End every stream with `ClientClosed`. Call from the event loop. Idempotent."""

@@ -127,7 +127,7 @@ class LiveState(MessageHandler):
 
     def _try_again(self) -> None:
         self._retry = None
-        self.on_drained()
+        self.drain()
 
     def _refuse(self, problem: str) -> None:
         self.stats.refused += 1

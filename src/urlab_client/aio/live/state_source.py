@@ -48,8 +48,8 @@ class OwnSteps:
         """Deliver a state to all handlers."""
         payload = StateSnapshot.of(reply).encode()
         for handler in tuple(self._handlers):
-            handler.on_message(STATE_FULL, payload)
-            handler.on_drained()
+            handler.take(STATE_FULL, payload)
+            handler.drain()
 
 
 class StateSource(PublishedSource):

@@ -7,6 +7,7 @@ binds its record to a new model.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from urlab_client.protocol.messages.session import (
     TwistState,
 )
 
-__all__ = ["Carried", "MirroredArticulation", "MirroredEntity", "Wrenches", "give_back"]
+__all__ = ["Carried", "MirroredArticulation", "MirroredEntity", "SetPoints", "Wrenches", "give_back"]
 
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
@@ -60,14 +61,15 @@ class MirroredEntity:
         self.pose: EntityState | None = None
         self.wrenches: Wrenches = {}
 
-    def bind_entity(self, info: EntityInfo) -> None:
-        """Adopt the description from a handshake."""
+    def bind_entity(self, info: EntityInfo, *, keep: bool) -> None:
+        """Adopt the description from a handshake, and keep the state or forget it."""
         self.body_id = info.id
         self.has_free_base = info.has_free_base
         self.free_joint = info.free_joint
         self.qpos_offset = info.qpos_offset
         self.qvel_offset = info.qvel_offset
-        self.pose = None
+        if not keep:
+            self.pose = None
 
     def check_pose(self, state: EntityState, op: str) -> None:
         """Reject a state whose arrays do not have the lengths of a pose and a velocity.
@@ -125,6 +127,31 @@ class MirroredEntity:
         return taken
 
 
+class SetPoints(np.ndarray[Any, np.dtype[np.float64]]):
+    """The view of an articulation's set-points that users write to. Assigning to its items drives the articulation.
+
+    Reading drives nothing, and neither do copies. Results of computations are plain arrays.
+    """
+
+    _on_write: Callable[[], None] | None = None  # None in arrays made from the view
+
+    @classmethod
+    def of(cls, ctrl: Floats, on_write: Callable[[], None]) -> SetPoints:
+        """Return the view of an array, with the callback for writes."""
+        view = ctrl.view(cls)
+        view._on_write = on_write  # noqa: SLF001  # its own class
+        return view
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(key, value)
+        # The same values as before count, too: the server may have others from an earlier owner.
+        if self._on_write is not None:
+            self._on_write()
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False, /) -> Any:
+        return array[()] if return_scalar else array
+
+
 class MirroredArticulation(MirroredEntity):
     """State of one articulation.
 
@@ -136,7 +163,8 @@ class MirroredArticulation(MirroredEntity):
         info: Description from the handshake.
         controller: Controller block from the handshake, kept current.
         control_mode: Whether the controller is active.
-        ctrl: Set-points that the next step sends, shape (n_ctrl,). Users write them in place after `drive`.
+        ctrl: Set-points that the next step sends, shape (n_ctrl,).
+        set_points: View of `ctrl` that users write to.
         qpos: Joint positions.
         qvel: Joint velocities.
         applied: `mjData.ctrl` as the server applied it.
@@ -156,29 +184,34 @@ class MirroredArticulation(MirroredEntity):
         super().__init__(mirror, info.prefix)
         self.controller: ControllerInfo | None = None
         self.control_mode: ControlMode = ControlMode.RAW
-        self.ctrl: Floats = np.zeros(0)
-        self._written_ctrl: Floats = np.zeros(0)
         self._driven = False
-        self._left_ctrl: Floats = self.ctrl
+        self._use_ctrl(0)
         self.user: dict[str, Any] = {}
-        self.bind(info, layout)
+        self.bind(info, layout, keep=False)
 
-    def bind(self, info: ArticulationInfo, layout: ArticulationLayout) -> None:
-        """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
+    def bind(self, info: ArticulationInfo, layout: ArticulationLayout, *, keep: bool) -> None:
+        """Adopt the description from a handshake. Keep set-points and control mode if they still fit.
+
+        Args:
+            info: The description.
+            layout: Addresses of its values in the model.
+            keep: Whether to keep the state, too.
+        """
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
         self._sensor_names = [*layout.sensor_dims]
         self._sensor_dims = [*layout.sensor_dims.values()]
+        keep = keep and len(self.ctrl) == n_ctrl
         if len(self.ctrl) != n_ctrl:
-            self.ctrl = np.zeros(n_ctrl)
-            self._written_ctrl = np.zeros(n_ctrl)
-            self._left_ctrl = np.zeros(n_ctrl)
+            self._use_ctrl(n_ctrl)
         self._bind_controller(info.controller)
         self._bind_root()
         data = self.mirror.data
         # Looking up MuJoCo's arrays takes as long as writing to them.
         self._mirrored = None if data is None else (data.qpos, data.qvel, data.ctrl, data.act)
+        if keep:
+            return
         self.qpos: Floats = np.zeros(0) if data is None else data.qpos[layout.qpos_adr]
         self.qvel: Floats = np.zeros(0) if data is None else data.qvel[layout.qvel_adr]
         self.applied: Floats = np.zeros(n_ctrl)
@@ -189,6 +222,12 @@ class MirroredArticulation(MirroredEntity):
         self.bodies: dict[str, BodyPose] | None = None
         self.twist: TwistState | None = None
         self.actions: int = 0
+
+    def _use_ctrl(self, n_ctrl: int) -> None:
+        self.ctrl: Floats = np.zeros(n_ctrl)
+        self.set_points: SetPoints = SetPoints.of(self.ctrl, self.drive)
+        self._written_ctrl: Floats = np.zeros(n_ctrl)
+        self._left: list[float] = [0.0] * n_ctrl
 
     def _bind_controller(self, info: ControllerInfo | None) -> None:
         before = self.controller
@@ -316,12 +355,12 @@ class MirroredArticulation(MirroredEntity):
     def leave(self) -> None:
         """Stop controlling the articulation until the next write."""
         self._driven = False
-        self._left_ctrl = self.ctrl.copy()
+        self._left = self.ctrl.tolist()
 
     @property
     def driven(self) -> bool:
-        """Whether this client controls the articulation: it called `drive` or wrote a set-point."""
-        return self._driven or not np.array_equal(self.ctrl, self._left_ctrl)
+        """Whether this client controls the articulation: it called `drive` or changed a set-point in any way."""
+        return self._driven or self.ctrl.tolist() != self._left
 
     def live_command(self) -> ArticulationCommand:
         """Return the command of a live step; the server ignores everything but `ctrl`.
@@ -350,6 +389,8 @@ class MirroredArticulation(MirroredEntity):
         if not math.isfinite(sum(values)) and (invalid := self.not_finite()):
             problem = f"set-points of articulation {self.name!r} are not finite: {', '.join(invalid)}"
             raise ValueError(f"step: {problem}. Nothing was sent.")
+        if not self._driven and values != self._left:
+            self._driven = True  # also after a later write of the values from before
         return values
 
     def not_finite(self) -> list[str]:

@@ -212,22 +212,53 @@ class Mirror:
             else:
                 return None
         except (ValueError, mujoco.FatalError) as error:
-            raise ProtocolError(f"hello: the server's model cannot be loaded: {error}", op="hello") from error
+            hint = None
+            if mismatch is not None:
+                hint = (
+                    f"The server has MuJoCo {mismatch.server_version}, this process {mismatch.client_version}: the "
+                    f"model may need what that lacks. Install mujoco=={mismatch.server_version}, or pass "
+                    "local_model=False to work without a local model."
+                )
+            raise ProtocolError(
+                f"hello: the server's model cannot be loaded: {error}", op="hello", hint=hint
+            ) from error
         if not 0 < model.opt.timestep < math.inf:
             raise ProtocolError(f"hello: the timestep of the server's model is {model.opt.timestep}.", op="hello")
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         return Loaded(model, data, not binary)
 
-    def use(self, loaded: Loaded | None) -> None:
-        """Switch to a loaded model, or to none. Call under the lock."""
-        if loaded is None:
-            self.model = self.data = None
-            self.approximate = False
-        else:
-            self.model, self.data, self.approximate = loaded.model, loaded.data, loaded.approximate
-        self._stale = False
+    def use(self, loaded: Loaded | None, *, keep: bool = False) -> None:
+        """Switch to a loaded model, or to none. Call under the lock.
+
+        Args:
+            loaded: The model and its initial data.
+            keep: Whether to keep the state; `holds` must have been true.
+        """
+        if keep and loaded is not None and self.model is not None and self.data is not None:
+            import mujoco  # noqa: PLC0415
+
+            kept = mujoco.mjtState.mjSTATE_INTEGRATION
+            state = np.empty(mujoco.mj_stateSize(self.model, kept))
+            mujoco.mj_getState(self.model, self.data, state, kept)
+            mujoco.mj_setState(loaded.model, loaded.data, state, kept)
+        self.model, self.data, self.approximate = (None, None, False) if loaded is None else loaded
+        self._stale = keep
         self._dragged = None
+
+    def holds(self, loaded: Loaded | None) -> bool:
+        """Return whether a loaded model has the same elements as the present one, so that its state fits."""
+        if loaded is None or self.model is None:
+            return loaded is None and self.model is None
+        import mujoco  # noqa: PLC0415
+
+        before, after = self.model, loaded.model
+        whole = mujoco.mjtState.mjSTATE_INTEGRATION
+        return (
+            before.names == after.names
+            and np.array_equal(before.qpos0, after.qpos0)
+            and mujoco.mj_stateSize(before, whole) == mujoco.mj_stateSize(after, whole)
+        )
 
     def reset(self, keyframe: str | None) -> None:
         """Reset the data as the server does, because replies carry only part of the state. Call under the lock.

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, fill
 from urlab_client.aio.namespaces._ops import ReplayOps
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.protocol.errors import RecordingAlreadyActive, RecordingNotActive
 from urlab_client.protocol.messages.recording import (
     RecordingClear,
     RecordingSave,
@@ -24,22 +27,25 @@ from urlab_client.protocol.types import RecordingHandle, RecordingSummary, Repla
 
 __all__ = ["RecordingNamespace", "ReplayNamespace"]
 
+_RECORDING = "recording"
+_FRAMES = "recorded frames"
+_SESSION = "replay session"
 _FLOAT32_MAX = 3.4028234663852886e38  # the server's value for "no limit"
 
 
 class RecordingNamespace(Namespace):
     """Recording joint states on the server. The properties reflect this client's own calls."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, state: SimState) -> None:
         super().__init__(session)
-        self._active = False
+        self._state = state
         self._summary = RecordingSummary(0, 0.0)
         self._last_saved: Path | None = None
 
     @property
     def is_active(self) -> bool:
         """Whether a recording is running."""
-        return self._active
+        return self._state.recording
 
     @property
     def frame_count(self) -> int:
@@ -69,8 +75,18 @@ class RecordingNamespace(Namespace):
         Raises:
             RecordingAlreadyActive: A recording is already running.
         """
-        reply = await self._call(RecordingStart(name=name, max_duration_s=max_duration_s), timeout)
-        self._active = True
+        request = RecordingStart(name=name, max_duration_s=max_duration_s)
+        async with self._session.turn(RecordingStart, timeout=timeout) as turn:
+            return await self._start(request, turn)
+
+    async def _start(self, request: RecordingStart, turn: Turn) -> RecordingHandle:
+        try:
+            with self._session.settling(_RECORDING, partial(self._start, request)):
+                reply = await turn.call(request)
+        except RecordingAlreadyActive:
+            self._state.recording = True
+            raise
+        self._state.recording = True
         limit = reply.max_duration_s
         return RecordingHandle(name=reply.name, max_duration_s=math.inf if limit >= _FLOAT32_MAX else limit)
 
@@ -80,9 +96,18 @@ class RecordingNamespace(Namespace):
         Raises:
             RecordingNotActive: No recording is running.
         """
-        self._summary = fill(RecordingSummary, await self._call(RecordingStop(), timeout))
-        self._active = False
-        return self._summary
+        async with self._session.turn(RecordingStop, timeout=timeout) as turn:
+            await self._stop(turn)
+            return self._summary
+
+    async def _stop(self, turn: Turn) -> None:
+        try:
+            with self._session.settling(_RECORDING, self._stop):
+                self._summary = fill(RecordingSummary, await turn.call(RecordingStop()))
+        except RecordingNotActive:
+            self._state.recording = False
+            raise
+        self._state.recording = False
 
     async def save(self, path: str | Path | None = None, *, timeout: Timeout = DEFAULT) -> Path:
         """Write the active session to a JSON file on the server's machine and return its absolute path.
@@ -100,15 +125,22 @@ class RecordingNamespace(Namespace):
 
     async def clear(self, *, timeout: Timeout = DEFAULT) -> None:
         """Discard the recorded frames."""
-        await self._call(RecordingClear(), timeout)
+        async with self._session.turn(RecordingClear, timeout=timeout) as turn:
+            with self._session.settling(_FRAMES, self._forget_frames):
+                await turn.call(RecordingClear())
+            await self._forget_frames(turn)
+
+    async def _forget_frames(self, turn: Turn) -> None:
+        del turn  # to clear again could discard what was recorded since
         self._summary = RecordingSummary(0, 0.0)
 
 
 class ReplayNamespace(ReplayOps):
     """Playing recordings back. Requires step mode `direct` or `puppet`."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, state: SimState) -> None:
         super().__init__(session)
+        self._state = state
         self._session_name: str | None = None
 
     @property
@@ -122,9 +154,13 @@ class ReplayNamespace(ReplayOps):
         Raises:
             PathNotReadable: The file is missing or is not a recording.
         """
-        reply = await self._call(ReplayLoad(path=str(path)), timeout)
-        self._session_name = reply.name
-        return ReplaySession(name=reply.name)
+        async with self._session.turn(ReplayLoad, timeout=timeout) as turn:
+            return await self._load(str(path), turn)
+
+    async def _load(self, path: str, turn: Turn) -> ReplaySession:
+        with self._session.settling(_SESSION, partial(self._load, path)):
+            self._session_name = name = (await turn.call(ReplayLoad(path=path))).name
+        return ReplaySession(name=name)
 
     async def set_active(self, name: str, *, timeout: Timeout = DEFAULT) -> None:
         """Make a loaded session the active one.
@@ -132,7 +168,12 @@ class ReplayNamespace(ReplayOps):
         Raises:
             ReplaySessionNotFound: No session has this name.
         """
-        await self._call(ReplaySetActive(name=name), timeout)
+        async with self._session.turn(ReplaySetActive, timeout=timeout) as turn:
+            await self._activate(name, turn)
+
+    async def _activate(self, name: str, turn: Turn) -> None:
+        with self._session.settling(_SESSION, partial(self._activate, name)):
+            await turn.call(ReplaySetActive(name=name))
         self._session_name = name
 
     async def start(self, *, timeout: Timeout = DEFAULT) -> ReplayStatus:
@@ -141,9 +182,21 @@ class ReplayNamespace(ReplayOps):
         Raises:
             ReplayRequiresStepped: The step mode is live.
         """
-        status = fill(ReplayStatus, await self._call(ReplayStart(), timeout))
+        async with self._session.turn(ReplayStart, timeout=timeout) as turn:
+            return await self._start(turn)
+
+    async def _start(self, turn: Turn) -> ReplayStatus:
+        with self._session.settling(_RECORDING, self._note_start):
+            status = fill(ReplayStatus, await turn.call(ReplayStart()))
+        await self._note_start(turn)
         self._session_name = status.active_session
         return status
+
+    async def _note_start(self, turn: Turn) -> None:
+        """A replay ends recording and resumes physics. To start it again would begin it again."""
+        del turn
+        self._state.paused = self._state.recording = False
+        self._session.unsettled.pop("pause", None)
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
         """Stop playing."""
@@ -165,8 +218,8 @@ class ReplayNamespace(ReplayOps):
         # In one turn: otherwise another task could activate another session before this one starts.
         async with self._session.turn(ReplayListSessions, timeout=timeout, each=True) as turn:
             if name in (await turn.call(ReplayListSessions())).sessions:
-                await turn.call(ReplaySetActive(name=name))
+                await self._activate(name, turn)
             else:
-                name = (await turn.call(ReplayLoad(path=name))).name
-            self._session_name = (await turn.call(ReplayStart())).active_session
+                name = (await self._load(name, turn)).name
+            await self._start(turn)
         return ReplaySession(name=name)

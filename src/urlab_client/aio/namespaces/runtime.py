@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -14,7 +15,7 @@ from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.wire_names import as_written, for_the_server
@@ -67,9 +68,14 @@ class RuntimeNamespace(RuntimeOps):
             paused: True to pause.
             timeout: Seconds to wait; None waits without limit.
         """
+        async with self._session.turn(SetPaused, timeout=timeout) as turn:
+            await self._pause(paused, turn)
+            return self._state.paused
+
+    async def _pause(self, paused: bool, turn: Turn) -> None:
         state = self._state
-        state.paused = (await self._call(SetPaused(paused=paused), timeout)).paused
-        return state.paused
+        with self._session.settling("pause", partial(self._pause, paused)):
+            state.paused = (await turn.call(SetPaused(paused=paused))).paused
 
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
@@ -172,10 +178,13 @@ class RuntimeNamespace(RuntimeOps):
         except ValueError as error:
             raise ValueError(f"set_sim_options: {error}. Nothing was sent.") from None
         async with self._session.turn(SetSimOptions, timeout=timeout) as turn:
-            reply = await turn.call(SetSimOptions(options=options))
-            in_force = in_small_letters(reply.options)
-            self._state.mirror_options(in_force)
-            return in_force
+            return await self._set_options(options, turn)
+
+    async def _set_options(self, options: SimOptions, turn: Turn) -> SimOptions:
+        with self._session.settling("options", partial(self._set_options, SimOptions())):
+            in_force = in_small_letters((await turn.call(SetSimOptions(options=options))).options)
+        self._state.mirror_options(in_force)
+        return in_force
 
     async def set_user_channels(
         self,

@@ -11,9 +11,8 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.namespaces.lasting import Playing
-from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.session import STOP, Session, Turn, leaves_open
 from urlab_client.aio.state.discovery import Discovery
-from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
@@ -70,6 +69,7 @@ class SimNamespace(Namespace):
                 result = PIEStartResult(state=state, compile_error=reply.compile_error)
                 if payload is not None:
                     await self._discovery.adopt(turn, payload)
+                    self._session.unsettled.pop(STOP, None)  # what was stopped before does not matter any more
                     result.handshake_payload = msgspec.to_builtins(payload)
             finally:
                 self._state.switching_play = False
@@ -121,22 +121,27 @@ class SimNamespace(Namespace):
             GameThreadTimeout: The editor did not react, often because a modal dialog is open.
             URLabTimeoutError: The editor accepted the request, but play did not end within 10 s.
         """
-        loop = running_loop()
         async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
-            self._state.switching_play = True
-            # On Windows the server could neither remove nor recreate regions that this client has mapped.
-            self._state.publishers.release_regions()
-            try:
+            await self._stop(turn)
+
+    async def _stop(self, turn: Turn) -> None:
+        state, loop = self._state, running_loop()
+        state.switching_play = True
+        # On Windows the server could neither remove nor recreate regions that this client has mapped.
+        state.publishers.release_regions()
+        try:
+            with self._session.settling(STOP, self._stop):
                 await turn.call(StopPie())
-                # The plugin replies as soon as the end has been requested.
-                deadline = loop.time() + _WIND_DOWN_S
-                while _status(await turn.call(PieStatus())).state is not PIEState.OFF:
-                    if loop.time() > deadline:
-                        raise URLabTimeoutError(f"stop_pie: play did not end within {_WIND_DOWN_S:g} s.", op="stop_pie")
-                    await turn.aside(asyncio.sleep(_STOP_POLL_S))
-            finally:
-                self._state.switching_play = False
-            self._state.on_play_ended("stopped by this client")
+            # The plugin replies as soon as the end has been requested.
+            self._session.unsettled[STOP] = self._stop
+            deadline = loop.time() + _WIND_DOWN_S
+            while _status(await turn.call(PieStatus())).state is not PIEState.OFF:
+                if loop.time() > deadline:
+                    raise URLabTimeoutError(f"stop_pie: play did not end within {_WIND_DOWN_S:g} s.", op="stop_pie")
+                await turn.aside(asyncio.sleep(_STOP_POLL_S))
+        finally:
+            state.switching_play = False
+        state.on_play_ended("stopped by this client")
 
     def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
         """Play for the duration of a `with` block: start on entering, and stop on leaving, also after an exception.

@@ -11,6 +11,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 
+from urlab_client.aio.background import background_task
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription
@@ -137,7 +138,7 @@ class ConnectionMonitor:
         if self._closed or self._state.switching_play or not self._session.session_id:
             return
         if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._find_out(), name="urlab-watch")
+            self._task = background_task("urlab-watch", self._find_out(), tell=self._session.tell)
 
     async def _find_out(self) -> None:
         before = self._playing

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import warnings
+from collections.abc import Callable
 from functools import partial
+from typing import Final
 
 import anyio.to_thread
 
@@ -12,15 +16,27 @@ from urlab_client.aio.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
+from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoActiveManager, NotReady, UnknownOp, URLabError, URLabVersionMismatch
+from urlab_client.protocol.errors import (
+    NoActiveManager,
+    NotReady,
+    ProtocolError,
+    UnknownOp,
+    URLabError,
+    URLabVersionMismatch,
+)
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
-from urlab_client.protocol.messages.streams import PlayStarted
+from urlab_client.protocol.messages.streams import PlayStarted, StateSnapshot, StreamPolicy
 
 __all__ = ["Discovery", "look"]
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
+
+_PUBLISHED_S: Final = 1.0  # wait for a snapshot of a server that publishes ten per second, or more, in every mode
+_PERHAPS_S: Final = 0.2  # of one that publishes one per tick in live mode, and none in the others
 
 
 class Discovery:
@@ -47,6 +63,7 @@ class Discovery:
     async def open(self, turn: Turn, observations: str) -> HelloOk:
         """Open a session and apply its handshake."""
         state = self._state
+        state.pending.handshake = True  # until it has been adopted
         hello = await state.session.hello(turn, Hello(observations=observations))
         state.level = state.sent_level = observations
         await self.adopt(turn, hello)
@@ -138,12 +155,16 @@ class Discovery:
         hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
         played = state.hello is not None and state.hello.manager_present
         with state.mirror.lock:
+            # Most likely the same play session goes on. If not, the first state of the new one shows it.
+            keep = played and hello.manager_present and state.mirror.holds(loaded)
             if self._local_model:
-                state.mirror.use(loaded)
+                state.mirror.use(loaded, keep=keep)
             state.hello = hello
-            state.objects.bind(hello, examined)
-            state.forget_clocks()
-        state.pending.play = False
+            state.objects.bind(hello, examined, keep=keep)
+            if not keep:
+                state.forget_clocks()
+        state.located = False
+        state.pending.play = state.pending.handshake = False
         views = state.objects.views()  # binds the cameras to the handshake's descriptions
         state.publishers.refresh()
         if state.publishers.camera_switch is not None:
@@ -153,19 +174,80 @@ class Discovery:
         if state.on_adopted is not None:
             state.on_adopted()
         state.tell_of_handshake()
-        if not hello.manager_present:
-            state.mode = StepMode.LIVE
-        elif self._promote and state.wanted_mode is not StepMode.AUTO:
-            await promote(state, turn, state.wanted_mode)
+        if hello.manager_present:
+            await self._join(turn)
         else:
-            state.assume_mode(StepMode.LIVE if state.wanted_mode is StepMode.AUTO else state.wanted_mode)
-        # A handshake describes the model but not the simulation's state, which may have run for hours.
-        if hello.manager_present and not state.session.read_only and (reply := await look(turn)) is not None:
-            state.absorb_found(reply, "forward")
+            state.mode = StepMode.LIVE
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode,
         )  # fmt: skip
+
+    async def _join(self, turn: Turn) -> None:
+        """Learn the state of the play session, and switch the server to the wanted step mode."""
+        state, wanted = self._state, self._state.wanted_mode
+        promoted = self._promote and wanted is not StepMode.AUTO
+        if promoted:
+            state.pending.mode = wanted  # until the server has accepted it, even if this call is cancelled
+        else:
+            state.assume_mode(StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+        await self._receive_state(turn)  # before a change of mode, because some servers publish in live mode only
+        if promoted and await promote(state, turn, wanted):
+            state.located = False  # physics may have gone on until the change of mode
+
+    async def _receive_state(self, turn: Turn) -> None:
+        """Wait for a snapshot, because a handshake describes the model but not the simulation's state.
+
+        `forward` would return the state, but make the server compute in a world that another program may be driving.
+        """
+        state = self._state
+        # From the socket, where all are new: a region may still have one from before the server stopped publishing.
+        source = state.publishers.state(StreamPolicy.ALL)
+        snapshot = _FirstSnapshot()
+        limit = _PUBLISHED_S if state.session.features.publishes_steps else _PERHAPS_S
+        # If the caller has set a deadline, the rest of the handshake gets half of what is left.
+        seconds = (turn.deadline(2 * limit) - asyncio.get_running_loop().time()) / 2
+        try:
+            source.attach(snapshot)
+            await turn.aside(asyncio.wait((snapshot.came,), timeout=seconds))
+        except ValueError as error:  # the server announces an invalid port
+            log.info("the state stream cannot be received: %s", error)
+        finally:
+            source.detach(snapshot)
+        state.publishers.check_open()
+        if snapshot.came.done() and (found := snapshot.came.result()) is not None and state.matches(found):
+            state.absorb_found(found, "state/full")
+
+
+class _FirstSnapshot(MessageHandler):
+    """Receives one snapshot.
+
+    Attributes:
+        came: The snapshot; None if there will be none.
+    """
+
+    def __init__(self) -> None:
+        self.came: asyncio.Future[StateSnapshot | None] = asyncio.get_running_loop().create_future()
+
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        """Take the first snapshot that is well-formed."""
+        with contextlib.suppress(ProtocolError):
+            self._settle(StateSnapshot.decode(payload))
+
+    def on_malformed(self, problem: str) -> None:
+        """Wait for the next one."""
+
+    def on_refusal(self) -> None:
+        """End the wait because nothing listens at the port."""
+        self._settle(None)
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """End the wait because the client was closed."""
+        self._settle(None)
+
+    def _settle(self, found: StateSnapshot | None) -> None:
+        if not self.came.done():
+            self.came.set_result(found)
 
 
 async def look(turn: Turn) -> ForwardOk | None:

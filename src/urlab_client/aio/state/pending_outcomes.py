@@ -7,21 +7,11 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from urlab_client.aio.model.articulation_state import Carried, give_back
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, leaves_open
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import (
-    InternalError,
-    ModeLocked,
-    ServerUnreachable,
-    ShuttingDown,
-    StepTimeout,
-    URLabRPCError,
-)
+from urlab_client.protocol.errors import ModeLocked, StepTimeout
 
-__all__ = ["PendingOutcomes", "leaves_open"]
-
-# These refusals leave open whether the op was executed. All others mean that it was not.
-_UNDECIDED = (StepTimeout, ShuttingDown, InternalError)
+__all__ = ["PendingOutcomes"]
 
 
 class Counters(Protocol):
@@ -44,9 +34,11 @@ class PendingOutcomes:
         carried: Wrenches of the steps, each with the number of steps after which they have acted.
         reset: Whether one of the requests is a reset.
         keyframe: Compiled keyframe of that reset.
+        seed: Seed of that reset.
         mode: Requested step mode, or None.
         paused: Whether physics may be paused for pictures; see `stopped_live`.
         play: Whether a start of play was interrupted, so that the server may play another world than the client knows.
+        handshake: Whether a handshake was interrupted, so that the client may know the world of an earlier one.
     """
 
     def __init__(self) -> None:
@@ -54,6 +46,7 @@ class PendingOutcomes:
         self.mode: StepMode | str | None = None
         self.paused = False
         self.play = False
+        self.handshake = False
         self.clear()
 
     def __bool__(self) -> bool:
@@ -67,6 +60,7 @@ class PendingOutcomes:
         self.queued: bool = False
         self.reset: bool = False
         self.keyframe: str | None = None
+        self.seed: int | None = None
         self.carried: list[tuple[int, Carried]] = []
 
     def add_steps(self, state: Counters, error: BaseException, steps: int, carried: Carried) -> None:
@@ -77,11 +71,12 @@ class PendingOutcomes:
             self.carried.append((self.steps, carried))
         self.queued = self.queued or isinstance(error, StepTimeout)
 
-    def add_reset(self, state: Counters, keyframe: str | None) -> None:
+    def add_reset(self, state: Counters, keyframe: str | None, seed: int | None) -> None:
         """Record a reset that was sent and failed with an error instead of a reply."""
         self._note(state)
         self.reset = True
         self.keyframe = keyframe
+        self.seed = seed
 
     def give_back(self, applied: int) -> None:
         """Buffer the wrenches of steps that were not executed again."""
@@ -106,10 +101,3 @@ class PendingOutcomes:
         if not self:
             self.since, self.time = state.step_count, state.sim_time
         self.connects = state.session.transport.stats.connects
-
-
-def leaves_open(error: BaseException) -> bool:
-    """Return whether a request that was sent and failed with this error may have been executed."""
-    if isinstance(error, URLabRPCError):
-        return isinstance(error, _UNDECIDED)
-    return not isinstance(error, (ServerUnreachable, TypeError, ValueError))

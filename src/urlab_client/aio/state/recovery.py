@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
+
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.session import Turn
+from urlab_client.aio.session import STOP, Turn
 from urlab_client.aio.state.discovery import Discovery, look
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.protocol.client_types import Resync
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoSession, SessionTakenOver
+from urlab_client.protocol.errors import NoSession, SessionTakenOver, URLabRPCError
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 
 __all__ = ["resync"]
+
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DEFAULT) -> Resync:
@@ -29,6 +34,7 @@ async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DE
             return await _resync(state, discovery, pending, turn)
         except BaseException:
             pending.mode = state.pending.mode or pending.mode
+            pending.handshake = state.pending.handshake or pending.handshake
             state.pending = pending  # for the next attempt
             raise
 
@@ -39,6 +45,8 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
     was_reset: bool | None = None
     before: ForwardOk | None = None
     held, renewed = True, False
+    if not pending.play:  # a later start of play leaves nothing to stop
+        await _settle(state, turn, [STOP])
     try:
         reply = before = await look(turn)
     except (SessionTakenOver, NoSession):
@@ -47,9 +55,12 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         applied, was_reset = _compare(pending, before)
         # A request interrupted by a lost connection may still be in transit and reach the server later. In puppet mode
         # the next push overrides it; in other modes the server rejects it once its session has been replaced.
-        late = pending.connects != state.session.transport.stats.connects and state.mode is not StepMode.PUPPET
+        connects = state.session.transport.stats.connects
+        late = pending.connects != connects and state.mode is not StepMode.PUPPET
         renewed = late and not (applied == sent and (was_reset or not pending.reset))
-    if renewed or pending.play:
+        renewed = renewed or (bool(state.session.unsettled) and state.session.unsettled_on != connects)
+    # Without a handshake, or if one was interrupted, the client may know another world than the one that plays.
+    if renewed or pending.play or pending.handshake or state.hello is None:
         renewed = True
         await discovery.open(turn, state.level)
         reply = await look(turn)
@@ -60,9 +71,13 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         reply = await look(turn)  # in live mode the simulation has advanced meanwhile
     if reply is not None:
         if was_reset:
+            state.reset_seed = pending.seed
             state.absorb_reset(reply, pending.keyframe)
         else:
             state.absorb(reply, "forward", into_mirror=state.mode is not StepMode.PUPPET)
+        await _settle(state, turn, list(state.session.unsettled))
+        if state.publishers.camera_switch is not None:
+            await turn.aside(state.publishers.camera_switch.settle())
     if applied is not None:
         pending.give_back(applied)
     return Resync(
@@ -76,6 +91,15 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         reset_applied=was_reset,
         settled=applied == sent or not pending.queued,
     )
+
+
+async def _settle(state: SimState, turn: Turn, subjects: Iterable[str]) -> None:
+    for what in subjects:
+        if (settle := state.session.unsettled.get(what)) is not None:
+            try:
+                await settle(turn)
+            except URLabRPCError as refusal:  # which tells, too
+                log.info("%s was in doubt: %s", what, refusal)
 
 
 def _compare(pending: PendingOutcomes, reply: ForwardOk) -> tuple[int | None, bool | None]:

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from urlab_client.aio.arguments import mapping, text
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite
-from urlab_client.aio.session import Turn
-from urlab_client.aio.state.pending_outcomes import leaves_open
+from urlab_client.aio.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.errors import UnknownKeyframe
 from urlab_client.protocol.messages.session import Reset, ResetOk
@@ -44,7 +43,7 @@ async def take_reset(
         state.absorb_reset(reply, request.keyframe_name)
     except BaseException as error:
         if turn.sent and leaves_open(error):
-            state.pending.add_reset(state, request.keyframe_name)
+            state.pending.add_reset(state, request.keyframe_name, seed)
         raise
     state.pending.clear()
     return reply

@@ -52,10 +52,10 @@ class SceneObjects:
         self._mirror = mirror
         self._motion = motion
 
-    def bind(self, hello: HelloOk, examined: Examined) -> None:
-        """Adopt the contents of a handshake."""
-        self._bind_articulations(hello, examined)
-        self._bind_entities(examined)
+    def bind(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
+        """Adopt the contents of a handshake; `keep` says whether the known state is also that of its world."""
+        self._bind_articulations(hello, examined, keep=keep)
+        self._bind_entities(examined, keep=keep)
         cameras = hello.global_cameras or {}
         self.global_cameras = NameMap({n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera")
 
@@ -147,7 +147,7 @@ class SceneObjects:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
             view.delivered = id(view) in delivered
 
-    def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
+    def _bind_articulations(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
         wrappers: dict[str, URLabArticulation] = {}
         aliases: dict[str, list[str]] = {}
         for info in hello.articulations:
@@ -157,7 +157,7 @@ class SceneObjects:
             if record is None:
                 record = self.records[key] = MirroredArticulation(self._mirror, info, layout)
             else:
-                record.bind(info, layout)
+                record.bind(info, layout, keep=keep)
             wrappers[key] = self.articulations.get(key) or URLabArticulation(
                 record, self._session, self._publishers, self._motion
             )
@@ -168,12 +168,12 @@ class SceneObjects:
         self.articulations = NameMap(wrappers, aliases, kind="articulation")
         self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
 
-    def _bind_entities(self, examined: Examined) -> None:
+    def _bind_entities(self, examined: Examined, *, keep: bool) -> None:
         plain: dict[str, URLabEntity] = {}
         records: dict[str, MirroredEntity] = {}
         for name, info in examined.entities.items():
             record = self.entity_records.get(name) or MirroredEntity(self._mirror, name)
-            record.bind_entity(info)
+            record.bind_entity(info, keep=keep)
             records[name] = record
             known = self.entities.get(name)
             plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)

@@ -12,6 +12,7 @@ import asyncio
 import logging
 from typing import Final
 
+from urlab_client.aio.background import background_task
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
@@ -55,17 +56,25 @@ class SessionKeeper:
         self._given_up = ""  # id of a session that another client has taken over
 
     def start(self) -> None:
-        """Keep the current session and its successors open. Call from the event loop. Idempotent."""
+        """Keep the current session and its successors open. Call from the event loop. Idempotent.
+
+        If it fails, calls name the reason until this is called again.
+        """
         if self._task is None or self._task.done():
             kinds = (ServerLost, SessionLost, PlayStarted)
             events = self._state.publishers.events.stream(kinds, 100)
-            self._task = asyncio.create_task(self._run(events), name="urlab-keeper")
+            session = self._session
+            session.unkept = None
+            self._task = background_task("urlab-keeper", self._run(events), tell=session.tell, failed=self._die)
 
     async def aclose(self) -> None:
         """Stop keeping the session. Idempotent."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait((self._task,))
+
+    def _die(self, error: URLabError) -> None:
+        self._session.unkept = error
 
     async def _run(self, events: Stream[ClientEvent]) -> None:
         while True:

@@ -77,8 +77,10 @@ class SimState:
         mode_word: Name of the step mode in the server's last reply that contains it.
         level: Observation level of the session.
         paused: Whether this client has paused physics and nothing has resumed it since.
+        recording: Whether this client has started a recording that nothing has ended since.
         sent_level: Observation level in the server, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
+        located: Whether the state is known exactly: a reply or snapshot has brought it since the last handshake.
         step_count: Steps since the last handshake or reset.
         reset_seed: Seed of the last reset, or None without one.
         sim_time: Simulation time of the last reply, seconds.
@@ -111,8 +113,10 @@ class SimState:
         self.mode_word = ""
         self.level = "standard"
         self.paused: bool = False
+        self.recording: bool = False
         self.sent_level: str = "standard"
         self.hello: HelloOk | None = None
+        self.located: bool = False
         self.step_count: int = 0
         self.reset_seed: int | None = None
         self.sim_time: float = 0.0
@@ -271,7 +275,7 @@ class SimState:
         received = time.time_ns()
         self._take_over(reply, self._checked(reply, op), received, into_mirror=into_mirror)
 
-    def absorb_found(self, reply: StateReply, op: str) -> None:
+    def absorb_found(self, reply: StateReply | StateSnapshot, op: str) -> None:
         """Apply the state found after a handshake; raise the same errors as `absorb`.
 
         Do not notify observers: the simulation has not changed.
@@ -321,6 +325,7 @@ class SimState:
 
     def _write(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
         articulations, entities, pictures = parts
+        self.located = True
         with self.mirror.lock:
             for record, state in articulations:
                 record.absorb(state, into_mirror=into_mirror)
@@ -400,6 +405,7 @@ class SimState:
         if isinstance(refusal, NoActiveManager):
             self.on_play_ended("stopped by another client or in the editor")
         elif isinstance(refusal, SessionTakenOver):
+            self.session.unsettled.clear()  # by a restart of the server, or another client changes what it likes
             self.publishers.events.publish(SessionLost(session_id=self.session.session_id, reason=refusal.message))
 
     def on_play_ended(self, reason: str = "") -> None:
@@ -412,7 +418,8 @@ class SimState:
         if self.publishers.camera_switch is not None:
             self.publishers.camera_switch.forget()
         self.mode = StepMode.LIVE
-        self.paused = False
+        self.paused = self.recording = False
+        self.session.unsettled.clear()
         self.promoted_from = None
         if played:
             self.publishers.events.publish(PlayEnded(reason=reason))

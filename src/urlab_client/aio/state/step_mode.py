@@ -8,8 +8,7 @@ from collections.abc import AsyncGenerator
 
 import anyio
 
-from urlab_client.aio.session import Turn
-from urlab_client.aio.state.pending_outcomes import leaves_open
+from urlab_client.aio.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.protocol.errors import BadMode, ModeLocked
@@ -55,8 +54,9 @@ async def ask_mode(state: SimState, turn: Turn, mode: StepMode | str) -> StepMod
             await _pause_in_puppet(turn, previous if isinstance(previous, StepMode) else state.mode, current)
     finally:
         state.mode = current
-        if current is not StepMode.LIVE:
-            state.paused = False  # a change of mode resumes physics
+        if current is not StepMode.LIVE and previous is not current:  # a change of mode resumes physics
+            state.paused = False
+            state.session.unsettled.pop("pause", None)
     return previous
 
 
@@ -141,8 +141,11 @@ async def _pause_in_puppet(turn: Turn, previous: StepMode, current: StepMode) ->
         await turn.call(SetPaused(paused=False))
 
 
-async def promote(state: SimState, turn: Turn, mode: StepMode) -> None:
+async def promote(state: SimState, turn: Turn, mode: StepMode) -> bool:
     """Switch the server to the step mode that the client was created with, and record the mode to restore.
+
+    Returns:
+        Whether the server was in another mode.
 
     Raises:
         ModeLocked: The project pins another mode.
@@ -154,10 +157,12 @@ async def promote(state: SimState, turn: Turn, mode: StepMode) -> None:
         if locked.pinned is not None:
             raise
         state.assume_mode(mode)  # the reply to the first step shows the pinned mode
-        return
+        return False
     except BaseException as error:
         if leaves_open(error) and state.promoted_from is None:
             state.promoted_from = StepMode.LIVE  # play begins in live mode; the reply was lost
         raise
-    if previous is not state.mode:
+    changed = previous is not state.mode
+    if changed:
         state.promoted_from = previous
+    return changed

@@ -7,18 +7,17 @@ from collections.abc import Mapping
 
 from urlab_client.aio.arguments import mapping
 from urlab_client.aio.model.articulation_state import Carried, give_back
-from urlab_client.aio.session import Turn
-from urlab_client.aio.state.pending_outcomes import leaves_open
+from urlab_client.aio.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
 from urlab_client.aio.state.step_mode import settle_mode
 from urlab_client.aio.state.step_pictures import StepPictures
-from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.codec import check_finite, op_of
 from urlab_client.protocol.enums import CameraTiming, StepMode
 from urlab_client.protocol.errors import StepTimeout, URLabError
 from urlab_client.protocol.messages.session import Step, StepOk
 
-__all__ = ["take_steps"]
+__all__ = ["send_step", "take_steps"]
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
@@ -71,6 +70,15 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     if pictures is not None:
         pictures.account(reply, came=state.mode is not StepMode.LIVE)
     return reply
+
+
+async def send_step(state: SimState, turn: Turn, request: Step) -> StepOk:
+    """Send a step as it is, within a turn, in which nobody else changes the mode."""
+    check_finite(request)  # a hot op: its request is not checked again before it is sent
+    await settle_mode(state, turn)
+    if request.n_steps < 1 and state.mode is StepMode.DIRECT:
+        raise ValueError(_too_few(request.n_steps, state.mode))  # the server would take one
+    return await turn.call(request)
 
 
 def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int, carried: Carried) -> None:

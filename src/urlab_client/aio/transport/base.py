@@ -62,6 +62,11 @@ class RequestTransport(Protocol):
         """Whether a server is connected."""
         ...
 
+    @property
+    def owed(self) -> bool:
+        """Whether the server has yet to answer a request whose caller gave up, so that it may still execute it."""
+        ...
+
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:

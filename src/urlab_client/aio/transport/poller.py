@@ -15,9 +15,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from weakref import WeakMethod
 
+from urlab_client.aio.background import Tell, background_thread
 from urlab_client.aio.transport.readiness import watch_socket
 from urlab_client.protocol import doorbell
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["Doorbell", "Poller", "RegionPoll", "ReplyPoll", "StreamPoll"]
 
@@ -84,14 +88,16 @@ class StreamPoll(RegionPoll):
 
 
 class Poller:
-    """The polling thread. Use from one event loop.
+    """The polling thread. Use from one event loop. If it dies, the next watch starts another one.
 
     Args:
         loop: The event loop.
+        tell: Publishes the event of its death; a method of something that the client owns.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, tell: Tell | None) -> None:
         self._loop = loop
+        self._tell = None if tell is None else WeakMethod(tell)  # the thread keeps no client that was forgotten
         self._changed = threading.Condition()
         self._watches: list[RegionPoll] = []
         self._thread: threading.Thread | None = None
@@ -102,7 +108,7 @@ class Poller:
         with self._changed:
             self._watches.append(watch)
             if self._thread is None and not self._closed:
-                self._thread = threading.Thread(target=self._run, name="urlab-shm", daemon=True)
+                self._thread = background_thread("urlab-shm", self._run, tell=self._report, failed=self._die)
                 self._thread.start()
             self._changed.notify()
 
@@ -121,6 +127,16 @@ class Poller:
             thread = self._thread
         if thread is not None:
             thread.join(2 * _BLOCK_S)
+
+    def _report(self, event: ClientEvent) -> None:
+        tell = None if self._tell is None else self._tell()
+        if tell is not None:
+            tell(event)
+
+    def _die(self, error: URLabError) -> None:
+        # The watches remain: their owners also look at the regions themselves, a few times a second.
+        with self._changed:
+            self._thread = None
 
     def _run(self) -> None:
         while True:

@@ -16,11 +16,15 @@ from weakref import WeakValueDictionary
 
 import zmq
 
+from urlab_client.aio.background import Tell, background_thread
+from urlab_client.protocol.messages.streams import ClientEvent
+
 __all__ = ["Readiness", "Watchable", "watch_socket"]
 
 # Interval of the thread's checks whether the loop was closed while clients were open.
 _CHECK_MS: Final = 1000
 _JOIN_S: Final = 1.0
+_AGAIN_S: Final = 1.0
 
 _DRAIN_BYTES: Final = 4096
 _POLLIN: Final = int(zmq.POLLIN)
@@ -52,6 +56,7 @@ def watch_socket(
     on_readable: Callable[[], object],
     *,
     awaited: Callable[[], bool] | None = None,
+    tell: Tell | None = None,
 ) -> Readiness:
     """Call `on_readable` on the event loop whenever a socket is readable.
 
@@ -62,11 +67,12 @@ def watch_socket(
         awaited: Callback that returns whether anything is expected. A watching thread is active only from `expect`
             until this returns False, because waking the thread would delay a reply that the loop polls for itself. None
             to watch always.
+        tell: Publishes the event that a watching thread died. Another one follows after a pause.
     """
     try:
         loop.add_reader(watched.fileno(), on_readable)
     except NotImplementedError:
-        return _Watched(_Watcher.of(loop), watched.fileno(), on_readable, awaited)
+        return _Watched(_Watcher.of(loop), watched.fileno(), on_readable, awaited, tell)
     return _Reader(loop, watched.fileno())
 
 
@@ -93,9 +99,15 @@ class _Watched:
     """A socket that the thread watches."""
 
     def __init__(
-        self, watcher: _Watcher, fd: int, on_readable: Callable[[], object], awaited: Callable[[], bool] | None
+        self,
+        watcher: _Watcher,
+        fd: int,
+        on_readable: Callable[[], object],
+        awaited: Callable[[], bool] | None,
+        tell: Tell | None,
     ) -> None:
         self.fd = fd
+        self.tell_event = tell
         self._watcher = watcher
         self._on_readable = on_readable
         self._awaited = awaited
@@ -144,8 +156,7 @@ class _Watcher:
         self._ended = False
         self._rung = False
         self._bell, self._button = socket.socketpair()
-        self._thread = threading.Thread(target=self._run, name="urlab-sockets", daemon=True)
-        self._thread.start()
+        self._start()
 
     @classmethod
     def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
@@ -174,6 +185,8 @@ class _Watcher:
         if last:
             self._forget()
             self._thread.join(_JOIN_S)
+            if not self._thread.is_alive():
+                self._finish()  # as it has done itself, unless it died
 
     def _ring(self) -> None:
         if not self._rung:
@@ -184,9 +197,27 @@ class _Watcher:
         if self._of_loops.get(self._loop) is self:
             del self._of_loops[self._loop]
 
+    def _start(self) -> None:
+        self._thread = background_thread("urlab-sockets", self._run, tell=self._on_death)
+        self._thread.start()
+
+    def _on_death(self, event: ClientEvent) -> None:
+        for watched in tuple(self._armed.values()):
+            if watched.tell_event is not None:
+                watched.tell_event(event)
+        self._loop.call_later(_AGAIN_S, self._begin_again)
+
+    def _begin_again(self) -> None:
+        if not self._ended:
+            self._rung = False  # the thread may have died between reading and noting it
+            self._start()
+
     def _run(self) -> None:
         while self._look():
             pass
+        self._finish()
+
+    def _finish(self) -> None:
         with self._lock:
             self._rung = True  # suppresses any further ring
             self._armed.clear()

@@ -60,6 +60,8 @@ class RegionChannel:
 
     Attributes:
         limit: Size of the largest payload that fits in both directions, bytes.
+        dirty: Whether an old reply may still be to come.
+        abandoned_at: Loop time at which the caller of this client's last request gave up, until the channel is clean.
     """
 
     def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
@@ -75,6 +77,7 @@ class RegionChannel:
         self.reply_event: NamedEvent = NamedEvent(reply_event)
         # A client that crashed may have left a request whose reply is still outstanding.
         self.dirty: bool = True
+        self.abandoned_at: float | None = None
         self.seen: int = 0
         self._token = ""
         self._asked_at = 0.0
@@ -111,6 +114,7 @@ class RegionChannel:
             answer = envelope_of(found.payload)
             if answer.code == "session_expired" and self._token in answer.message:
                 self.dirty = False
+                self.abandoned_at = None
                 self._token = ""
         return not self.dirty
 

@@ -338,8 +338,8 @@ class Regions:
             return
         for handler in handlers:
             if handler in reader.handlers:
-                handler.on_message(reader.place.topic, payload)
-                handler.on_drained()
+                handler.take(reader.place.topic, payload)
+                handler.drain()
 
     def _lose(self, reader: _RegionReader) -> None:
         """Continue without a region."""
@@ -374,6 +374,8 @@ class Regions:
 
     def _supervise(self) -> None:
         self._timer = None
+        if self._wanted and self._loop is not None:  # first, whatever happens below
+            self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
         now = self._now()
         for reader in tuple(self._readers.values()):
             self._rouse(reader)
@@ -390,8 +392,6 @@ class Regions:
                     for handler in handlers:
                         self._subscribe(handler)
         self._settle_all()
-        if self._wanted and self._loop is not None:
-            self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
         for reader in tuple(self._readers.values()):
             if not self._wanted:
                 self._close_reader(reader)

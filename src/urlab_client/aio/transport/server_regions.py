@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path, PurePath
 
+from urlab_client.aio.background import Tell
 from urlab_client.aio.transport.poller import Doorbell, Poller
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError, URLabConnectionError
@@ -28,10 +29,12 @@ class SharedMemoryRegions:
     Attributes:
         directory: Directory of `state.shm`; None until a server reports it.
         rung: Callbacks for each ring of the doorbell, by kind.
+        tell: Publishes an event of the client.
     """
 
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
+        self.tell: Tell | None = None
         # Replies last, because the task that waits for one resumes within the callback.
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
         self._told: dict[str, Path] = {}  # files that the server names explicitly, by region
@@ -45,7 +48,7 @@ class SharedMemoryRegions:
     def waiter(self) -> Poller:
         """The polling thread, used without a doorbell."""
         if self._waiter is None:
-            self._waiter = Poller(asyncio.get_running_loop())
+            self._waiter = Poller(asyncio.get_running_loop(), self.tell)
         return self._waiter
 
     @property

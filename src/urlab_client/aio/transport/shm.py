@@ -3,6 +3,10 @@
 The plugin executes a request and then drops its reply if that does not fit its slot, and replies carry no number. So
 the transport is chosen before sending and a request is sent only once. After a request without a reply, shared memory
 stays unused until an exchange without side effects has shown that no old reply is outstanding.
+
+The server serves shared memory and ZeroMQ in two threads, so a request could overtake an earlier one whose caller gave
+up. Behind one on ZeroMQ the next request also takes ZeroMQ; behind one in shared memory it waits until that exchange
+has shown that the server is done with it.
 """
 
 from __future__ import annotations
@@ -46,6 +50,9 @@ _GROWTH = 8
 _NOT_READY_S = 0.5
 _RETRY_S = 1.0
 _SETTLE_S = 0.5
+_SETTLE_LOOK_S = 1e-3
+# No request over shared memory takes this long, so nothing reads these regions any more.
+_DEAD_S = 30.0
 _IDLE_S = 0.5
 # Poll at this interval in any case, so that a lost ring delays a reply no longer.
 _GLANCE_S = 0.05
@@ -113,6 +120,11 @@ class ShmTransport:
         """Whether a server is connected."""
         return self._inner.connected
 
+    @property
+    def owed(self) -> bool:
+        """See `RequestTransport.owed`."""
+        return self._inner.owed or (self._channel is not None and self._channel.abandoned_at is not None)
+
     async def follow(self, hello: HelloOk) -> None:
         """Open the regions that a handshake names.
 
@@ -152,15 +164,19 @@ class ShmTransport:
         self._memory.connect_bell()
         give_up = loop.time() + _SETTLE_S
         while self._settling(channel) and loop.time() < give_up:  # noqa: ASYNC110 - a region has no event
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(_SETTLE_LOOK_S)
 
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
+        if self._channel is not None and self._channel.abandoned_at is not None:
+            await self._let_it_end(op, deadline)
         way = way_of(op)
         pictures = way.pictures and b"include_cameras" in frame
         detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
+        if not detour and self._inner.owed:
+            detour = "behind an abandoned request"
         channel = None
         if not detour:
             loop = asyncio.get_running_loop()
@@ -228,6 +244,29 @@ class ShmTransport:
     def _settling(self, channel: RegionChannel) -> bool:
         """Return whether `channel` is still in use, free of other tasks' requests, and not yet clean."""
         return self._channel is channel and self._pending is None and not self._is_clean(channel)
+
+    async def _let_it_end(self, op: Op, deadline: float | None) -> None:
+        """Wait until the server is done with the request whose caller gave up.
+
+        Raises:
+            URLabTimeoutError: It was not done by the deadline.
+        """
+        loop = asyncio.get_running_loop()
+        while (channel := self._channel) is not None and (since := channel.abandoned_at) is not None:
+            now = loop.time()
+            if self._usable_channel(now) is not None:
+                return
+            if now > since + _DEAD_S:
+                self._drop("no answer in shared memory")
+            elif deadline is not None and now >= deadline:
+                raise URLabTimeoutError(
+                    f"{op.name}: the server has not answered an abandoned request in shared memory yet, which this one "
+                    "must not overtake. Nothing was sent.",
+                    op=op.name,
+                    hint="The server is busy or blocked; allow more time with timeout=…",
+                )
+            else:
+                await asyncio.sleep(_SETTLE_LOOK_S)
 
     def _is_clean(self, channel: RegionChannel) -> bool:
         try:
@@ -300,6 +339,9 @@ class ShmTransport:
                 if self._glances is None:
                     self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
             answer = await pending.future
+        except BaseException:
+            channel.abandoned_at = loop.time()
+            raise
         finally:
             if pending.watch is not None:
                 self._unwatch()
@@ -325,10 +367,10 @@ class ShmTransport:
         pending = self._pending
         if pending is None:
             return
+        self._glances = loop.call_later(_GLANCE_S, self._glance, loop)  # first, whatever happens below
         self._look()
         if not pending.future.done() and self._channel is not None and self._channel.replaced():
             self._drop("the regions were replaced")
-        self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
 
     def _watch(self) -> None:
         """Let the thread poll for the reply."""

@@ -56,7 +56,32 @@ class MessageGone(ProtocolError):
 
 
 class MessageHandler(ABC):
-    """Receives the messages of a subscription. Called on the event loop; must not block or raise."""
+    """Receives the messages of a subscription. Called on the event loop; must not block.
+
+    Receivers call `take` and `drain`, so that an error in one handler costs the others nothing.
+    """
+
+    _errors = 0
+
+    def take(self, topic: bytes, payload: BytesLike) -> None:
+        """Call `on_message`; an error is logged and reported to `on_malformed`."""
+        try:
+            self.on_message(topic, payload)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the other handlers are none the worse
+            self._blame(error)
+
+    def drain(self) -> None:
+        """Call `on_drained`; see `take`."""
+        try:
+            self.on_drained()
+        except Exception as error:  # noqa: BLE001 - likewise
+            self._blame(error)
+
+    def _blame(self, error: Exception) -> None:
+        self._errors += 1
+        if self._errors & (self._errors - 1) == 0:  # ever more rarely
+            log.error("a message could not be handled (%d so far)", self._errors, exc_info=error)
+        self.on_malformed(f"{type(error).__name__}: {error}")
 
     @abstractmethod
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
@@ -75,6 +100,9 @@ class MessageHandler(ABC):
 
     def on_connection(self, connected: bool) -> None:  # noqa: B027 - most handlers need not know
         """Handle that the connection was opened or lost."""
+
+    def on_refusal(self) -> None:  # noqa: B027 - most handlers wait until the publisher is there
+        """Handle that an attempt to open the first connection failed."""
 
     def on_gap(self, why: str) -> None:  # noqa: B027 - a handler that keeps only the newest misses nothing
         """Handle that messages are missing before the next one."""
@@ -202,7 +230,7 @@ class _Subscriber:
             if not drained and not self._closed:
                 self._loop.call_soon(self._on_readable)
         for handler in touched:
-            handler.on_drained()
+            handler.drain()
 
     def _take(self, topic: bytes, touched: dict[MessageHandler, None]) -> int:
         """Receive the rest of a message, which has fully arrived, and deliver it to its handlers. Return its size."""
@@ -226,7 +254,7 @@ class _Subscriber:
                 handler.on_malformed(f"topic {topic[:64]!r}: {2 + extra if extra else 1} frames, expected 2.")
             else:
                 touched[handler] = None
-                handler.on_message(topic, payload)
+                handler.take(topic, payload)
         return 0 if payload is None else len(payload)
 
     def _route(self, topic: bytes) -> tuple[MessageHandler, ...]:
@@ -267,6 +295,9 @@ class _Subscriber:
             self.obstacle = (
                 f"{obstacle}. {SERVER_KEY_HINT}" if event in connection_status.FAILED_HANDSHAKES else obstacle
             )
+            if event is not zmq.Event.CONNECTED:  # the handshake may still follow
+                for handler in tuple(self._handlers):
+                    handler.on_refusal()
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
             # ZeroMQ does not retry on its own, but the server may learn the key.
             self._loop.call_later(connection_status.RECONNECT_MAX_MS / 1000, self._reconnect)

@@ -104,7 +104,8 @@ class ZmqTransport:
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
         self._sent: dict[bytes, _Sent] = {}
-        self._late: dict[bytes, asyncio.Future[bytes]] = {}
+        self._late: tuple[bytes, asyncio.Future[bytes]] | None = None  # id of the last abandoned handshake, its reply
+        self._abandoned = b""  # id of the last request whose caller gave up, until a reply shows that it is done
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
         self._send: _Send | None = None
@@ -133,6 +134,11 @@ class ZmqTransport:
     def connected(self) -> bool:
         """Whether a server is connected."""
         return self._connected
+
+    @property
+    def owed(self) -> bool:
+        """See `RequestTransport.owed`."""
+        return bool(self._abandoned)
 
     async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
@@ -177,6 +183,8 @@ class ZmqTransport:
                 self._replies.expect()
             answer = await reply
         except (asyncio.CancelledError, URLabTimeoutError):
+            if self._connected and not _answered(reply):
+                self._abandoned = key
             if late is not None:
                 late(self._reply_to_come(key, reply))
             raise
@@ -241,7 +249,7 @@ class ZmqTransport:
             shared_context.give_back(context)
             raise ValueError(f"{self._endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
         self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
-        self._events = watch_socket(loop, monitor, self._on_event)
+        self._events = watch_socket(loop, monitor, self._on_event, tell=self._tell)
         self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
         send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
@@ -250,18 +258,19 @@ class ZmqTransport:
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
         """Return a future for the reply to a request that its caller has abandoned."""
-        if reply.done() and not reply.cancelled() and reply.exception() is None:
+        if _answered(reply):
             return reply  # it arrived in the loop iteration that cancelled the caller
         coming: asyncio.Future[bytes] = reply.get_loop().create_future()
         if self._connected:
-            self._late[key] = coming
+            self._forget_late()
+            self._late = key, coming
         else:
             coming.cancel()
         return coming
 
     def _awaited(self) -> bool:
         """Return whether a reply is expected, possibly to an abandoned request."""
-        pending = self._late or any(not entry.reply.done() for entry in self._sent.values())
+        pending = self._abandoned or any(not entry.reply.done() for entry in self._sent.values())
         return self._silent_since is not None or bool(pending)
 
     async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
@@ -364,6 +373,10 @@ class ZmqTransport:
             if (silent := self._silent_since) is not None and self._loop is not None:
                 self._silent_since = None
                 self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=self._loop.time() - silent))
+            if self._abandoned and key >= self._abandoned:
+                self._abandoned = b""  # the server answers the requests of a connection in their order
+            if self._late is not None and key > self._late[0]:
+                self._forget_late()
             entry = self._sent.get(key)
             if entry is None or entry.reply.done():
                 self._deliver_late(key, last.bytes)
@@ -376,11 +389,17 @@ class ZmqTransport:
             entry.reply.set_result(last.bytes)
 
     def _deliver_late(self, key: bytes, answer: bytes) -> None:
-        if (late := self._late.pop(key, None)) is not None:
+        if self._late is not None and self._late[0] == key:
             self.stats.late += 1
-            late.set_result(answer)
+            self._late[1].set_result(answer)
+            self._late = None
         else:
             self._drop_stray()
+
+    def _forget_late(self) -> None:
+        if self._late is not None:
+            self._late[1].cancel()
+            self._late = None
 
     def _drop_stray(self) -> None:
         self.stats.late += 1
@@ -469,7 +488,10 @@ class ZmqTransport:
 
     def _tell(self, event: ClientEvent) -> None:
         if self.on_event is not None:
-            self.on_event(event)
+            try:
+                self.on_event(event)
+            except Exception:  # what waits for this connection must hear of its loss all the same
+                log.exception("%r could not be handled", event)
 
     def _lost(self, entry: _Sent) -> URLabError:
         name = entry.op.name
@@ -495,12 +517,15 @@ class ZmqTransport:
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
-        for late in self._late.values():
-            late.cancel()
-        self._late.clear()
+        self._forget_late()
+        self._abandoned = b""
         for entry in self._sent.values():
             if not entry.reply.done():
                 entry.reply.set_exception(error(entry))
+
+
+def _answered(reply: asyncio.Future[bytes]) -> bool:
+    return reply.done() and not reply.cancelled() and reply.exception() is None
 
 
 def _ms(seconds: float) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import copy
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
 
+from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
@@ -70,6 +72,7 @@ class Follower(ClientObserver):
         self._put: Callable[[State | CameraPicture], None] | None = None
         self._room: Callable[[], Awaitable[None]] | None = None
         self._lost: Callable[[int], None] | None = None
+        self._failed: Callable[[URLabError], None] = lambda _: None
         self._scene: SceneMessages | None = None
         self._described: object = None
         self._due_at: int | None = None
@@ -109,6 +112,7 @@ class Follower(ClientObserver):
         *,
         room: Callable[[], Awaitable[None]] | None = None,
         lost: Callable[[int], None] | None = None,
+        failed: Callable[[URLabError], None],
     ) -> None:
         """Start passing on items.
 
@@ -116,8 +120,9 @@ class Follower(ClientObserver):
             put: Called with each item on the event loop; must be fast.
             room: Returns when there is space for the items of another step, or after a limit.
             lost: Called with the number of pictures that were due but missing in a step.
+            failed: Called with an unexpected error, after which states or pictures are missing.
         """
-        self._put, self._room, self._lost = put, room, lost
+        self._put, self._room, self._lost, self._failed = put, room, lost, failed
         self._client.add_observer(self)
         if self._client.step_mode is StepMode.LIVE:
             self._listen()
@@ -241,24 +246,25 @@ class Follower(ClientObserver):
         """Follow the streams, because live mode has no state in replies."""
         scene = self._current()
         self._live = True
-        self._begin(self._follow_states())
+        self._begin(self._follow_states)
         self._follow_cameras(scene)
 
     def _follow_cameras(self, scene: SceneMessages) -> None:
         """Follow this scene's cameras instead of the previous ones."""
         for task in self._camera_tasks:
             task.cancel()
-        self._camera_tasks = [self._begin(self._follow_camera(camera)) for camera in scene.cameras.values()]
+        self._camera_tasks = [self._begin(partial(self._follow_camera, camera)) for camera in scene.cameras.values()]
 
-    def _begin(self, following: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.create_task(following, name="urlab-feed")
+    def _begin(self, follow: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
+        task = background_task("urlab-feed", self._following(follow), failed=self._failed)
         self._tasks.add(task)
-        task.add_done_callback(self._on_end)
+        task.add_done_callback(self._tasks.discard)
         return task
 
-    def _on_end(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
+    async def _following(self, follow: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await follow()
+        except URLabError as error:
             log.warning("%s: a stream was not read to its end: %s", self._name, error)
 
     def _ignore(self) -> None:

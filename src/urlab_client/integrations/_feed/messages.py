@@ -6,10 +6,10 @@ those named `urlab.*` are specific to this project and can be plotted there.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from urlab_client.protocol.base import Floats
 
@@ -19,6 +19,7 @@ __all__ = [
     "CompressedImage",
     "ContactMessage",
     "ContactsMessage",
+    "Count",
     "EntityMessage",
     "EpisodeOutcome",
     "FrameTransform",
@@ -40,11 +41,15 @@ __all__ = [
 _NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as in protobuf's JSON
 
 
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""A number of things, or a number in a row."""
+
+
 class Time(Struct, frozen=True):
     """A time on the recording's clock."""
 
-    sec: int
-    nsec: int
+    sec: Count
+    nsec: Count
 
     @classmethod
     def of(cls, nanoseconds: int) -> Time:
@@ -98,9 +103,9 @@ class ArticulationMessage(Struct, kw_only=True, omit_defaults=True):
 
     timestamp: Time
     sim_time: float
-    sample: int
-    step: int
-    episode: int
+    sample: Count
+    step: Count
+    episode: Count
     wall_time: Time
     qpos: list[float]
     qvel: list[float]
@@ -115,9 +120,9 @@ class EntityMessage(Struct, kw_only=True, omit_defaults=True):
 
     timestamp: Time
     sim_time: float
-    sample: int
-    step: int
-    episode: int
+    sample: Count
+    step: Count
+    episode: Count
     position: list[float]
     orientation: list[float]
     qvel: list[float] = []
@@ -168,10 +173,10 @@ class RawImage(Struct, frozen=True):
 
     timestamp: Time
     frame_id: str
-    width: int
-    height: int
+    width: Count
+    height: Count
     encoding: str
-    step: int
+    step: Count
     data: bytes
 
 
@@ -221,8 +226,8 @@ class EpisodeMessage(Struct, frozen=True):
     """Randomisation of the episode that begins, and its seed."""
 
     timestamp: Time
-    episode: int
-    seed: int
+    episode: Count
+    seed: Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
     varied: list[VariedQuantity]
 
 
@@ -237,7 +242,7 @@ class OutcomeMessage(Struct, frozen=True):
     """
 
     timestamp: Time
-    episode: int
+    episode: Count
     outcome: EpisodeOutcome
     goal: dict[str, list[float]]
 
@@ -246,8 +251,8 @@ class GapMessage(Struct, frozen=True):
     """Losses since the previous message of this kind, because the file could not be written fast enough."""
 
     timestamp: Time
-    states: int
-    frames: int
+    states: Annotated[int, Meta(ge=0, lt=2**32)]
+    frames: Annotated[int, Meta(ge=0, lt=2**32)]
 
 
 _FOXGLOVE = (CameraCalibration, CompressedImage, FrameTransforms, JointStates, RawImage)

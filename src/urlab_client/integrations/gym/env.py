@@ -314,5 +314,5 @@ def keyframe_option(options: dict[str, Any] | None) -> str | None:
     """
     unknown = set(options or {}) - {"keyframe"}
     if unknown:
-        raise ValueError(f"unknown reset options {', '.join(sorted(unknown))}; the only option is 'keyframe'")
+        raise ValueError(f"unknown reset options {', '.join(map(str, unknown))}; the only option is 'keyframe'")
     return None if options is None else options.get("keyframe")

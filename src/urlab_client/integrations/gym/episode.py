@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
@@ -417,7 +418,7 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     Raises:
         KeyError: The camera does not exist.
     """
-    key, slash, camera = name.partition("/")
+    key, slash, camera = text("the name of a camera", name).partition("/")
     if slash:
         return client.articulations[key].cameras[camera]
     return client.global_cameras[name]

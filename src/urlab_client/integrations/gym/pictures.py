@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import copy
 import queue
-import threading
 import weakref
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.episode import client_camera
 from urlab_client.integrations.gym.spaces import Space, camera_space
@@ -154,13 +155,16 @@ class _Thread:
         self._scene = scene
         self._backend = backend
         self._jobs: queue.SimpleQueue[tuple[Sequence[str], Visible, Future[list[Pixels]]] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="urlab-pictures", daemon=True)
+        self._failure: BaseException | None = None
+        self._thread = background_thread("urlab-pictures", self._run, failed=self._die)
         self._thread.start()
 
     def submit(self, cameras: Sequence[str], visible: Visible) -> Future[list[Pixels]]:
         """Begin to draw one copy."""
         drawn: Future[list[Pixels]] = Future()
         self._jobs.put((cameras, visible, drawn))
+        if self._failure is not None:
+            self._fail_waiting(self._failure)
         return drawn
 
     def stop(self) -> None:
@@ -172,6 +176,17 @@ class _Thread:
         """Stop the thread and wait for a limited time until it exits."""
         self.stop()
         self._thread.join(_JOIN_S)
+
+    def _die(self, error: URLabError) -> None:
+        self._failure = error
+        self._fail_waiting(error)
+
+    def _fail_waiting(self, error: BaseException) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                job = self._jobs.get_nowait()
+                if job is not None and job[2].set_running_or_notify_cancel():
+                    job[2].set_exception(error)
 
     def _run(self) -> None:
         with ExitStack() as context:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.arguments import require
 from urlab_client.protocol.base import Floats
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ class ResetNoise:
 
     def __post_init__(self) -> None:
         for name, value in (("hinge", self.hinge), ("slide", self.slide)):
+            require("reset_noise", value, Real, "a ResetNoise or a number")
             if not 0 <= value < np.inf:
                 raise ValueError(f"reset_noise must be 0 or more, not {value} for {name} joints")
 

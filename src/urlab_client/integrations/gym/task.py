@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from urlab_client.aio.arguments import collection, integer, require, text
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
@@ -306,17 +307,23 @@ class EpisodeSettings:
         """Return the effective settings. None selects the value of the task, or the default without a task.
 
         Raises:
+            TypeError: An argument has a wrong type.
             ValueError: A number is below 1, or the noise is negative.
         """
+        if task is not None:
+            require("task", task, Task, "a Task")
+        if not isinstance(observations, str | None):
+            collection("observations", observations)
         defaults = _NO_TASK if task is None else task
+        most = defaults.max_episode_steps if max_episode_steps is None else max_episode_steps
         settings = cls(
             observations=defaults.observations if observations is None else observations,
-            n_substeps=defaults.n_substeps if n_substeps is None else n_substeps,
-            max_episode_steps=defaults.max_episode_steps if max_episode_steps is None else max_episode_steps,
-            keyframe=defaults.keyframe if keyframe is None else keyframe,
+            n_substeps=integer("n_substeps", defaults.n_substeps if n_substeps is None else n_substeps),
+            max_episode_steps=None if most is None else integer("max_episode_steps", most),
+            keyframe=defaults.keyframe if keyframe is None else text("keyframe", keyframe),
             reset_noise=noise_of(defaults.reset_noise if reset_noise is None else reset_noise),
             space_mode=defaults.space_mode if space_mode is None else space_mode,
-            cameras=tuple(defaults.cameras if cameras is None else cameras),
+            cameras=tuple(collection("cameras", defaults.cameras if cameras is None else cameras)),
             articulations=defaults.articulations,
         )
         if settings.n_substeps < 1:

@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
+from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
@@ -25,7 +26,7 @@ from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone, joined
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.errors import URLabError, refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
@@ -86,7 +87,7 @@ class _Session:
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
         if self._opening is None:
-            self._opening = asyncio.create_task(self._reopen(), name="urlab-environment")
+            self._opening = background_task("urlab-environment", self._reopen())
             self._opening.add_done_callback(self._opened)
         return self._opening
 
@@ -125,9 +126,7 @@ class _Session:
             await episode.client.close()
 
     def _opened(self, task: asyncio.Task[None]) -> None:
-        self._opening = None
-        if not task.cancelled():
-            task.exception()  # a waiting reset raises it; otherwise the next reset tries again
+        self._opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
 
 class URLabVectorEnv(Vectorized):
@@ -135,9 +134,10 @@ class URLabVectorEnv(Vectorized):
 
     Each environment has its own session and, with `sim://`, its own server process. One event loop in a background
     thread sends the requests of a step concurrently. `infos` contains `step_count`, `sim_time` and `restarts` as
-    arrays, and `error` after a failure (see `Vectorized`). An environment that fails or takes too long loses its
-    client, and with `sim://` its server. Replacements start in the background. The environment returns at the first
-    reset that finds them ready within `step_timeout`; it never delays the others for longer than that.
+    arrays, and `error` after a failure (see `Vectorized`). An environment that loses its connection or takes too long
+    loses its client, too, and with `sim://` its server; one that refuses a request keeps both. Replacements start in
+    the background. The environment returns at the first reset that finds them ready within `step_timeout`; it never
+    delays the others for longer than that.
 
     At most one server per processor starts at the same time.
     """
@@ -374,7 +374,7 @@ class URLabVectorEnv(Vectorized):
                 error.add_note(f"environment {i} at {self._addresses[i]}")
                 results[i] = error
         for i, result in results.items():
-            if isinstance(result, Exception):
+            if isinstance(result, Exception) and not refused_for_good(result):
                 self._sessions[i].reopen()
         return results
 

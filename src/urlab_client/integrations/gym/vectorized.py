@@ -16,6 +16,7 @@ from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
 from urlab_client.integrations.gym.task import States, Task
+from urlab_client.protocol.errors import refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 
 __all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
@@ -122,12 +123,14 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
         Raises:
             ValueError: An option is unknown, or the mask or list has the wrong length.
+            URLabRPCError: A server refused the reset of its environment, for example because it has no such keyframe.
+                The other environments were reset.
         """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(f"reset_mask needs {self.num_envs} booleans, at least one of them true")
-        self._keyframe = keyframe_option(options)
+        keyframe = keyframe_option(options)
         seeds = (
             [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
         )
@@ -137,8 +140,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
                 self._rngs[i] = np.random.default_rng(seeds[i])
-        errors = self._start(np.flatnonzero(mask))
+        errors = self._start(np.flatnonzero(mask), keyframe)
         self._started = True
+        refusal = next(filter(refused_for_good, errors.values()), None)
+        if refusal is not None:
+            raise refusal
+        self._keyframe = keyframe
         infos = self._infos(errors)
         self._add_success(infos, np.flatnonzero(~self._ended))
         return self._disturbed_observations(), infos
@@ -201,9 +208,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         found[: len(self._disturbances)] = [disturbances.seed for disturbances in self._disturbances]
         return found
 
-    def _start(self, indices: Indices) -> Mapping[int, Exception]:
+    def _start(self, indices: Indices, keyframe: str | None) -> Mapping[int, Exception]:
         self._begin(indices)
-        found = self._reset_some(indices, self._keyframe)
+        found = self._reset_some(indices, keyframe)
         self._store_reset(indices, found)
         return found[1]
 
@@ -238,7 +245,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             final[i] = _pick(self._sensed if self._observations_disturbed else self._observations, int(i))
-        errors = self._start(np.flatnonzero(ended))
+        errors = self._start(np.flatnonzero(ended), self._keyframe)
         after = self._infos({**_errors_in(infos), **errors})
         if "success" in infos:
             after["success"], after["_success"] = infos["success"].copy(), infos["_success"].copy()

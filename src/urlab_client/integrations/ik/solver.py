@@ -19,7 +19,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.names import unknown_name
+from urlab_client.protocol.names import split_prefix, unknown_name
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
@@ -121,7 +121,7 @@ class InverseKinematics:
         kind, name = ("site", site) if site is not None else ("body", body or "")
         self.frame: str = name
         self._kind = kind
-        self._id = _frame_id(model, self._robot, kind, name)
+        self._id = self._robot.bodies[name].id if kind == "body" else _frame_id(client, self._robot, name)
         root = int(model.site_bodyid[self._id]) if kind == "site" else self._id
         held = _held(self._robot, _chain(model, root), None if joints is None else [*joints], f"{kind} {name!r}")
         self.joints: tuple[str, ...] = tuple(held)
@@ -305,15 +305,18 @@ def _robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulat
     return next(iter(robots.values()))
 
 
-def _frame_id(model: mujoco.MjModel, robot: URLabArticulation | AsyncArticulation, kind: str, name: str) -> int:
-    if kind == "body":
-        return robot.bodies[name].id
-    prefix = f"{robot.compiled_prefix}_"
-    own = {known: i for i, known in enumerate(model_names(model, "site")) if known.startswith(prefix)}
-    found = own.get(prefix + name, own.get(name))
+def own_sites(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation) -> dict[str, int]:
+    """Return the ids of a robot's sites by their short names; empty without a local model."""
+    names = [] if client.model is None else model_names(client.model, "site")
+    owned = split_prefix(names, {art.compiled_prefix for art in client.articulations.values()})
+    return {name: i for i, (owner, name) in enumerate(owned) if owner == robot.compiled_prefix}
+
+
+def _frame_id(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation, site: str) -> int:
+    sites = own_sites(client, robot)
+    found = sites.get(site, sites.get(site.removeprefix(f"{robot.compiled_prefix}_")))
     if found is None:
-        short = [known.removeprefix(prefix) for known in own]
-        raise unknown_name("site", name, short, owner=robot.name)
+        raise unknown_name("site", site, sites, owner=robot.name)
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, cast, get_args
 from urllib.parse import urlencode
 
 import msgspec
@@ -302,7 +302,7 @@ def parse_spec(text: str, source: str) -> PolicySpec:
     """
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise PolicyFileError(f"{source}: not TOML: {error}.") from None
     try:
         return msgspec.convert(raw, PolicySpec)
@@ -332,7 +332,8 @@ def _advice(raw: dict[str, Any], problem: str, where: str) -> str | None:
         if where.endswith("term") or "`term`" in problem:
             return f"Terms are {', '.join(_TERMS)}."
         index = where.partition("[")[2].partition("]")[0]
-        term = _TERMS.get(raw["observation"][int(index)].get("term")) if index.isdigit() else None
+        given: Any = raw["observation"][int(index)] if index.isdigit() else None
+        term = _TERMS.get(str(cast("dict[str, Any]", given).get("term"))) if isinstance(given, dict) else None
         return (
             None
             if term is None or "field" not in problem

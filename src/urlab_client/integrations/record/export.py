@@ -34,6 +34,7 @@ from urlab_client.integrations.record.writer import RecordingError
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
 
 _ROWS = 1_000
+_NAMES_CHARS = 32 << 20
 _CODECS = {"libx264": 90_000, "mpeg4": 60_000}
 """Ticks per second of MP4 timestamps by codec; MPEG-4 allows at most 65,535."""
 
@@ -84,7 +85,7 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
         writing = next(steps)
-        _save_table(archive, stored, lambda share: writing(int(share * size)))
+        _save_table(run, archive, stored, lambda share: writing(int(share * size)))
         for name, when in times.items():
             pictures = (picture.pixels[None] for picture in islice(run.frames(name, next(steps)), len(when)))
             try:
@@ -135,7 +136,7 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
     Raises:
         ImportError: The extra `video` is not installed.
         KeyError: The recording has no pictures of the camera.
-        RecordingError: The installed PyAV cannot write video.
+        RecordingError: The installed PyAV cannot write video, or not of these pictures.
     """
     need("av", extra="video")
     av: Any = importlib.import_module("av")
@@ -143,22 +144,27 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
     codec = next((name for name in _CODECS if name in av.codecs_available), None)
     if codec is None:
         raise RecordingError(f"{path}: this PyAV has neither {' nor '.join(_CODECS)}.")
-    ticks, count, start, last, far = _CODECS[codec], 0, 0.0, -1, 0.0
-    with replaced(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        stream: Any = container.add_stream(codec, options={"crf": "18"} if codec == "libx264" else {})
-        for picture in run.frames(camera, progress):
-            if not count:
-                start, far = picture.time, farthest(picture.pixels)
-                height, width = picture.pixels.shape[:2]
-                stream.width, stream.height = width + width % 2, height + height % 2
-                stream.pix_fmt = "yuv420p"
-                stream.time_base = stream.codec_context.time_base = Fraction(1, ticks)
-            frame: Any = av.VideoFrame.from_ndarray(even(visible(picture.pixels, far)), format="rgb24")
-            last = max(last + 1, round((picture.time - start) * ticks))
-            frame.pts, frame.time_base = last, Fraction(1, ticks)
-            container.mux(stream.encode(frame))
-            count += 1
-        container.mux(stream.encode())
+    ticks, count, start, last, far, height, width = _CODECS[codec], 0, 0.0, -1, 0.0, 0, 0
+    try:
+        with replaced(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+            stream: Any = container.add_stream(codec, options={"crf": "18"} if codec == "libx264" else {})
+            for picture in run.frames(camera, progress):
+                if not count:
+                    start, far = picture.time, farthest(picture.pixels)
+                    height, width = picture.pixels.shape[:2]
+                    stream.width, stream.height = width + width % 2, height + height % 2
+                    stream.pix_fmt = "yuv420p"
+                    stream.time_base = stream.codec_context.time_base = Fraction(1, ticks)
+                if picture.pixels.shape[:2] != (height, width):
+                    raise RecordingError(f"{run.path}: the pictures of {camera} are not all of one size.")
+                frame: Any = av.VideoFrame.from_ndarray(even(visible(picture.pixels, far)), format="rgb24")
+                last = max(last + 1, round((picture.time - start) * ticks))
+                frame.pts, frame.time_base = last, Fraction(1, ticks)
+                container.mux(stream.encode(frame))
+                count += 1
+            container.mux(stream.encode())
+    except av.FFmpegError as error:
+        raise RecordingError(f"{run.path}: the pictures of {camera} cannot be written as video: {error}.") from error
     return count
 
 
@@ -184,12 +190,14 @@ def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress 
         yield _Transitions(pieces, told)
 
 
-def _save_table(archive: zipfile.ZipFile, stored: StoredTable, told: Callable[[float], None]) -> None:
+def _save_table(run: Run, archive: zipfile.ZipFile, stored: StoredTable, told: Callable[[float], None]) -> None:
     arrays = stored.last.arrays()
     for number, name in enumerate(arrays):
         _save(archive, name, stored.parts(name), len(stored), lambda: told(number / len(arrays)))  # noqa: B023
         column = stored.last.columns.get(name)
         if column is not None:
+            if len(column.names) * max(map(len, column.names)) > _NAMES_CHARS:  # each takes the space of the longest
+                raise RecordingError(f"{run.path}: the names of the values of {name} are too long for an array.")
             _save(archive, f"{name}.names", [np.array(column.names, dtype=np.str_)], len(column.names))
 
 

@@ -1,29 +1,32 @@
 """Where the messages of an MCAP file are: from the index at its end or, in an unfinished file, from its records' heads.
 
-Opening reads no messages, and looking one up reads one block.
+Opening reads no messages, and looking one up reads one block. What a file declares is checked before memory is
+allocated for it, because files come from anywhere.
 """
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import struct
 import threading
 import zlib
+from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 
+import msgspec
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, MetadataIndex, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Metadata, MetadataIndex, Schema
 from numpy.typing import NDArray
-from zstandard import ZstdError
+from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from urlab_client.integrations._feed.scene_messages import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
@@ -38,15 +41,30 @@ CUT_OFF = "the end of the file is missing"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # with the head of its record
-_CHUNK = struct.Struct("<Q")  # its earliest time
+_CHUNK = struct.Struct("<QQQII")  # times, size and checksum of its contents, length of the compression's name
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _LISTED = struct.Struct("<HQ")
 _INDEX = struct.Struct("<HI")
 _FOOTER = struct.Struct("<BQQQI")
 _NO_CHANNELS: frozenset[int] = frozenset()
 _KEPT = 8  # blocks in memory: the one that is played, and those with the newest pictures of some cameras
+_KEPT_BYTES = 64 << 20
 _TOLD_EVERY = 16
-_BROKEN = (McapError, ZstdError, struct.error, ValueError, OverflowError, MemoryError)
+_BROKEN = (McapError, ZstdError, struct.error, ValueError, OverflowError, MemoryError, RuntimeError)  # the last by LZ4
+
+LATEST_NS: Final = 2**63 - 1
+"""The latest time, nanoseconds, that fits the tables of a recording."""
+
+# Limits on what a file can make a reader allocate. A chunk of the recorder has 1 MiB or one picture, and a picture of
+# the sky hardly takes any space.
+_CHUNK_BYTES = 64 << 20
+_CHUNK_RATIO = 100
+_LARGEST_CHUNK = 512 << 20
+_SUMMARY_BYTES = 256 << 20
+_DECLARED_BYTES = 16 << 20
+_MOST_BLOCKS = 4_000_000
+_MOST_WALKED = 10_000_000
+_NAME_CHARS = 4096
 
 Positions: TypeAlias = dict[int, NDArray[np.uint64]]
 """By channel: time, nanoseconds, and offset in the block of each message, shape (n, 2)."""
@@ -63,12 +81,14 @@ class IndexedChannel(NamedTuple):
 
 
 class RecordedMessage(NamedTuple):
-    """One message; times in nanoseconds, of the recording's clock and of the server's UTC clock."""
+    """One message: times in nanoseconds, of the recording's clock and of the server's UTC clock, and where it is."""
 
     channel: IndexedChannel
     log_time: int
     publish_time: int
     data: bytes
+    block: int
+    offset: int
 
 
 @dataclass(slots=True)
@@ -108,6 +128,7 @@ class RecordingIndex:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     _blocks: list[_Block] = field(default_factory=list[_Block])
     _schemas: dict[int, str] = field(default_factory=dict[int, str])
+    _declared: int = 0
     _kept: OrderedDict[int, _Contents] = field(default_factory=OrderedDict[int, _Contents])
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -148,14 +169,40 @@ class RecordingIndex:
     def times(self, channels: Collection[int] | None = None) -> dict[int, NDArray[np.int64]]:
         """Return the times of all messages by channel, nanoseconds, without reading the messages."""
         found: dict[int, list[NDArray[np.int64]]] = {}
+        walked = 0
         with self.path.open("rb") as file:
             for block in self._blocks:
                 if channels is None or not block.channels.isdisjoint(channels):
-                    positions = self._positions(file, block)
+                    try:
+                        positions = self._positions(file, block)
+                    except _BROKEN as error:
+                        raise self._damaged(block, error) from error
+                    walked += 0 if block.index_size else sum(map(len, positions.values()))
+                    if walked > _MOST_WALKED:
+                        raise RecordingError(f"{self.path}: more than {_MOST_WALKED} messages are in no index.")
                     for channel, rows in positions.items():
-                        if channels is None or channel in channels:
+                        if channel in self.channels and (channels is None or channel in channels):
                             found.setdefault(channel, []).append(rows[:, 0].astype(np.int64))
-        return {channel: np.concatenate(parts) for channel, parts in found.items()}
+        times = {channel: np.concatenate(parts) for channel, parts in found.items()}
+        for channel, stamps in times.items():
+            if stamps.min() < 0:
+                topic = self.channels[channel].topic
+                raise RecordingError(f"{self.path}: a message of {topic} has a time of more than {LATEST_NS} ns.")
+        return times
+
+    def unreadable(self, message: RecordedMessage, reason: object) -> RecordingError:
+        """Return the error for a message whose contents are wrong; it says which of its channel's messages that is."""
+        topic, number = message.channel.topic, 1
+        with self.path.open("rb") as file:
+            for block in self._blocks[: message.block + 1]:
+                try:
+                    rows = self._positions(file, block).get(message.channel.id)
+                except _BROKEN as error:
+                    return self._damaged(block, error)
+                if rows is not None:
+                    last = block is self._blocks[message.block]
+                    number += int((rows[:, 1] < message.offset).sum()) if last else len(rows)
+        return RecordingError(f"{self.path}: message {number} of {topic} cannot be read: {str(reason).rstrip('.')}.")
 
     def messages(self, channels: Collection[int], progress: Progress | None = None) -> Iterator[RecordedMessage]:
         """Iterate over the messages of some channels in the file's order. It ends before damage, which `damage` names.
@@ -166,14 +213,14 @@ class RecordingIndex:
         """
         wanted = frozenset(channels)
         with self.path.open("rb") as file:
-            for block in self._blocks:
+            for number, block in enumerate(self._blocks):
                 if wanted.isdisjoint(block.channels):
                     continue
                 try:
                     contents = self._read(file, block)
                     found = [rows[:, 1] for channel, rows in contents.positions.items() if channel in wanted]
                     for offset in np.sort(np.concatenate(found)).tolist() if found else ():
-                        yield self._message(contents, offset)
+                        yield self._message(number, contents, offset)
                 except _BROKEN as error:
                     self.damage = _explained(error)
                     return
@@ -188,7 +235,7 @@ class RecordingIndex:
         """
         for number, block in enumerate(self._blocks):
             if channel in block.channels and (rows := self._contents(number).positions.get(channel)) is not None:
-                return self._checked(number, int(rows[0, 1]))
+                return self._checked(number, int(rows[:, 1].min()))
         return None
 
     def newest(self, channel: int, at: int | None = None) -> RecordedMessage | None:
@@ -224,8 +271,9 @@ class RecordingIndex:
         found: list[int] = []
         for number, end in ((0, np.min), (len(self._blocks) - 1, np.max)):
             offsets = [end(rows[:, 1]) for rows in self._contents(number).positions.values()]
-            found.append(self._checked(number, int(end(offsets))).publish_time)
-        return found[0], found[1]
+            if offsets:
+                found.append(self._checked(number, int(end(offsets))).publish_time)
+        return (found[0], found[-1]) if found else (0, 0)
 
     # Blocks
 
@@ -243,29 +291,35 @@ class RecordingIndex:
             raise self._damaged(block, error) from error
         with self._lock:
             self._kept[number] = contents
-            while len(self._kept) > _KEPT:
+            sizes = [len(one.data) for one in self._kept.values()]
+            while len(sizes) > _KEPT or (len(sizes) > 1 and sum(sizes) > _KEPT_BYTES):
                 self._kept.popitem(last=False)
+                del sizes[0]
         return contents
 
     def _checked(self, number: int, offset: int) -> RecordedMessage:
         try:
-            return self._message(self._contents(number), offset)
+            return self._message(number, self._contents(number), offset)
         except _BROKEN as error:
             raise self._damaged(self._blocks[number], error) from error
 
     def _damaged(self, block: _Block, error: Exception) -> RecordingError:
         return RecordingError(f"{self.path} is damaged at byte {block.start}: {_explained(error)}.")
 
-    def _message(self, contents: _Contents, offset: int) -> RecordedMessage:
+    def _message(self, number: int, contents: _Contents, offset: int) -> RecordedMessage:
         kind, length, channel, _, log_time, publish_time = _MESSAGE.unpack_from(contents.data, offset)
         start, end = offset + _MESSAGE.size, offset + _RECORD.size + length
         if kind != Opcode.MESSAGE or not start <= end <= len(contents.data) or channel not in self.channels:
             raise ValueError("the index of a chunk does not fit it")
-        return RecordedMessage(self.channels[channel], log_time, publish_time, contents.data[start:end])
+        if max(log_time, publish_time) > LATEST_NS:
+            raise ValueError(f"a message has a time of {max(log_time, publish_time)} ns, more than {LATEST_NS}")
+        data = contents.data[start:end]
+        return RecordedMessage(self.channels[channel], log_time, publish_time, data, number, offset)
 
     def _read(self, file: BinaryIO, block: _Block) -> _Contents:
         data = self._data(file, block)
-        return _Contents(data, self._positions(file, block) if block.index_size else _walked(data))
+        positions = self._positions(file, block) if block.index_size else _walked(data)
+        return _Contents(data, {channel: _by_time(rows) for channel, rows in positions.items()})
 
     def _data(self, file: BinaryIO, block: _Block) -> bytes:
         file.seek(block.start)
@@ -274,9 +328,7 @@ class RecordingIndex:
             raise ValueError(CUT_OFF)
         if not block.chunked:
             return raw
-        chunk = Chunk.read(_stream(raw[_RECORD.size :]))
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        return stream.read(length)
+        return _unpacked(memoryview(raw)[_RECORD.size :])
 
     def _positions(self, file: BinaryIO, block: _Block) -> Positions:
         if not block.index_size:
@@ -306,6 +358,8 @@ class RecordingIndex:
         kind, length, start, _, crc = _FOOTER.unpack(raw[: _FOOTER.size])
         if (kind, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size) or not len(_MAGIC) <= start < end:
             return False
+        if end - start > _SUMMARY_BYTES:
+            return False
         file.seek(start)
         summary = file.read(end - start)
         if crc and zlib.crc32(summary + raw[: _FOOTER.size - 4]) != crc:
@@ -331,10 +385,13 @@ class RecordingIndex:
         for offset in offsets:
             file.seek(offset)
             kind, length = _RECORD.unpack(file.read(_RECORD.size))
-            self._take(kind, file.read(length))
+            self._declare(kind, length, file)
         self._blocks.sort(key=lambda block: block.start)
         indexed = all(block.index_size and block.channels <= self.channels.keys() for block in self._blocks)
-        return indexed and bool(self._blocks or not messages)
+        ends = [block.start + block.size + block.index_size for block in self._blocks]
+        starts = [*(block.start for block in self._blocks[1:]), start]
+        apart = not ends or all(ended <= began for ended, began in zip(ends, starts, strict=True))
+        return indexed and apart and bool(self._blocks or not messages)
 
     def _scan(self, file: BinaryIO, size: int, progress: Progress | None) -> None:
         """Find the messages by the heads of the records, up to where the file breaks off."""
@@ -346,7 +403,7 @@ class RecordingIndex:
                     break
                 if kind in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA}:
                     file.seek(at + _RECORD.size)
-                    self._take(kind, file.read(length))
+                    self._declare(kind, length, file)
                 else:
                     self._note(kind, at, _RECORD.size + length, head)
                 if progress is not None and number % _TOLD_EVERY == 0:
@@ -357,10 +414,12 @@ class RecordingIndex:
 
     def _note(self, kind: int, at: int, size: int, head: bytes) -> None:
         """Note where a record with messages, or with their positions, is."""
+        if len(self._blocks) > _MOST_BLOCKS:
+            raise ValueError(f"it has more than {_MOST_BLOCKS} chunks")
         last = self._blocks[-1] if self._blocks else None
         match kind:
             case Opcode.CHUNK:
-                (first_ns,) = _CHUNK.unpack_from(head, _RECORD.size)
+                first_ns = int.from_bytes(head[_RECORD.size : _RECORD.size + 8], "little")
                 self._blocks.append(_Block(at, size, chunked=True, first_ns=first_ns))
             case Opcode.MESSAGE_INDEX if last is not None:
                 channel, entries = _INDEX.unpack_from(head, _RECORD.size)
@@ -368,7 +427,10 @@ class RecordingIndex:
                 last.channels |= {channel} if entries else _NO_CHANNELS
             case Opcode.MESSAGE:
                 first_ns = _MESSAGE.unpack_from(head)[4]
-                if last is None or last.chunked or last.start + last.size != at:
+                if size > _CHUNK_BYTES:
+                    raise ValueError(f"a message outside of chunks has {size} bytes, more than {_CHUNK_BYTES}")
+                full = last is None or last.size + size > _CHUNK_BYTES
+                if last is None or full or last.chunked or last.start + last.size != at:
                     last = _Block(at, 0, chunked=False, first_ns=first_ns)
                     self._blocks.append(last)
                 last.size += size
@@ -395,21 +457,39 @@ class RecordingIndex:
                 del self._blocks[number:]
                 return
 
+    def _declare(self, kind: int, length: int, file: BinaryIO) -> None:
+        if length > _DECLARED_BYTES:
+            raise ValueError(f"a record of {length} bytes declares a schema, a channel or metadata")
+        self._take(kind, file.read(length))
+
     def _take(self, kind: int, body: bytes) -> None:
-        match kind:
-            case Opcode.SCHEMA:
-                schema = Schema.read(_stream(body))
-                self._schemas[schema.id] = schema.name
-            case Opcode.CHANNEL:
-                one = Channel.read(_stream(body))
-                layout = from_metadata(one.metadata)
-                schema_name = self._schemas.get(one.schema_id, "")
-                self.channels[one.id] = IndexedChannel(one.id, one.topic, schema_name, one.metadata, layout)
+        number = int.from_bytes(body[:2], "little")
+        match kind:  # chunks may repeat schemas and channels
+            case Opcode.SCHEMA if number not in self._schemas:
+                self._schemas[number] = Schema.read(self._counted(body)).name
+            case Opcode.CHANNEL if number not in self.channels:
+                one = Channel.read(self._counted(body))
+                name = self._schemas.get(one.schema_id, "")
+                self.channels[number] = IndexedChannel(number, one.topic, name, one.metadata, self._layout(one))
             case Opcode.METADATA:
-                metadata = Metadata.read(_stream(body))
+                metadata = Metadata.read(self._counted(body))
                 self.metadata[metadata.name] = metadata.metadata
             case _:
                 pass
+
+    def _counted(self, body: bytes) -> ReadDataStream:
+        self._declared += len(body)
+        if self._declared > _DECLARED_BYTES:
+            raise ValueError(f"schemas, channels and metadata take more than {_DECLARED_BYTES} bytes")
+        return _stream(body)
+
+    def _layout(self, channel: Channel) -> SceneLayout:
+        if len(channel.topic) > _NAME_CHARS or "\0" in channel.topic:
+            raise RecordingError(f"{self.path}: {channel.topic[:100]!r} is not a valid name of a channel.")
+        try:
+            return from_metadata(channel.metadata)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise RecordingError(f"{self.path}: the layout of {channel.topic} cannot be read: {error}.") from None
 
 
 def _stream(data: bytes) -> ReadDataStream:
@@ -453,13 +533,48 @@ def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 def _walked(data: bytes) -> Positions:
     """Return where the messages are in a block that has no index."""
-    found: dict[int, list[tuple[int, int]]] = {}
+    found: dict[int, array[int]] = {}
     for kind, start, _ in _records(data):
         if kind == Opcode.MESSAGE:
             offset = start - _RECORD.size
             _, _, channel, _, log_time, _ = _MESSAGE.unpack_from(data, offset)
-            found.setdefault(channel, []).append((log_time, offset))
-    return {channel: np.array(rows, dtype=np.uint64) for channel, rows in found.items()}
+            found.setdefault(channel, array("Q")).extend((log_time, offset))
+    return {channel: np.array(rows, dtype=np.uint64).reshape(-1, 2) for channel, rows in found.items()}
+
+
+def _by_time(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    times = rows[:, 0]
+    return rows if (times[1:] >= times[:-1]).all() else rows[np.argsort(times, kind="stable")]
+
+
+def _unpacked(chunk: memoryview) -> bytes:
+    """Return the records of a chunk.
+
+    Raises:
+        ValueError: It does not contain what it declares, or declares too much.
+    """
+    _, _, size, checksum, named = _CHUNK.unpack_from(chunk)
+    compression, rest = bytes(chunk[_CHUNK.size :][:named]), chunk[_CHUNK.size + named :]
+    packed = rest[8:][: int.from_bytes(rest[:8], "little")]
+    if size > min(max(_CHUNK_BYTES, _CHUNK_RATIO * len(packed)), _LARGEST_CHUNK):
+        raise ValueError(f"a chunk of {len(packed)} bytes declares that it unpacks to {size}")
+    match compression:
+        case b"zstd":
+            # The library allocates what the data themselves declare, whatever the limit.
+            fits = frame_content_size(packed) in {-1, size}
+            data = ZstdDecompressor().decompress(packed, max_output_size=size) if fits else b""
+        case b"lz4":
+            lz4: Any = importlib.import_module("lz4.frame")  # it has no type stubs
+            data = lz4.LZ4FrameDecompressor().decompress(packed, max_length=size)
+        case b"":
+            data = bytes(packed)
+        case _:
+            raise ValueError(f"a chunk is compressed as {compression.decode(errors='replace')!r}, which is unknown")
+    if len(data) != size:
+        raise ValueError(f"a chunk does not unpack to {size} bytes, as it declares")
+    if checksum and zlib.crc32(data) != checksum:
+        raise ValueError("the checksum of a chunk is wrong")
+    return data
 
 
 def _explained(error: Exception) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Collection, Generator, Iterator
 from datetime import UTC, datetime
 from functools import cached_property
@@ -36,6 +37,10 @@ OWNER: Final = "joints"
 
 _NS = 1e9
 _HEAD = 64
+_LARGEST_FILE = 256 << 20
+_LATEST_S = 2**63 / _NS
+_WIDEST = 100_000
+_MOST_VALUES = 8 << 20
 _COORDINATES = {1: ("",), 4: (".qw", ".qx", ".qy", ".qz"), 7: (".x", ".y", ".z", ".qw", ".qx", ".qy", ".qz")}
 _VELOCITIES = {1: ("",), 3: (".wx", ".wy", ".wz"), 6: (".vx", ".vy", ".vz", ".wx", ".wy", ".wz")}
 
@@ -78,12 +83,22 @@ class JointStatesRun(Run):
             RecordingError: The file is not a recording.
         """
         del progress
+        size = self.path.stat().st_size
+        if size > _LARGEST_FILE:
+            raise RecordingError(f"{self.path}: {size} bytes are too many for a recording of joint states.")
         try:
             frames = decode_json(self.path.read_bytes())
         except ValueError as error:
-            raise RecordingError(f"{self.path}: {error}") from error
+            raise RecordingError(f"{self.path}: {str(error).rstrip('.')}.") from error
         sim_time = np.array([frame.time for frame in frames], dtype=np.float64)
-        steps = np.diff(sim_time, prepend=sim_time[:1])
+        bounded = sim_time.clip(-_LATEST_S, _LATEST_S)
+        steps = np.diff(bounded, prepend=bounded[:1])
+        time = np.cumsum(np.maximum(steps, 0.0))
+        if len(frames) and max(abs(bounded).max(), time[-1]) >= _LATEST_S:
+            raise RecordingError(f"{self.path}: its times reach {_LATEST_S:.0f} s and more.")
+        width = max(len(frames[0].qpos), len(frames[0].qvel)) if frames else 0
+        if width > _WIDEST or len(frames) * width > max(_MOST_VALUES, size):
+            raise RecordingError(f"{self.path}: {len(frames)} frames of {width} values do not fit its size.")
         layout = frames[0].layout if frames else None
         names = dict(layout.joints) if layout else {}
         columns: dict[str, Column] = {}
@@ -101,7 +116,7 @@ class JointStatesRun(Run):
                         values[row] = given
                 columns[f"{OWNER}/{field}"] = Column(labels, values, quantities(SceneLayout(), field, labels), labels)
         return Table(
-            time=np.cumsum(np.maximum(steps, 0.0)),
+            time=time,
             sim_time=sim_time,
             wall_ns=(sim_time * _NS).astype(np.int64),
             step=np.arange(len(frames), dtype=np.int64),
@@ -137,7 +152,14 @@ class JointStatesRun(Run):
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
     def state_at(self, time: float) -> RecordedState | None:
-        """Return the newest state that is not after a time, None without any; all joints are one articulation."""
+        """Return the newest state that is not after a time, None without any; all joints are one articulation.
+
+        Raises:
+            RecordingError: The file is not a recording.
+            ValueError: The time is NaN.
+        """
+        if math.isnan(time):
+            raise ValueError("the time is NaN")
         table = self.whole
         row = int(np.searchsorted(table.time, time, side="right")) - 1
         if row < 0:

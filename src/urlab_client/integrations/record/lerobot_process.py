@@ -9,7 +9,6 @@ import queue
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -21,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._children import APART
+from urlab_client.aio.background import background_thread
 from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.protocol.errors import URLabError
 
 __all__ = ["LeRobot", "last_line"]
 
@@ -57,7 +58,8 @@ class LeRobot:
                 encoding="utf-8",
                 **APART,
             )
-        threading.Thread(target=self._listen, name="urlab-lerobot", daemon=True).start()
+        self._failure: URLabError | None = None
+        background_thread("urlab-lerobot", self._listen, failed=self._die).start()
 
     def __enter__(self) -> Self:
         return self
@@ -66,10 +68,9 @@ class LeRobot:
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._kill()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):  # what it did not read any more
-                    pipe.close()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):  # what it did not read any more
+                self._process.stdin.close()
 
     def add(self, arrays: Mapping[str, NDArray[Any]], *, ends_episode: bool) -> None:
         """Hand frames over, and wait while too many do.
@@ -89,7 +90,7 @@ class LeRobot:
                 self._process.stdin.write(json.dumps({"file": name, "ends_episode": ends_episode}) + "\n")
                 self._process.stdin.flush()
         except OSError:
-            raise self._failure() from None
+            raise self._broken_off() from None
 
     def finish(self) -> None:
         """Wait until the dataset is whole.
@@ -107,11 +108,11 @@ class LeRobot:
         except subprocess.TimeoutExpired:
             raise RecordingError(f"LeRobot did not end within {_DEADLINE_S:g} s.") from None
         if failed:
-            raise self._failure()
+            raise self._broken_off()
 
     def _wait(self) -> None:
         if not self._reply():
-            raise self._failure()
+            raise self._broken_off()
 
     def _reply(self) -> str:
         """Return the next reply, which is empty when there are no more."""
@@ -125,11 +126,15 @@ class LeRobot:
                     raise RecordingError(f"LeRobot did not finish within {allowed:g} s.") from None
 
     def _listen(self) -> None:
-        try:
-            for line in self._process.stdout or ():
-                self._replies.put(line)
-        except ValueError:  # closed meanwhile
-            pass
+        output = self._process.stdout
+        if output is not None:
+            with output:  # closed here and not by who waits: what encodes videos may outlive LeRobot and hold it open
+                for line in output:
+                    self._replies.put(line)
+        self._replies.put("")
+
+    def _die(self, error: URLabError) -> None:
+        self._failure = error
         self._replies.put("")
 
     def _kill(self) -> None:
@@ -140,7 +145,11 @@ class LeRobot:
                 os.killpg(self._process.pid, signal.SIGKILL)  # with those that encode videos for it
             self._process.wait()
 
-    def _failure(self) -> RecordingError:
+    def _broken_off(self) -> RecordingError:
+        if self._failure is not None:
+            failed = RecordingError(f"LeRobot's replies could not be read: {self._failure.__cause__!r}.")
+            failed.__cause__ = self._failure.__cause__
+            return failed
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_ENDING_S)  # it says why when it ends
         self._kill()

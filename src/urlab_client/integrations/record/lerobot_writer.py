@@ -26,6 +26,7 @@ __all__ = ["write_lerobot"]
 
 _PROBE_S = 120.0
 _TOGETHER = 64  # frames per batch
+_MOST_FRAMES = 10_000_000  # of an episode
 _SLACK = 1.01  # tolerance for rounded times
 _SLACK_S = 1e-6
 
@@ -86,7 +87,7 @@ def write_lerobot(
         everything = _timeline(stored.pieces())
         table = _timeline(transition_pieces(stored.pieces(), outcomes, episodes))
         rate = _rate(run, [*times.values()] or [everything.time]) if fps is None else fps
-        rows = _resampled(table, rate, [*times.values()], _episode_starts(everything))
+        rows = _resampled(run, table, rate, [*times.values()], _episode_starts(everything))
         if not len(rows):
             raise RecordingError(f"{run.path}: there is nothing to make a dataset of.")
         episode, when = table.episode[rows], table.time[rows]
@@ -242,7 +243,7 @@ def _episode_starts(table: _Timeline) -> dict[int, float]:
 
 
 def _resampled(
-    table: _Timeline, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
+    run: Run, table: _Timeline, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
 ) -> NDArray[np.intp]:
     """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
     rows: list[NDArray[np.intp]] = []
@@ -253,6 +254,10 @@ def _resampled(
             later = times[times >= starts[episode] - _SLACK_S]
             first = max(first, float(later[0]) if len(later) else np.inf)
         if first <= last + _SLACK_S:
+            if (last - first) * fps > _MOST_FRAMES:
+                raise RecordingError(
+                    f"{run.path}: episode {episode} of {last - first:.0f} s has more than {_MOST_FRAMES} frames."
+                )
             grid = first + np.arange(int((last - first) * fps + _SLACK_S) + 1) / fps
             found = np.searchsorted(table.time[own], grid + _SLACK_S, side="right") - 1
             rows.append(own[np.maximum(found, 0)])

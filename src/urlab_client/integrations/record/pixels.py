@@ -11,15 +11,15 @@ __all__ = ["even", "farthest", "visible"]
 
 
 def farthest(pixels: Pixels) -> float:
-    """Return the largest finite depth of a depth picture, metres; 1 for other pictures."""
+    """Return the largest finite depth of a depth picture, metres; 1 for other pictures, and without any depth."""
     depths = pixels[np.isfinite(pixels)] if pixels.dtype == np.float32 else np.zeros(0)
-    return float(depths.max()) if depths.size else 1.0
+    return float(depths.max(initial=0.0)) or 1.0
 
 
 def visible(pixels: Pixels, far: float) -> NDArray[np.uint8]:
     """Return pixels as RGB: depths in grey, from bright (near) to black (`far` and beyond)."""
     if pixels.dtype == np.float32:
-        grey = np.clip(1.0 - np.nan_to_num(pixels, nan=far, posinf=far) / far, 0.0, 1.0)
+        grey = 1.0 - np.clip(np.nan_to_num(pixels, nan=far), 0.0, far) / far
         return np.repeat(np.rint(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
     return without_alpha(pixels)
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import threading
 from array import array
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from pathlib import Path
+from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
@@ -21,6 +23,7 @@ from PIL import Image
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
+    Count,
     EntityMessage,
     EpisodeMessage,
     GapMessage,
@@ -37,7 +40,7 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.index import IndexedChannel, RecordedMessage, RecordingIndex
+from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, RecordedMessage, RecordingIndex
 from urlab_client.integrations.record.stored_table import StoredTable
 from urlab_client.integrations.record.table_builder import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
@@ -51,15 +54,22 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _STATES, _ENTITIES = schema_name(ArticulationMessage), schema_name(EntityMessage)
 _PICTURES = schema_name(CompressedImage), schema_name(RawImage)
 _CAMERA, _ARTICULATION, _ENTITY = "/camera/", "/state/", "/entity/"
+_MESSAGE_BYTES = 32 << 20
+_KEPT_BYTES = 32 << 20
+_MOST_VALUES = 8 << 20
+_VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
+_NAMES_CHARS = 32 << 20
+_MOST_PIXELS = 8192 * 8192
+_T = TypeVar("_T")
 
 
 class _State(msgspec.Struct):
     """An articulation's message as decoded; numbers that JSON cannot represent are text."""
 
     sim_time: Number
-    sample: int
-    step: int
-    episode: int
+    sample: Count
+    step: Count
+    episode: Count
     qpos: list[Number]
     qvel: list[Number]
     set_points: list[Number] = []
@@ -70,12 +80,12 @@ class _State(msgspec.Struct):
 
 class _Entity(msgspec.Struct):
     sim_time: Number
-    sample: int
-    step: int
-    episode: int
-    position: list[Number]
-    orientation: list[Number]
-    qvel: list[Number] = []
+    sample: Count
+    step: Count
+    episode: Count
+    position: Annotated[list[Number], msgspec.Meta(min_length=3, max_length=3)]
+    orientation: Annotated[list[Number], msgspec.Meta(min_length=4, max_length=4)]
+    qvel: Annotated[list[Number], msgspec.Meta(max_length=6)] = []
 
 
 _state = msgspec.json.Decoder(_State).decode
@@ -94,18 +104,25 @@ class RecordedPicture(msgspec.Struct, frozen=True):
         time: Time on the recording's clock, seconds.
         mode: Mode of the camera: `real`, `depth` and so on.
         message: The encoded picture.
+        unreadable: Makes the error for a picture that is not what it says.
     """
 
     time: float
     mode: str
     message: CompressedImage | RawImage
+    unreadable: Callable[[object], RecordingError]
 
     def pixels(self) -> Pixels:
-        """Return it as an array like `Camera.pixels`."""
+        """Return it as an array like `Camera.pixels`.
+
+        Raises:
+            RecordingError: It is damaged, too large, or not what the message says.
+        """
         message = self.message
-        if isinstance(message, RawImage):
-            return np.frombuffer(message.data, "<f4").astype(np.float32).reshape(message.height, message.width)
-        return np.array(Image.open(io.BytesIO(message.data)))
+        try:
+            return _depths(message) if isinstance(message, RawImage) else _colours(message.data)
+        except Exception as error:  # Pillow raises errors of many types
+            raise self.unreadable(error) from error
 
 
 class Run:
@@ -142,7 +159,7 @@ class Run:
         stamps_of = {topic: np.concatenate(parts) for topic, parts in sorted(times.items())}
         schemas = {channel.topic: channel.schema for channel in index.channels.values()}
         states = [found for one in index.having(_STATES) if (found := index.newest(one.id)) is not None]
-        gaps = [_gap(message.data) for message in self._of(index, GapMessage)]
+        gaps = self._contents(index, GapMessage, _gap)
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
         began, ended = index.wall_span()
         return Summary(
@@ -152,11 +169,11 @@ class Run:
             about=dict(index.metadata.get("urlab", {})),
             duration_s=int(max(ends) - min(ends)) / _NS if ends else 0.0,
             wall_s=(ended - began) / _NS,
-            episodes=max((_state(message.data).episode for message in states), default=-1) + 1,
+            episodes=max((_decoded(index, message, _state).episode for message in states), default=-1) + 1,
             dropped_states=sum(gap.states for gap in gaps),
             dropped_frames=sum(gap.frames for gap in gaps),
             topics={topic: describe_topic(topic, schemas[topic], stamps) for topic, stamps in stamps_of.items()},
-            varied=tuple(_episode(message.data) for message in self._of(index, EpisodeMessage)),
+            varied=tuple(self._contents(index, EpisodeMessage, _episode)),
             outcomes=self.outcomes(),
         )
 
@@ -170,7 +187,7 @@ class Run:
         Raises:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        builder = TableBuilder(fields)
+        builder = TableBuilder(fields, most=self._most_values())
         self._read_states(builder, progress)
         return builder.build(broken_off=bool(self.damage))
 
@@ -190,7 +207,7 @@ class Run:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
         with StoredTable(folder) as stored:
-            builder = TableBuilder(fields, take=stored.keep)
+            builder = TableBuilder(fields, take=stored.keep, most=self._most_values())
             self._read_states(builder, progress)
             stored.last = builder.build(broken_off=bool(self.damage))
             del builder
@@ -202,7 +219,7 @@ class Run:
         Raises:
             RecordingError: The file is not a recording.
         """
-        outcomes = [_outcome(message.data) for message in self._of(self._index(), OutcomeMessage)]
+        outcomes = self._contents(self._index(), OutcomeMessage, _outcome)
         return tuple({outcome.episode: outcome for outcome in outcomes}.values())
 
     def time_range(self) -> tuple[float, float]:
@@ -213,9 +230,9 @@ class Run:
         """
         index = self._index()
         channels = index.having(_STATES, _ENTITIES)
-        first = [one.log_time for channel in channels if (one := index.first(channel.id)) is not None]
-        last = [one.log_time for channel in channels if (one := index.newest(channel.id)) is not None]
-        return min(first, default=0) / _NS, max(last, default=0) / _NS
+        ends = [end for channel in channels for end in (index.first(channel.id), index.newest(channel.id))]
+        times = [end.log_time for end in ends if end is not None]
+        return min(times, default=0) / _NS, max(times, default=0) / _NS
 
     def state_at(self, time: float) -> RecordedState | None:
         """Return the newest state at or before a time; None if there is none.
@@ -225,6 +242,7 @@ class Run:
 
         Raises:
             RecordingError: The file is not a recording, or is damaged there.
+            ValueError: The time is NaN.
         """
         index = self._index()
         found = [_newest(index, [channel], time) for channel in index.having(_STATES, _ENTITIES)]
@@ -232,9 +250,9 @@ class Run:
         entities: dict[str, tuple[RecordedMessage, _Entity]] = {}
         for message in found:
             if message is not None and message.channel.schema == _STATES:
-                states[message.channel.topic.removeprefix(_ARTICULATION)] = message, _state(message.data)
+                states[message.channel.topic.removeprefix(_ARTICULATION)] = message, _decoded(index, message, _state)
             elif message is not None:
-                entities[message.channel.topic.removeprefix(_ENTITY)] = message, _entity(message.data)
+                entities[message.channel.topic.removeprefix(_ENTITY)] = message, _decoded(index, message, _entity)
         every = [*states.values(), *entities.values()]
         if not every:
             return None
@@ -265,7 +283,7 @@ class Run:
         for channel in index.having(_STATES):
             first = index.first(channel.id)
             if first is not None:
-                count, names = len(_state(first.data).qpos), channel.layout.qpos
+                count, names = len(_decoded(index, first, _state).qpos), channel.layout.qpos
                 names = names if len(names) == count else [str(i) for i in range(count)]
                 found.setdefault(channel.topic.removeprefix(_ARTICULATION), names)
         return found
@@ -273,7 +291,8 @@ class Run:
     def cameras(self) -> list[str]:
         """Return the names of the cameras with pictures in the file."""
         index = self._index()
-        cameras = [channel for channel in index.having(*_PICTURES) if index.first(channel.id) is not None]
+        pictures = [channel for channel in index.having(*_PICTURES) if channel.topic.startswith(_CAMERA)]
+        cameras = [channel for channel in pictures if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
     def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
@@ -305,7 +324,9 @@ class Run:
             RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
-        yield from map(_picture, self._messages(self._index(progress), channels, progress))
+        index = self._index(progress)
+        for message in self._messages(index, channels, progress):
+            yield _picture(index, message)
 
     def picture_at(self, camera: str, time: float) -> Camera | None:
         """Return the newest picture of a camera at or before a time; None if there is none.
@@ -317,11 +338,13 @@ class Run:
         Raises:
             KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording, or is damaged there.
+            ValueError: The time is NaN.
         """
-        found = _newest(self._index(), self._camera(camera), time)
+        index = self._index()
+        found = _newest(index, self._camera(camera), time)
         if found is None:
             return None
-        picture = _picture(found)
+        picture = _picture(index, found)
         return Camera(picture.time, picture.pixels())
 
     def encoded_picture_at(self, camera: str, time: float) -> RecordedPicture:
@@ -330,13 +353,14 @@ class Run:
         Raises:
             KeyError: The file has no pictures of this camera.
             RecordingError: The file is not a recording, or is damaged there.
+            ValueError: The time is NaN.
         """
         index, channels = self._index(), self._camera(camera)
         found = _newest(index, channels, time)
         if found is None:
             firsts = [first for channel in channels if (first := index.first(channel.id)) is not None]
             found = min(firsts, key=lambda one: one.log_time)
-        return _picture(found)
+        return _picture(index, found)
 
     def _camera(self, name: str) -> list[IndexedChannel]:
         index = self._index()
@@ -365,32 +389,38 @@ class Run:
         yield from index.messages(channels, progress)
         self.damage = index.damage
 
-    def _of(self, index: RecordingIndex, kind: type[msgspec.Struct]) -> Iterator[RecordedMessage]:
-        return self._messages(index, [channel.id for channel in index.having(schema_name(kind))])
+    def _contents(self, index: RecordingIndex, kind: type[msgspec.Struct], decode: Callable[[bytes], _T]) -> list[_T]:
+        """Return all messages of a kind of which a recording has few."""
+        found: list[_T] = []
+        left = max(_KEPT_BYTES, 4 * self.path.stat().st_size)
+        for message in self._messages(index, [channel.id for channel in index.having(schema_name(kind))]):
+            left -= len(message.data)
+            if left < 0:
+                raise index.unreadable(message, "with those before it, it is larger than the file can be")
+            found.append(_decoded(index, message, decode))
+        return found
+
+    def _most_values(self) -> int:
+        return max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
 
     def _read_states(self, builder: TableBuilder, progress: Callable[[int], None] | None) -> None:
         index = self._index(progress)
         channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
-            if message.channel.schema == _STATES:
-                self._take_state(builder, message)
-            else:
-                _take_entity(builder, message)
+            take = self._take_state if message.channel.schema == _STATES else _take_entity
+            try:
+                take(builder, index, message)
+            except ValueError as error:  # it does not fit those before it
+                raise index.unreadable(message, error) from None
 
-    def _take_state(self, builder: TableBuilder, message: RecordedMessage) -> None:
-        state, key = _state(message.data), message.channel.topic.removeprefix(_ARTICULATION)
+    def _take_state(self, builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
+        state, key = _decoded(index, message, _state), message.channel.topic.removeprefix(_ARTICULATION)
         source = builder.source(key, message.channel.layout)
         if source.layout != message.channel.layout:
             raise RecordingError(
                 f"{self.path}: {key} changes its joints or actuators in the middle, which fits no one table.",
                 hint="Record each scene into a file of its own.",
             )
-        if state.sensors and "sensors" not in source.names:
-            source.names["sensors"] = [
-                name if len(reading) == 1 else f"{name}.{i}"
-                for name, reading in state.sensors.items()
-                for i in range(len(reading))
-            ]
         builder.add(
             source,
             state.sample,
@@ -402,6 +432,14 @@ class Run:
             act=state.act,
             sensors=[value for reading in state.sensors.values() for value in reading],
         )
+        if state.sensors and "sensors" not in source.names:
+            if sum(len(name) * len(reading) for name, reading in state.sensors.items()) > _NAMES_CHARS:
+                raise ValueError("the names of its sensors are too long")
+            source.names["sensors"] = [
+                name if len(reading) == 1 else f"{name}.{i}"
+                for name, reading in state.sensors.items()
+                for i in range(len(reading))
+            ]
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
@@ -422,23 +460,69 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
 
 def _newest(index: RecordingIndex, channels: Sequence[IndexedChannel], time: float) -> RecordedMessage | None:
+    if math.isnan(time):
+        raise ValueError("the time is NaN")
     if time < 0:
         return None
-    found = [index.newest(channel.id, round(time * _NS)) for channel in channels]
+    at = LATEST_NS if time * _NS >= LATEST_NS else round(time * _NS)
+    found = [index.newest(channel.id, at) for channel in channels]
     return max((one for one in found if one is not None), key=lambda one: one.log_time, default=None)
 
 
-def _picture(message: RecordedMessage) -> RecordedPicture:
+def _decoded(index: RecordingIndex, message: RecordedMessage, decode: Callable[[bytes], _T]) -> _T:
+    """Return the contents of a message.
+
+    Raises:
+        RecordingError: They are not what its channel says.
+    """
+    if len(message.data) > _MESSAGE_BYTES and message.channel.schema not in _PICTURES:
+        raise index.unreadable(message, f"it has {len(message.data)} bytes, more than {_MESSAGE_BYTES}")
+    try:
+        return decode(message.data)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise index.unreadable(message, error) from None
+
+
+def _picture(index: RecordingIndex, message: RecordedMessage) -> RecordedPicture:
     decode = _raw if message.channel.schema == schema_name(RawImage) else _compressed
-    return RecordedPicture(message.log_time / _NS, message.channel.metadata.get("mode", ""), decode(message.data))
+    found: CompressedImage | RawImage = _decoded(index, message, decode)
+    place = message._replace(data=b"")
+    return RecordedPicture(
+        message.log_time / _NS,
+        message.channel.metadata.get("mode", ""),
+        found,
+        lambda reason: index.unreadable(place, reason),
+    )
+
+
+def _depths(message: RawImage) -> Pixels:
+    height, width = message.height, message.width
+    if message.encoding != "32FC1" or message.step != 4 * width or len(message.data) != 4 * height * width:
+        raise ValueError(
+            f"{len(message.data)} bytes of {message.encoding[:20]!r} in rows of {message.step} bytes "
+            f"are not {width}x{height} depths"
+        )
+    _check_size(width, height)
+    return np.frombuffer(message.data, "<f4").astype(np.float32).reshape(height, width)
+
+
+def _colours(data: bytes) -> Pixels:
+    with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+        _check_size(*image.size)
+        return np.array(image if image.mode in {"RGB", "RGBA"} else image.convert("RGB"))
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > _MOST_PIXELS:
+        raise ValueError(f"a picture of {width}x{height} pixels; it can have 1 to {_MOST_PIXELS}")
 
 
 def _times(message: RecordedMessage, state: _State | _Entity) -> SampleTimes:
     return SampleTimes(message.log_time, float(state.sim_time), message.publish_time, state.step, state.episode)
 
 
-def _take_entity(builder: TableBuilder, message: RecordedMessage) -> None:
-    entity, key = _entity(message.data), message.channel.topic.removeprefix(_ENTITY)
+def _take_entity(builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
+    entity, key = _decoded(index, message, _entity), message.channel.topic.removeprefix(_ENTITY)
     source = builder.source(key, message.channel.layout)
     source.names["pose"] = list(_POSE)
     source.names["qvel"] = ["vx", "vy", "vz", "wx", "wy", "wz"]

@@ -112,7 +112,8 @@ class AsyncRecorder:
         self._follower.check()
         self._writer = WriterThread(self._path, self._options())
         await anyio.to_thread.run_sync(self._writer.open)
-        self._follower.start(self._writer.put, room=self._writer.room, lost=self._writer.lose_frames)
+        writer = self._writer
+        self._follower.start(writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up)
         return self
 
     async def __aexit__(

@@ -23,6 +23,8 @@ __all__ = ["PIECE_VALUES", "Number", "SampleTimes", "TableBuilder"]
 PIECE_VALUES = 1 << 21
 """Approximate number of values in a piece of a table: 16 MiB."""
 
+_MOST_COLUMNS = 1_000_000
+
 Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
 """A number as decoded; numbers that JSON cannot represent are text."""
 
@@ -92,11 +94,17 @@ class TableBuilder:
         only: Fields to keep, such as `qpos`; None keeps all.
         take: Called with each full piece of the table, which is then released; None keeps all. Later pieces may have
             more and wider columns.
+        most: Largest number of values of the whole table, missing ones included.
     """
 
-    def __init__(self, only: Collection[str] | None = None, take: Callable[[Table], None] | None = None) -> None:
+    def __init__(
+        self, only: Collection[str] | None = None, take: Callable[[Table], None] | None = None, *, most: int
+    ) -> None:
         self._only = only
         self._take = take
+        self._most = most
+        self._count = 0
+        self._width = len(SampleTimes._fields)
         self._sources: dict[str, _Source] = {}
         self._taken_last: frozenset[str] = frozenset()
         self._begin()
@@ -104,27 +112,36 @@ class TableBuilder:
     def _begin(self) -> None:
         self._samples = array("q")
         self._times: tuple[array[float], ...] = tuple(array(kind) for kind in ("q", "d", "q", "q", "q"))
-        self._size = 0
 
     def source(self, key: str, layout: SceneLayout) -> _Source:
         """Return the samples of an articulation or entity so far."""
         return self._sources.setdefault(key, _Source(layout))
 
     def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
-        """Add a part of a sample."""
-        if not self._samples or sample != self._samples[-1]:
-            if self._take is not None and self._size >= PIECE_VALUES:
+        """Add a part of a sample.
+
+        Raises:
+            ValueError: It is not the next one, or the table becomes too large.
+        """
+        last = self._samples[-1] if self._samples else -1
+        if sample < last or sample in source.samples[-1:]:
+            raise ValueError(f"sample {sample} comes after sample {last}")
+        kept = {name: row for name, row in fields.items() if row and (self._only is None or name in self._only)}
+        widths = {name: source.fields[name].width if name in source.fields else 0 for name in kept}
+        self._width += sum(max(0, len(row) - widths[name]) for name, row in kept.items())
+        self._count += sample != last
+        if self._width > _MOST_COLUMNS or self._count * self._width > self._most:
+            raise ValueError(f"{self._count} samples of {self._width} values are too many for the size of the file")
+        if sample != last:
+            if self._take is not None and len(self._samples) * self._width >= PIECE_VALUES:
                 self._give(self._take)
             self._samples.append(sample)
             for column, value in zip(self._times, times, strict=True):
                 column.append(value)
-            self._size += len(times)
         row = len(source.samples)
         source.samples.append(sample)
-        for name, values in fields.items():
-            if values and (self._only is None or name in self._only):
-                source.fields.setdefault(name, _Values()).put(row, values)
-                self._size += len(values)
+        for name, values in kept.items():
+            source.fields.setdefault(name, _Values()).put(row, values)
 
     def build(self, *, broken_off: bool) -> Table:
         """Return the table, or its rest after `take`, without the last sample if that is incomplete."""

@@ -79,7 +79,9 @@ def _chosen(table: Table, outcomes: Sequence[OutcomeMessage], only: Episodes) ->
 def with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
     """Return a table with the goals of its episodes; NaN if unknown."""
     goals = {mark.episode: mark.goal for mark in outcomes}
-    widths = {name: len(values) for goal in goals.values() for name, values in goal.items()}
+    widths: dict[str, int] = {}
+    for goal in goals.values():
+        widths |= {name: max(len(values), widths.get(name, 0)) for name, values in goal.items()}
     columns = dict(table.columns)
     for name, width in widths.items():
         values = np.full((len(table), width), np.nan)

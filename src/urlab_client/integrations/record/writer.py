@@ -19,6 +19,7 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
+from urlab_client.aio.background import background_thread
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     ContactsMessage,
@@ -134,7 +135,9 @@ class WriterThread:
         self._file: _McapFile | None = None
         self._sink: _Sink | None = None
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="urlab-record", daemon=True)
+        self._thread = background_thread(
+            "urlab-record", self._run, failed=lambda error: self._fail(self._broken_off(error))
+        )
 
     def open(self) -> None:
         """Create the file and start the thread.
@@ -210,6 +213,10 @@ class WriterThread:
                 )
                 return
 
+    def give_up(self, error: URLabError) -> None:
+        """Take nothing more, because states or pictures are missing from now on; `close` raises the reason."""
+        self.error = self._broken_off(error)
+
     def end(self) -> None:
         """Tell the thread to write the queue and finish the file, without waiting."""
         self._stop.set()
@@ -243,11 +250,14 @@ class WriterThread:
             sink.finish(self._dropped_states, self._dropped_frames)
         except OSError as error:
             self._fail(error)
-        except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on and `close` tells
-            self._fail(RecordingError(f"{self.path}: the recording broke off: {error!r}"))
         finally:
             with contextlib.suppress(OSError):  # already reported if writing failed
                 file.close()
+
+    def _broken_off(self, error: URLabError) -> RecordingError:
+        broken = RecordingError(f"{self.path}: the recording broke off: {error.__cause__!r}")
+        broken.__cause__ = error.__cause__
+        return broken
 
     def _drain(self, sink: _Sink) -> None:
         while self._queue:

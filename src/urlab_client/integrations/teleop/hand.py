@@ -8,10 +8,9 @@ import numpy as np
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.integrations.ik import IkSolution, InverseKinematics
-from urlab_client.integrations.ik.solver import Vector
+from urlab_client.integrations.ik.solver import Vector, own_sites
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
@@ -154,9 +153,7 @@ class HandControl:
 
 
 def _only_site(client: URLabClient | AsyncClient, key: str) -> str:
-    prefix = f"{client.articulations[key].compiled_prefix}_"
-    names = [] if client.model is None else model_names(client.model, "site")
-    sites = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+    sites = [*own_sites(client, client.articulations[key])]
     if client.model is not None and len(sites) != 1:
         raise URLabError(f"Name the site of the hand of {key!r}: it has {', '.join(sites) or 'none'}.")
     return sites[0] if sites else ""

@@ -15,6 +15,7 @@ import anyio.to_thread
 import numpy as np
 from msgspec import Struct
 
+from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
@@ -155,7 +156,7 @@ class AsyncView:
         self._shown: int = 0
         self._stop = threading.Event()
         self._gone = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="urlab-view", daemon=True)
+        self._thread = background_thread("urlab-view", self._run, failed=self._fail)
         self._error: Exception | None = None
         self._opened = False
 
@@ -188,7 +189,7 @@ class AsyncView:
         if not self._client.config.read_only:  # a read-only client has no state until the first one is published
             self._states.append(self._start(scene))
         self._thread.start()
-        self._follower.start(self._put)
+        self._follower.start(self._put, failed=self._fail)
         return self
 
     async def __aexit__(
@@ -246,12 +247,17 @@ class AsyncView:
             self._error = error
             log.warning("%s: the view ended: %s", self._name, error)
         finally:
-            self._gone.set()
             try:
                 self._backend.close()
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
                 log.warning("%s: closing the view failed: %s", self._name, error)
+        self._gone.set()
+
+    def _fail(self, error: URLabError) -> None:
+        self._error = error
+        self._stop.set()
+        self._gone.set()
 
     def _drain(self) -> None:
         if self._states:

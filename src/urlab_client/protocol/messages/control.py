@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, doc
+from urlab_client.protocol.errors import UNCLAIMED
 
 __all__ = ["OPS", "UNCLAIMED", "ClaimControl", "ClaimControlOk", "ReleaseControl", "ReleaseControlOk"]
-
-UNCLAIMED: Final = "(unclaimed)"
-"""Owner that a server reports for a robot without one."""
 
 
 class ClaimControlOk(Reply, tag="claim_control_ok", kw_only=True):

@@ -37,6 +37,7 @@ __all__ = [
     "StreamItem",
     "StreamPolicy",
     "StreamStats",
+    "TaskFailed",
 ]
 
 
@@ -257,3 +258,10 @@ class PlayEnded(ClientEvent, tag="play_ended", kw_only=True, omit_defaults=True)
     """The play world has ended."""
 
     reason: Annotated[str, doc("What ended it, as far as this client knows.")] = ""
+
+
+class TaskFailed(ClientEvent, tag="task_failed", kw_only=True, omit_defaults=True):
+    """A background task or thread of this client ended unexpectedly; the log has the details."""
+
+    task: Annotated[str, doc("Its name, such as `urlab-keeper`, which keeps the session.")]
+    error: Annotated[str, doc("The error that ended it.")]

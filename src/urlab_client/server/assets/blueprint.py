@@ -151,7 +151,10 @@ def load_blueprint(file: Path) -> Blueprint:
         OSError: It cannot be read.
         ValueError: It is not such a file, or its snapshot is gone.
     """
-    decoded = _RECORD.decode(file.read_bytes())
+    try:
+        decoded = _RECORD.decode(file.read_bytes())
+    except RecursionError as error:
+        raise ValueError(str(error)) from None
     if not decoded.stem or decoded.stem != sanitized(decoded.stem) or not _DIGEST.fullmatch(decoded.digest):
         raise ValueError(f"'{decoded.stem}' and '{decoded.digest}' cannot be the names of folders")
     folder = file.parent / decoded.digest

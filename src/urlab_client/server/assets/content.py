@@ -28,6 +28,8 @@ from typing import Final
 import msgspec
 import mujoco
 
+from urlab_client._whole_files import write_whole
+from urlab_client.protocol.instances import import_directory
 from urlab_client.server.assets.blueprint import (
     IMPORTS,
     Blueprint,
@@ -42,7 +44,6 @@ from urlab_client.server.assets.importer import Compiled, compile_snapshot, one_
 from urlab_client.server.assets.sandbox import build_confined
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.atomic_write import write_atomic
 from urlab_client.server.system.temporary_folder import sweep, working_in
 
 __all__ = ["ContentRoot"]
@@ -66,8 +67,8 @@ class ContentRoot:
 
         Args:
             saved_dir: Folder of the content root; made when something is first written.
-            model_roots: Folders below which MJCF files may be imported. The models shipped with this package may
-                always be.
+            model_roots: Folders below which MJCF files may be imported. The models shipped with this package, and
+                those that a console hands over in `import_directory()`, may always be.
             limits: For what clients name.
         """
         self.limits = limits
@@ -98,6 +99,12 @@ class ContentRoot:
         wanted = class_path.casefold()
         return next((item for item in self._blueprints.values() if item.class_path.casefold() == wanted), None)
 
+    @property
+    def _import_roots(self) -> tuple[Path, ...]:
+        """Folders below which clients may import; resolved."""
+        handed_over = import_directory()
+        return *self.model_roots, bundled_root(), *(() if handed_over is None else (handed_over.resolve(),))
+
     def import_xml(self, path: str, *, force_reimport: bool = False, trusted: bool = False) -> tuple[Blueprint, bool]:
         """Import an MJCF file, or return the blueprint of the same file stem.
 
@@ -116,7 +123,7 @@ class ContentRoot:
         if not path:
             raise Refusal("missing_field", "path: name the MJCF file to import")
         file, source = self._locate(path, trusted=trusted)
-        roots = None if trusted else (*self.model_roots, bundled_root())
+        roots = None if trusted else self._import_roots
         return self._import_file(file, source, roots, force_reimport=force_reimport)
 
     def import_uploaded(self, document: Path) -> Blueprint:
@@ -176,7 +183,7 @@ class ContentRoot:
             return None
         home = self.root / IMPORTS / other.stem
         folder = home / other.digest
-        if not folder.exists():
+        if not _is_sound(folder):
             home.mkdir(parents=True, exist_ok=True)
             with (
                 working_in(self.root / IMPORTS),
@@ -184,7 +191,7 @@ class ContentRoot:
             ):
                 copy = Path(temporary_folder) / "snapshot"
                 shutil.copytree(other.folder, copy)
-                os.replace(copy, folder)
+                _replace(copy, folder)
         return self._register(home, folder, to_record(other))
 
     def remove_blueprint(self, stem: str) -> None:
@@ -245,8 +252,7 @@ class ContentRoot:
         resolved = [place.resolve() for place in places]
         if trusted:
             return resolved
-        allowed = (*self.model_roots, bundled_root())
-        return [place for place in resolved if any(place.is_relative_to(root) for root in allowed)]
+        return [place for place in resolved if any(place.is_relative_to(root) for root in self._import_roots)]
 
     def _roots_text(self) -> str:
         return ", ".join(map(str, self.model_roots)) or "none but the bundled models"
@@ -308,7 +314,7 @@ class ContentRoot:
 
     def _register(self, home: Path, folder: Path, record: BlueprintRecord) -> Blueprint:
         known = self._blueprints.get(record.stem)
-        write_atomic(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
+        write_whole(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
         blueprint = from_record(folder, record)
         self._blueprints[record.stem] = blueprint
         # A play session under way may still read the model before this one; older ones are unused.
@@ -346,12 +352,22 @@ def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
 
 
 def _put_in_place(snapshot: Path, home: Path) -> tuple[Path, bool]:
-    """Move a snapshot to the folder that its content names, unless that is there; return it, and whether it is new."""
+    """Move a snapshot to the folder that its content names, unless that is there and as it was written; return it, and
+    whether it is new."""
     folder = home / _digest(snapshot)
-    if folder.exists():
+    if _is_sound(folder):
         return folder, False
-    os.replace(snapshot, folder)
+    _replace(snapshot, folder)
     return folder, True
+
+
+def _is_sound(folder: Path) -> bool:
+    return _digest(folder) == folder.name
+
+
+def _replace(snapshot: Path, folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(snapshot, folder)
 
 
 def _digest(folder: Path) -> str:

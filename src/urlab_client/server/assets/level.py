@@ -16,6 +16,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
+from urlab_client._whole_files import write_whole
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.rotation import IDENTITY, normalized
@@ -25,7 +26,6 @@ from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.atomic_write import write_atomic
 
 __all__ = ["LevelError", "read_level", "write_level"]
 
@@ -125,7 +125,7 @@ def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> No
             )
         )
     level = _Level(format=FORMAT, version=VERSION, blueprints=blueprints, actors=entries)
-    write_atomic(path, msgspec.json.format(msgspec.json.encode(level), indent=2) + b"\n")
+    write_whole(path, msgspec.json.format(msgspec.json.encode(level), indent=2) + b"\n")
 
 
 def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> dict[str, Actor]:
@@ -154,7 +154,7 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
         if header.version != VERSION:
             raise LevelError(f"{path} has version {header.version} of the level format; this server reads {VERSION}")
         level = _LEVEL.decode(data)
-    except msgspec.DecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise LevelError(f"{path} is not a level: {error}") from None
     folder = path.parent.resolve()
     blueprints: dict[str, Blueprint] = {}

@@ -5,15 +5,13 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from urlab_client.protocol.names import WINDOWS_DEVICES
 from urlab_client.server.assets.blueprint import IMPORTS
 
-__all__ = ["WINDOWS_DEVICES", "level_package"]
+__all__ = ["level_package"]
 _LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
 _MAX_SEGMENT_BYTES: Final = 240
 _RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
-WINDOWS_DEVICES: Final = frozenset(
-    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
-)
 
 
 def level_package(name: str) -> str:

@@ -1,10 +1,10 @@
 """Compiling models that clients name, in a child process with limits.
 
 For `ContentRoot`. MuJoCo's compiler takes all the memory and time that a file asks for, cannot be broken off, and is
-written in C++: so it runs where it may fail. One child per server process is started with the first such model, with
-MuJoCo loaded; for each model it forks a grandchild, which lives under the limits and sees no other model. Where there
-is no `fork` (Windows) the child does the work itself and is replaced after each model; there the limits are wall time
-and what the operating system gives.
+written in C++: so it runs where it may fail. A child is started with the first such model, with MuJoCo loaded, and
+kept; for each model it forks a grandchild, which lives under the limits and sees no other model. Where there is no
+`fork` (Windows) the child does the work itself and is replaced after each model; there the limits are wall time and
+what the operating system gives. Both are killed together, and nobody waits for their pipes beyond a model's time.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import queue
 import select
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from typing import Final
 import msgspec
 import mujoco
 
+from urlab_client._background import daemon
 from urlab_client._children import APART
 from urlab_client._confined import limit_process
 from urlab_client._landlock import confine_files
@@ -36,6 +38,9 @@ __all__ = ["build_confined"]
 
 _GRACE_S: Final = 5.0 if hasattr(os, "fork") else 30.0
 """For the child to answer beyond a model's time. Without `fork` the child starts for each model, which counts, too."""
+
+_END_S: Final = 1.0
+"""For a killed process to go, which takes no time unless the system is at its end."""
 
 _REPLY_BYTES: Final = 64 * 2**20
 
@@ -61,85 +66,125 @@ _ORDER: Final = msgspec.json.Decoder(_SandboxJob)
 _OUTCOME: Final = msgspec.json.Decoder(_Outcome)
 
 
-class _Child:
-    """The process that compiles; started when needed and kept."""
+class _Compiler:
+    """A process that compiles one model at a time, and the pipes to it."""
+
+    program: str = "from urlab_client.server.assets import sandbox; sandbox.serve()"
+    """Not `-m`: importing the package imports this module, of which Python warns when it is to be run as well."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pid = 0
-
-    def build(self, order: _SandboxJob) -> _Outcome:
-        """Have a model compiled."""
-        with self._lock:
-            if self._pid != os.getpid():  # a forked copy of this program has no child of its own
-                self._process, self._pid = None, os.getpid()
-            for _ in range(2):  # a child that ended meanwhile is replaced, once
-                process = self._process or self._start()
-                line, in_time = self._exchange(process, msgspec.json.encode(order) + b"\n", order.limits.model_wall_s)
-                if line:
-                    if not hasattr(os, "fork"):
-                        self._end()
-                    return _OUTCOME.decode(line)
-                self._end()
-                if not in_time:
-                    return _took_too_long(order.limits)
-        return _Outcome(refused="compilation ended without an answer: it exceeded its limits, or MuJoCo failed")
-
-    def close(self) -> None:
-        """End the child."""
-        with self._lock:
-            if self._pid == os.getpid():
-                self._end()
-
-    def _start(self) -> subprocess.Popen[bytes]:
-        self._process = subprocess.Popen(
-            # Not `-m`: importing the package imports this module, of which Python warns when it is to be run as well.
-            [sys.executable, "-c", "from urlab_client.server.assets import sandbox; sandbox.serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            **APART,
+        self.process = subprocess.Popen(  # noqa: S603 - a script of this module
+            [sys.executable, "-c", self.program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, **APART
         )
-        return self._process
+        self._asking: threading.Thread | None = None
 
-    def _exchange(self, process: subprocess.Popen[bytes], line: bytes, wall_s: float) -> tuple[bytes, bool]:
-        """Return the child's answer, if any, and whether it came, or the child ended by itself, in time."""
-        if process.stdin is None or process.stdout is None:
-            raise TypeError("the child's input and output must be pipes")
-        too_late = threading.Event()
+    def ask(self, line: bytes, deadline: float) -> bytes | None:
+        """Return the answer to a line, nothing if the process ended without one, or None if it is late.
 
-        def kill() -> None:
-            too_late.set()
-            process.kill()
-
-        watchdog = threading.Timer(wall_s + _GRACE_S, kill)
-        watchdog.daemon = True
-        watchdog.start()
+        The caller waits for a thread and not for the pipe, whose end may never come: what the process has forked, or
+        what any thread of this one forked meanwhile, may hold it open.
+        """
+        answers: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
+        self._asking = daemon("urlab-sandbox", self._ask, line, answers, failed=answers.put)
+        self._asking.start()
         try:
-            process.stdin.write(line)
-            process.stdin.flush()
-            answer = process.stdout.readline(_REPLY_BYTES)
-        except OSError:
-            answer = b""
-        finally:
-            watchdog.cancel()
-            watchdog.join()
-        return answer if answer.endswith(b"\n") else b"", not too_late.is_set()
+            answer = answers.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            return None
+        if isinstance(answer, BaseException):
+            raise RuntimeError(f"urlab-sandbox died of {answer!r}") from answer  # noqa: TRY004
+        return answer
 
-    def _end(self) -> None:
-        process, self._process = self._process, None
-        if process is None:
-            return
-        for stream in (process.stdin, process.stdout):
+    def _ask(self, line: bytes, answers: queue.SimpleQueue[bytes | BaseException]) -> None:
+        answer = b""
+        try:
+            if self.process.stdin is not None and self.process.stdout is not None:
+                self.process.stdin.write(line)
+                self.process.stdin.flush()
+                answer = self.process.stdout.readline(_REPLY_BYTES)
+        except OSError:
+            pass
+        finally:
+            if not answer.endswith(b"\n"):
+                answer = b""
+                self._close()
+        answers.put(answer)
+
+    def end(self) -> None:
+        """Kill the process with all that it has forked, within a bounded time."""
+        if sys.platform != "win32":
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.process.pid, signal.SIGKILL)  # before `kill`, after which the number may be another's
+        self.process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(_END_S)
+        if self._asking is not None:
+            self._asking.join(_END_S)
+        if self._asking is None or not self._asking.is_alive():  # otherwise it closes them when the pipe lets it
+            self._close()
+
+    def _close(self) -> None:
+        for stream in (self.process.stdin, self.process.stdout):
             if stream is not None:
                 with contextlib.suppress(OSError):
                     stream.close()
-        process.kill()
-        process.wait()
 
 
-_child = _Child()
-atexit.register(_child.close)
+class _Compilers:
+    """The processes that compile: as many as there are models at once, of which one is kept for the next."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._all: set[_Compiler] = set()
+        self._idle: _Compiler | None = None
+        self._pid = 0
+
+    def build(self, order: _SandboxJob) -> _Outcome:
+        """Have a model compiled; whatever happens to the processes, there is an outcome in its time."""
+        deadline = time.monotonic() + order.limits.model_wall_s + _GRACE_S
+        for _ in range(2):  # a process that ended meanwhile is replaced, once
+            try:
+                compiler = self._take()
+            except OSError as error:
+                return _Outcome(refused=f"the process that compiles cannot be started: {one_line(error)}")
+            answer = None
+            try:
+                answer = compiler.ask(msgspec.json.encode(order) + b"\n", deadline)
+            finally:
+                self._put_back(compiler, usable=bool(answer) and hasattr(os, "fork"))
+            if answer:
+                return _OUTCOME.decode(answer)
+            if answer is None:
+                return _took_too_long(order.limits)
+        return _Outcome(refused="compilation ended without an answer: it exceeded its limits, or MuJoCo failed")
+
+    def close(self) -> None:
+        """End all of them."""
+        with self._lock:
+            ending = [*self._all] if self._pid == os.getpid() else []
+            self._all, self._idle = set(), None
+        for compiler in ending:
+            compiler.end()
+
+    def _take(self) -> _Compiler:
+        with self._lock:
+            if self._pid != os.getpid():  # a forked copy of this program has none of its own
+                self._all, self._idle, self._pid = set(), None, os.getpid()
+            compiler, self._idle = self._idle or _Compiler(), None
+            self._all.add(compiler)
+            return compiler
+
+    def _put_back(self, compiler: _Compiler, *, usable: bool) -> None:
+        with self._lock:
+            if usable and self._idle is None and compiler in self._all:
+                self._idle = compiler
+                return
+            self._all.discard(compiler)
+        compiler.end()
+
+
+_compilers = _Compilers()
+atexit.register(_compilers.close)
 
 
 def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: Limits) -> Compiled:
@@ -149,7 +194,7 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
         Refusal: `import_failed`, with what was wrong or which limit was exceeded.
     """
     order = _SandboxJob(str(file), str(snapshot), [str(root) for root in roots], limits)
-    outcome = _child.build(order)
+    outcome = _compilers.build(order)
     if outcome.done is None:
         raise Refusal("import_failed", f"{outcome.subject or file}: {outcome.refused}")
     return outcome.done
@@ -166,17 +211,18 @@ def serve() -> None:
         signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
     for line in sys.stdin.buffer:
         order = _ORDER.decode(line)
-        outcome = _fork(order) if hasattr(os, "fork") else _work(order)
+        outcome = _fork(order, answers.fileno()) if hasattr(os, "fork") else _work(order)
         answers.write(msgspec.json.encode(outcome) + b"\n")
         answers.flush()
 
 
-def _fork(order: _SandboxJob) -> _Outcome:
+def _fork(order: _SandboxJob, answers: int) -> _Outcome:
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
-        os.close(reading)
         try:
+            os.close(reading)
+            os.close(answers)  # so that its end is seen at once if this process's parent dies
             limit_process(order.limits.model_memory_bytes, order.limits.model_cpu_s)
             confine_files(map(Path, order.roots), (Path(order.snapshot).parent,))
             with os.fdopen(writing, "wb") as stream:

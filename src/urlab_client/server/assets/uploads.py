@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelChunk,
     UploadModelManifest,
 )
-from urlab_client.server.assets.package_names import WINDOWS_DEVICES
+from urlab_client.protocol.names import is_file_name
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
 
@@ -48,7 +48,6 @@ _UNDER_WAY: Final = ".upload-"
 
 _DOCUMENT_IN_REPLIES: Final = "<xml>"
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
-_MAX_NAME_BYTES: Final = 240
 
 
 @dataclass
@@ -59,6 +58,13 @@ class _File:
     size: int | None
     received: int = 0
     partial: Path | None = None
+
+    def drop(self) -> None:
+        """Forget what was received."""
+        if self.partial is not None:
+            with contextlib.suppress(OSError):
+                self.partial.unlink()
+        self.partial, self.received = None, 0
 
 
 @dataclass
@@ -86,7 +92,7 @@ class Uploads:
 
     Attributes:
         root: Folder for the cache and for what is under way; made when something is first sent.
-        cache_bytes: Size of the cache; what was used longest ago gives way.
+        cache_bytes: Size of the cache and of what is under way; what was used longest ago gives way.
         clock: Tells the time, seconds.
     """
 
@@ -95,6 +101,8 @@ class Uploads:
     clock: Callable[[], float] = time.monotonic
     _open: dict[str, _Upload] = field(default_factory=dict[str, _Upload])
     _working: contextlib.ExitStack | None = None
+    _held: int = 0
+    """Bytes in the cache, as of the last manifest and of what was done since."""
 
     def __post_init__(self) -> None:
         sweep(self.root, f"{_UNDER_WAY}*")
@@ -110,7 +118,7 @@ class Uploads:
             Its id, whether the document is needed, and the names of the assets that are.
 
         Raises:
-            Refusal: `bad_request`, `payload_too_large`.
+            Refusal: `bad_request`, `payload_too_large`; `internal_error` if nothing can be stored.
         """
         assets, total_bytes = manifest.assets, manifest.total_bytes
         _check_hash(manifest.xml_sha256, "xml_sha256")
@@ -123,7 +131,7 @@ class Uploads:
             _check_hash(asset.sha256, f"the sha256 of '{asset.name}'")
             if not 0 <= asset.size <= MAX_BLOB_BYTES:
                 raise Refusal(
-                    "payload_too_large", f"'{asset.name}' has {asset.size} bytes; a file has at most {MAX_BLOB_BYTES}"
+                    "payload_too_large", f"the size of '{asset.name}' must be 0 to {MAX_BLOB_BYTES}, not {asset.size}"
                 )
         named = {asset.name: _File(asset.sha256, asset.size) for asset in assets}
         total = sum(asset.size or 0 for asset in named.values())
@@ -134,17 +142,19 @@ class Uploads:
             raise Refusal(
                 "bad_request", f"{MAX_OPEN} uploads are open: commit one, or wait until one is {IDLE_S:g} s idle"
             )
-        if self._working is None:  # from now on no other server takes what is under way here for left behind
-            self.root.mkdir(parents=True, exist_ok=True)
-            self._working = contextlib.ExitStack()
-            self._working.enter_context(working_in(self.root))
+        document = _File(manifest.xml_sha256, None)
+        with _storing("the upload"):
+            if self._working is None:  # from now on no other server takes what is under way here for left behind
+                self._cache.mkdir(parents=True, exist_ok=True)
+                self._working = contextlib.ExitStack()
+                self._working.enter_context(working_in(self.root))
+            needed = [name for name, file in named.items() if not self._take(file)]
+            need_xml = not self._take(document)
+            self._held = sum(about.st_size for _, about in _files(self._cache.iterdir()))
+            folder = Path(tempfile.mkdtemp(dir=self.root, prefix=_UNDER_WAY))
         upload_id = str(uuid.uuid4()).upper()
-        folder = Path(tempfile.mkdtemp(dir=self.root, prefix=_UNDER_WAY))
-        self._open[upload_id] = upload = _Upload(
-            _File(manifest.xml_sha256, None), named, _step_mode(manifest.step_mode), self.clock(), folder
-        )
-        needed = [name for name, file in named.items() if not self._cached(file)]
-        return upload_id, not self._cached(upload.document), needed
+        self._open[upload_id] = _Upload(document, named, _step_mode(manifest.step_mode), self.clock(), folder)
+        return upload_id, need_xml, needed
 
     def receive(self, chunk: UploadModelChunk) -> tuple[str, int, bool]:
         """Take a piece of a file.
@@ -153,7 +163,8 @@ class Uploads:
             What replies call the file, how many bytes of it were received, and whether it is complete.
 
         Raises:
-            Refusal: `bad_request`, `payload_too_large`, `unknown_upload`, `hash_mismatch`.
+            Refusal: `bad_request`, `payload_too_large`, `unknown_upload`, `hash_mismatch`; `internal_error` if the
+                piece cannot be stored. Then, as with a wrong hash, the file starts anew.
         """
         kind, offset, total, data = chunk.kind, chunk.offset, chunk.total, chunk.data
         if kind not in ("xml", "asset"):
@@ -174,20 +185,23 @@ class Uploads:
             raise Refusal("bad_request", f"'{label}' has {file.size} bytes in the manifest, not {total}")
         if self._cached(file):
             return label, total, True
-        if file.partial is None:
-            handle, partial = tempfile.mkstemp(dir=upload.folder)
-            os.close(handle)
-            file.partial = Path(partial)
         try:
-            with file.partial.open("r+b") as stream:
-                stream.seek(offset)
-                stream.write(data)
-        except OSError as error:
-            raise Refusal("internal_error", f"'{label}' cannot be stored: {error.strerror or error}") from None
-        file.received += len(data)
-        if file.received < total:
-            return label, file.received, False
-        self._complete(label, file, total)
+            with _storing(f"'{label}'"):
+                self._make_room(len(data))
+                if file.partial is None:
+                    handle, partial = tempfile.mkstemp(dir=upload.folder)
+                    os.close(handle)
+                    file.partial = Path(partial)
+                with file.partial.open("r+b") as stream:
+                    stream.seek(offset)
+                    stream.write(data)
+                file.received += len(data)
+                if file.received < total:
+                    return label, file.received, False
+                self._complete(label, file, total)
+        except Refusal:
+            file.drop()
+            raise
         return label, total, True
 
     @contextmanager
@@ -203,8 +217,8 @@ class Uploads:
         if not upload_id:
             raise Refusal("bad_request", "upload_id is empty")
         upload = self._find(upload_id)
-        missing = [] if self._cached(upload.document) else [_DOCUMENT_IN_REPLIES]
-        missing += [name for name, file in upload.assets.items() if not self._cached(file)]
+        missing = [] if self._take(upload.document) else [_DOCUMENT_IN_REPLIES]
+        missing += [name for name, file in upload.assets.items() if not self._take(file)]
         if missing:
             raise Refusal("bad_request", f"the upload is incomplete: {', '.join(missing[:5])} must be sent first")
         try:
@@ -249,31 +263,58 @@ class Uploads:
             return False
         return file.size is None or size == file.size
 
+    def _take(self, file: _File) -> bool:
+        """Whether the cache has a file, which is now the last one used; a damaged one is removed."""
+        path = self._cache / file.sha256
+        try:
+            if _hash_of(path) == file.sha256:
+                os.utime(path)
+            else:
+                path.unlink()
+        except OSError:
+            return False
+        return self._cached(file)
+
     def _complete(self, label: str, file: _File, total: int) -> None:
         """Move a file whose bytes are all there into the cache, if they are the right ones."""
         partial = file.partial
         assert partial is not None  # noqa: S101 - what was received is in it
-        file.partial, file.received = None, 0
-        with partial.open("rb") as stream:
-            found = hashlib.file_digest(stream, "sha256").hexdigest()
-        if found != file.sha256 or partial.stat().st_size != total:
-            partial.unlink()
+        found, size = _hash_of(partial), partial.stat().st_size
+        if found != file.sha256 or size != total:
             raise Refusal("hash_mismatch", f"'{label}' has the hash {found}, the manifest says {file.sha256}")
-        self._cache.mkdir(exist_ok=True)
         os.replace(partial, self._cache / file.sha256)
-        self._make_room()
+        file.drop()
+        self._held += size
 
-    def _make_room(self) -> None:
-        """Drop what was used longest ago, but nothing that an open upload needs."""
-        needed = {file.sha256 for upload in self._open.values() for file in (upload.document, *upload.assets.values())}
-        files = sorted(_files(self._cache.iterdir()), key=lambda item: item[1].st_mtime)
-        held = sum(about.st_size for _, about in files)
-        for path, about in files:
-            if held <= self.cache_bytes:
-                return
-            if path.name not in needed:
-                path.unlink(missing_ok=True)
-                held -= about.st_size
+    def _make_room(self, n_bytes: int) -> None:
+        """Drop what was used longest ago for something to be stored, but nothing that an open upload needs."""
+        needed = [file for upload in self._open.values() for file in (upload.document, *upload.assets.values())]
+        n_bytes += sum(file.received for file in needed)
+        if self._held + n_bytes > self.cache_bytes:
+            names = {file.sha256 for file in needed}
+            for path, about in sorted(_files(self._cache.iterdir()), key=lambda item: item[1].st_mtime_ns):
+                if path.name not in names and self._held + n_bytes > self.cache_bytes:
+                    path.unlink(missing_ok=True)
+                    self._held -= about.st_size
+        if self._held + n_bytes > self.cache_bytes:
+            raise Refusal(
+                "payload_too_large",
+                f"the files of the uploads that are open would take {self._held + n_bytes} bytes, more than the limit "
+                f"upload_cache_bytes, {self.cache_bytes}",
+            )
+
+
+@contextmanager
+def _storing(what: str) -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise Refusal("internal_error", f"{what} cannot be stored: {error.strerror or error}") from None
+
+
+def _hash_of(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
@@ -292,8 +333,7 @@ def _check_hash(text: str, what: str) -> None:
 
 def _check_name(name: str) -> None:
     """Refuse what is not a bare file name on every system, and the document's own name."""
-    bare = name not in ("", ".", "..") and not any(c in '/\\:*?"<>|' or ord(c) < 32 for c in name)
-    if not bare or len(name.encode()) > _MAX_NAME_BYTES or name.partition(".")[0].upper() in WINDOWS_DEVICES:
+    if not is_file_name(name):
         raise Refusal("bad_request", f"'{name[:80]}' is not a bare file name")
     if name.casefold() == DOCUMENT:
         raise Refusal("bad_request", f"an asset must not be called '{name}', which is what the document is called")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
@@ -62,7 +63,8 @@ class LevelActors:
         """Add an actor with a label of its own: the short class name, numbered from the second on."""
         short = actor.class_name.removesuffix("_C")
         labels = {other.label for other in self}
-        return self.put(replace(actor, label=next(label for label in _variants(short, "", 2) if label not in labels)))
+        numbered = itertools.chain([short], (f"{short}{number}" for number in itertools.count(2)))
+        return self.put(replace(actor, label=next(label for label in numbered if label not in labels)))
 
     def get(self, key: str, *, by_name: bool = False) -> Actor | None:
         """Return the actor with an id, or with an object name; None if there is none.
@@ -115,12 +117,29 @@ class LevelActors:
             return self.numbered(blueprint.class_name)
         base = sanitized(blueprint.model_name) or blueprint.stem
         return next(
-            name for name in _variants(base, "_", 1) if name not in self._actors and not self._clashes(name, blueprint)
+            name for name in self._copies(base) if name not in self._actors and not self._clashes(name, blueprint)
         )
+
+    def unused_id(self, stem: str) -> str:
+        """Return `stem`, or an id derived from it if an actor has that."""
+        ids = {actor.actor_id for actor in self}
+        return next(name for name in self._copies(stem) if name not in ids)
+
+    def _copies(self, stem: str) -> Iterator[str]:
+        """Yield `stem`, and then names like `copy1_STEM`: none begins with the name of another actor, nor that with it.
+
+        Clients tell by how a compiled name begins which robot it belongs to, and some take the first that fits.
+        """
+        yield stem
+        taken = {known for actor in self for known in (actor.name, actor.actor_id) if known}
+        for copy in (f"copy{number}_{stem}" for number in itertools.count(1)):
+            if copy not in taken and not any(copy.startswith(known) or known.startswith(copy) for known in taken):
+                yield copy
 
     def numbered(self, class_name: str) -> str:
         """Return the first free name of a class, numbered from 0."""
-        return next(name for name in _numbers(class_name) if name not in self._actors)
+        names = (f"{class_name}_{number}" for number in itertools.count())
+        return next(name for name in names if name not in self._actors)
 
     def _clashes(self, name: str, blueprint: Blueprint) -> bool:
         """Whether compiled names would repeat: `robot` with a body `1_base` beside `robot_1` with a body `base`."""
@@ -149,19 +168,3 @@ def match_actor(actors: Iterable[Actor], target: str, code: str) -> Actor:
         if actor.name == target or actor.has_id(target):
             return actor
     raise Refusal(code, f"no actor has the id or name '{target}'; list_actors names them")
-
-
-def _variants(stem: str, separator: str, first: int) -> Iterator[str]:
-    """Yield `stem`, then `stem` with the numbers from `first` on."""
-    yield stem
-    number = first
-    while True:
-        yield f"{stem}{separator}{number}"
-        number += 1
-
-
-def _numbers(stem: str) -> Iterator[str]:
-    number = 0
-    while True:
-        yield f"{stem}_{number}"
-        number += 1

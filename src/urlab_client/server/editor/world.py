@@ -71,7 +71,7 @@ class EditorWorld:
 
         Args:
             content: The content root.
-            actor_names: How articulations are named: `model` after the MJCF's model name (`robot`, `robot_1`, …),
+            actor_names: How articulations are named: `model` after the MJCF's model name (`robot`, `copy1_robot`, …),
                 `plugin` as the plugin does (`robot_C_0`, `robot_C_1`, …).
         """
         self.content = content
@@ -312,6 +312,10 @@ class EditorWorld:
     def actor(self, key: str, *, by_name: bool = False) -> Actor | None:
         """Return the actor of the open level with an id, or with an object name; see `LevelActors.get`."""
         return self._actors.get(key, by_name=by_name)
+
+    def unused_id(self, stem: str) -> str:
+        """Return an id for one more actor, `stem` if no actor of the open level has that."""
+        return self._actors.unused_id(stem)
 
     def snapshot(self) -> list[Actor]:
         """Return every actor, of the play world while play runs."""

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Final
 
+from urlab_client._whole_files import write_whole
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.recording import (
     RecordingClear,
@@ -37,7 +38,6 @@ from urlab_client.server.physics.replay import Player, ReplaySessions, replay_fo
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
-from urlab_client.server.system.atomic_write import write_atomic
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""
@@ -137,7 +137,7 @@ def recording_save(server: ServerCore, request: RecordingSave) -> RecordingSaveO
     if not frames:
         raise Refusal("path_not_writable", "", absolute_path=str(file))
     try:
-        write_atomic(file, encode_json(frames))
+        write_whole(file, encode_json(frames))
     except OSError:
         raise Refusal("path_not_writable", "", absolute_path=str(file)) from None
     return RecordingSaveOk(absolute_path=str(file))

@@ -56,11 +56,10 @@ class PhysicsThread:
         self._iterate = iterate
         self._fail = fail
         self._give_up = give_up
-        self._health = health
         self.wake: threading.Condition = threading.Condition(lock.inner)
         self.stopping: bool = False
         self.death: str | None = None
-        self._thread = threading.Thread(target=self._run, name="urlab-physics", daemon=True)
+        self._thread = health.thread("urlab-physics", self._run, on_death=self._die)
 
     @property
     def alive(self) -> bool:
@@ -103,13 +102,14 @@ class PhysicsThread:
 
     def _run(self) -> None:
         with self._lock.inner:
-            try:
-                while not self.stopping:
-                    try:
-                        self._iterate()
-                    except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
-                        self._fail(error)
-                self._give_up(shutting_down())
-            except BaseException as error:  # noqa: BLE001 - a caller that waits for a step must not hang
-                self.death = self._health.report(error)
-                self._give_up(Refusal("internal_error", self.death))
+            while not self.stopping:
+                try:
+                    self._iterate()
+                except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
+                    self._fail(error)
+            self._give_up(shutting_down())
+
+    def _die(self, reason: str) -> None:
+        with self._lock.inner:
+            self.death = reason
+            self._give_up(Refusal("internal_error", reason))

@@ -29,6 +29,7 @@ from urlab_client.server.physics.replay import ReplaySessions
 from urlab_client.server.physics.reply_template import StepReplies
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
+from urlab_client.server.system.health import Health
 
 __all__ = ["Play", "Running"]
 
@@ -133,7 +134,8 @@ class Play:
             must not block.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, health: Health) -> None:
+        self._health = health
         self.listeners: list[Callable[[Running | None], None]] = []
         self._changed = threading.Condition()
         self._attempt: _Attempt | None = None
@@ -183,9 +185,15 @@ class Play:
         """
         self.stop()
         attempt = _Attempt()
+
+        def die(reason: str) -> None:
+            with self._changed:
+                attempt.error = reason
+                self._changed.notify_all()
+
         with self._changed:
             self._attempt = attempt
-        threading.Thread(target=self._build, args=(attempt, build), name="urlab-compile", daemon=True).start()
+        self._health.thread("urlab-compile", self._build, attempt, build, on_death=die).start()
 
     def wait(self, timeout_s: float) -> PIEState:
         """Wait until compilation has ended and return the state.
@@ -241,21 +249,23 @@ class Play:
             error = failure.message
         except BaseException as failure:  # noqa: BLE001 - a caller that waits for the start must not hang
             error = _unexpected(failure)
-        with self._changed:
-            if not attempt.abandoned:
-                if running is not None:
-                    try:
-                        self._announce(running)
-                    except Exception as failure:  # noqa: BLE001 - likewise
-                        error = _unexpected(failure)
-                        self._announce(None)
-                    else:
-                        attempt.running, running = running, None
-                if attempt.running is None:
-                    attempt.error = error
-            self._changed.notify_all()
-        if running is not None:
-            running.close()
+        try:
+            with self._changed:
+                if not attempt.abandoned:
+                    if running is not None:
+                        try:
+                            self._announce(running)
+                        except Exception as failure:  # noqa: BLE001 - likewise
+                            error = _unexpected(failure)
+                            self._announce(None)
+                        else:
+                            attempt.running, running = running, None
+                    if attempt.running is None:
+                        attempt.error = error
+                self._changed.notify_all()
+        finally:
+            if running is not None:
+                running.close()
 
     def _announce(self, running: Running | None) -> None:
         for listener in self.listeners:

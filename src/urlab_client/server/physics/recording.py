@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import logging
 import math
+import re
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -43,6 +45,11 @@ FRAME_OVERHEAD: Final = 500
 """About the bytes a frame takes besides its numbers."""
 
 CSV_PERIOD_S: Final = 0.002
+
+_READ_BYTES: Final = 1 << 30
+_LAYOUT_OVERHEAD: Final = 600  # about the bytes of a joint in a layout
+_NAME_CHARS: Final = 4096
+_SPACE: Final = re.compile(r"[ \t\n\r]*")
 
 
 @dataclass(frozen=True)
@@ -173,13 +180,6 @@ class _RecordedFrame(msgspec.Struct, forbid_unknown_fields=True):
     bHasCameraData: bool = False  # noqa: N815
 
 
-class _RecordingFile(msgspec.Struct, forbid_unknown_fields=True):
-    Frames: list[_RecordedFrame]
-
-
-_FILE: Final = msgspec.json.Decoder(_RecordingFile)
-
-
 def encode_json(frames: Iterable[Frame]) -> bytes:
     """Return the content of a recording file."""
     # Frame by frame: one call for all of them would keep physics from running for as long as it takes.
@@ -197,18 +197,61 @@ def decode_json(content: bytes) -> list[Frame]:
     """Read a recording file: keys in any case, missing ones at their defaults, unknown ones ignored.
 
     Raises:
-        ValueError: It is not JSON, or has no list of frames.
+        ValueError: It is not JSON, has no list of frames, or more of them than fit into 1 GiB.
     """
-    text = _text(content)
+    made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
     try:
-        try:
-            frames = _FILE.decode(text).Frames
-        except msgspec.ValidationError:
-            frames = _read_loosely(msgspec.json.decode(text))
+        return _kept(_from_file(_read(frame), made) for frame in _frames(_text(content)))
     except (RecursionError, OverflowError) as error:
         raise ValueError(f"it is not a recording: {error}") from None
-    made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
-    return [_from_file(frame, made) for frame in frames]
+
+
+def _frames(text: str) -> Iterator[object]:
+    """Yield the frames of a file one at a time, because decoded they take much more memory than as text."""
+    decode = json.JSONDecoder().raw_decode
+
+    def space(at: int) -> int:
+        return cast("re.Match[str]", _SPACE.match(text, at)).end()
+
+    def after(at: int, expected: str) -> int:
+        """Return where the next token, one of some characters, ends."""
+        at = space(at)
+        if text[at : at + 1] not in tuple(expected):
+            raise ValueError(f"it is not a recording: character {at} is not {' or '.join(expected)}")
+        return at + 1
+
+    found, at = False, after(0, "{")
+    while text[at - 1] != "}":
+        key, at = decode(text, space(at))
+        at = space(after(at, ":"))
+        if isinstance(key, str) and key.casefold() == "frames" and text[at : at + 1] == "[":
+            found, at = True, space(at + 1)
+            while text[at : at + 1] != "]":
+                frame, at = decode(text, at)
+                yield frame
+                at = after(at, ",]")
+                at = at - 1 if text[at - 1] == "]" else space(at)
+            at += 1
+        else:
+            at = decode(text, at)[1]
+        at = after(at, ",}")
+    if not found:
+        raise ValueError("the list 'Frames' is missing")
+
+
+def _kept(frames: Iterable[Frame]) -> list[Frame]:
+    kept: list[Frame] = []
+    layouts: set[int] = set()
+    size = 0
+    for frame in frames:
+        size += FRAME_OVERHEAD + frame.qpos.nbytes + frame.qvel.nbytes
+        if id(frame.layout) not in layouts:
+            layouts.add(id(frame.layout))
+            size += _LAYOUT_OVERHEAD * len(frame.layout.joints)
+        if size > _READ_BYTES:
+            raise ValueError(f"its frames take more than {_READ_BYTES} bytes of memory")
+        kept.append(frame)
+    return kept
 
 
 def _text(content: bytes) -> str:
@@ -220,6 +263,8 @@ def _text(content: bytes) -> str:
 def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...], JointLayout]) -> Frame:
     states = frame.jointStates
     widths = tuple((name, len(state.qPos), len(state.qVel)) for name, state in states.items())
+    if any(len(name) > _NAME_CHARS for name in states):
+        raise ValueError(f"a joint's name has more than {_NAME_CHARS} characters")
     layout = made.get(widths) or made.setdefault(widths, JointLayout.of(widths))
     qpos = [value for state in states.values() for value in state.qPos]
     qvel = [value for state in states.values() for value in state.qVel]
@@ -228,22 +273,17 @@ def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...
     return Frame(frame.timestamp, layout, np.array(qpos, dtype=np.float64), np.array(qvel, dtype=np.float64))
 
 
-def _read_loosely(plain: object) -> list[_RecordedFrame]:
-    frames = _folded(plain).get("frames")
-    if not isinstance(frames, list):
-        raise ValueError("the list 'Frames' is missing")  # noqa: TRY004 - the file is wrong, not the caller
-    found: list[_RecordedFrame] = []
-    for item in cast("list[object]", frames):
-        fields = _folded(item)
-        stamp, states = fields.get("timestamp"), fields.get("jointstates")
-        joints: dict[str, _Joint] = {}
-        for name, state in cast("dict[str, object]", states if isinstance(states, dict) else {}).items():
-            values = _folded(state)
-            joints[name] = _Joint(_numbers(values.get("qpos")), _numbers(values.get("qvel")))
-        found.append(
-            _RecordedFrame(timestamp=float(stamp) if isinstance(stamp, int | float) else 0.0, jointStates=joints)
-        )
-    return found
+def _read(frame: object) -> _RecordedFrame:
+    try:
+        return msgspec.convert(frame, _RecordedFrame)
+    except msgspec.ValidationError:
+        fields = _folded(frame)
+    stamp, states = fields.get("timestamp"), fields.get("jointstates")
+    joints: dict[str, _Joint] = {}
+    for name, state in cast("dict[str, object]", states if isinstance(states, dict) else {}).items():
+        values = _folded(state)
+        joints[name] = _Joint(_numbers(values.get("qpos")), _numbers(values.get("qvel")))
+    return _RecordedFrame(timestamp=float(stamp) if isinstance(stamp, int | float) else 0.0, jointStates=joints)
 
 
 def _folded(value: object) -> dict[str, object]:
@@ -268,12 +308,15 @@ def decode_csv(content: bytes) -> list[Frame]:
         ValueError: It has no header, or a cell is not a number.
     """
     try:
-        rows = [row for row in csv.reader(io.StringIO(_text(content))) if row]
+        return _kept(_from_table(row for row in csv.reader(io.StringIO(_text(content))) if row))
     except csv.Error as error:
         raise ValueError(f"it is not a table: {error}") from None
-    if not rows:
+
+
+def _from_table(rows: Iterator[list[str]]) -> Iterator[Frame]:
+    header = [name.strip() for name in next(rows, list[str]())]
+    if not header:
         raise ValueError("the table is empty")
-    header = [name.strip() for name in rows[0]]
     clock = next((at for at, name in enumerate(header) if name.casefold() in ("time", "timestamp")), None)
     columns: dict[str, dict[int, int]] = {}
     for at, name in enumerate(header):
@@ -284,16 +327,14 @@ def decode_csv(content: bytes) -> list[Frame]:
     joints = {name: [places[at] for at in sorted(places)] for name, places in columns.items()}
     layout = JointLayout.of((name, len(places), 0) for name, places in joints.items())
     order = [at for places in joints.values() for at in places]
-    frames: list[Frame] = []
-    for number, row in enumerate(rows[1:]):
+    for number, row in enumerate(rows):
         if len(row) < len(header):
             raise ValueError(f"row {number + 2} has {len(row)} cells, the header has {len(header)}")
         time = float(row[clock]) if clock is not None else number * CSV_PERIOD_S
         qpos = np.array([float(row[at]) for at in order], dtype=np.float64)
         if not (math.isfinite(time) and np.isfinite(qpos).all()):
             raise ValueError(f"row {number + 2} contains a number that is not finite")
-        frames.append(Frame(time, layout, qpos, np.empty(0)))
-    return frames
+        yield Frame(time, layout, qpos, np.empty(0))
 
 
 def duration(frames: Sequence[Frame] | deque[Frame]) -> float:

@@ -44,7 +44,7 @@ class Appearance(Struct, kw_only=True, frozen=True, omit_defaults=True):
         text = model_text(model, APPEARANCE_TEXT)
         try:
             return cls() if text is None else msgspec.json.decode(text, type=cls)
-        except msgspec.DecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"the scene's text {APPEARANCE_TEXT!r}: {error}") from None
 
     def texts(self) -> dict[str, str]:

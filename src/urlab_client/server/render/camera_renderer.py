@@ -267,6 +267,11 @@ class CameraRenderer:
         cameras = {key: self._by_name[key] for key in keys if key in self._by_name}
         return [Shot(key, camera, sync=True, late=_late(camera)) for key, camera in cameras.items()]
 
+    def newest(self, key: str) -> int:
+        """Return the number of the newest snapshot that a camera has drawn, by `ARTICULATION/CAMERA`; else 0."""
+        frame = self._by_name[key].frame
+        return 0 if frame is None else frame.frame_id or 0
+
     def latency(self, key: str) -> CameraDelayInForce | None:
         """Return the latency of a camera as it was set; None if it was not."""
         latency = self._by_name[key].latency
@@ -444,7 +449,7 @@ class CameraRenderer:
             self._pending.add(job)
             self._queue.put(job)
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="urlab-render", daemon=True)
+                self._thread = self._health.thread("urlab-render", self._run)
                 self._thread.start()
         return True
 
@@ -467,8 +472,6 @@ class CameraRenderer:
                     self._draw(stage)
         except Exception:
             logger.exception("camera images are left out from now on: drawing failed")
-        except BaseException as error:  # noqa: BLE001 - the next request for images fails
-            self._health.report(error)
         finally:
             with self._lock:
                 self._broken = True

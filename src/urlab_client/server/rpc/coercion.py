@@ -109,6 +109,9 @@ def _converter(info: inspect.Type) -> Converter:
             convert = _union_converter(members)
         case inspect.TupleType(item_types=items):
             convert = _tuple_converter([_item_converter(item) for item in items])
+        case inspect.ListType(item_type=inspect.StructType(cls=cls)):
+            nested = _nested_converter(cls)
+            convert = _list_converter(lambda value: nested(value if isinstance(value, dict) else {}))
         case inspect.ListType(item_type=item):
             convert = _list_converter(_item_converter(item))
         case inspect.DictType(value_type=item):

@@ -255,9 +255,10 @@ class Dispatcher:
         """Return the result of a job's handler as plain data with the numbers of the wire."""
         try:
             reply: Any = handler(self._core, request)
+            frame = encode_reply(reply)
         except Exception as failure:  # noqa: BLE001 - whoever asks for the job must hear of it
-            reply = _error(name, failure)
-        return msgspec.msgpack.decode(encode_reply(reply))
+            frame = encode_reply(_error(name, failure))
+        return msgspec.msgpack.decode(frame)
 
     def _check_session(self, session_id: str) -> None:
         if not self._core.session.accepts(session_id):

@@ -30,9 +30,8 @@ class Watchdog:
         """Configure the thread; `start` starts it."""
         self._core = core
         self._dispatcher = dispatcher
-        self._health = health
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="urlab-watchdog", daemon=True)
+        self._thread = health.thread("urlab-watchdog", self._run)
 
     @property
     def alive(self) -> bool:
@@ -53,13 +52,12 @@ class Watchdog:
 
     def _run(self) -> None:
         told: object = None
-        with self._health.watch():
-            while not self._stopping.wait(INTERVAL_S):
-                running = self._core.play.current
-                overdue = None if running is None else running.engine.overdue
-                if overdue is None:
-                    continue
-                if overdue.began_at != told:
-                    told = overdue.began_at
-                    logger.warning("physics has not returned from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds)
-                self._dispatcher.relieve(overdue.thread)
+        while not self._stopping.wait(INTERVAL_S):
+            running = self._core.play.current
+            overdue = None if running is None else running.engine.overdue
+            if overdue is None:
+                continue
+            if overdue.began_at != told:
+                told = overdue.began_at
+                logger.warning("physics has not returned from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds)
+            self._dispatcher.relieve(overdue.thread)

@@ -11,8 +11,8 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Final
+from collections.abc import Callable, Collection, Sequence
+from typing import Final, TypeAlias
 
 import zmq
 
@@ -34,6 +34,9 @@ from urlab_client.server.transport.shared_memory import SharedMemoryServer
 __all__ = ["CameraStreams"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_Sent: TypeAlias = dict[str, int]
+"""Snapshot's number of the last picture by `ARTICULATION/CAMERA`."""
 
 PERIOD_S: Final = 1.0 / 30.0
 QUEUED_FRAMES: Final = 10
@@ -117,18 +120,19 @@ class CameraStreams:
         self._dialect = dialect
         self._zmq_on: set[str] = set()
         self._shm_on: set[str] = set()
-        self._sent: dict[str, int] = {}
+        # Apart, because subscribers and readers of shared memory come at different times.
+        self._zmq_sent: _Sent = {}
+        self._shm_sent: _Sent = {}
         self._host = host
         self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
-        self._health = health
         self._failed = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._running: Running | None = None
         self._streams: list[_Stream] = []
-        self._thread = threading.Thread(target=self._run, name="urlab-cameras", daemon=True)
+        self._thread = health.thread("urlab-cameras", self._run)
         try:
             self._streams.append(_Stream(self._context, self._authenticator, host, port))
         except BaseException:
@@ -160,7 +164,8 @@ class CameraStreams:
             if self._stopping.is_set():
                 return
             self._running = running
-            self._sent.clear()
+            self._zmq_sent.clear()
+            self._shm_sent.clear()
             for stream in self._streams[1:]:
                 stream.socket.close()
             del self._streams[1:]
@@ -187,9 +192,10 @@ class CameraStreams:
             running = self._running
             if running is None:
                 return
-            if key not in self._zmq_on | self._shm_on and not self._dialect.cameras_repeat:
-                self._sent[key] = running.engine.snapshots.number  # publish nothing until the state changes
-            for on, wanted in ((self._zmq_on, zmq), (self._shm_on, shm)):
+            places = ((self._zmq_on, self._zmq_sent, zmq), (self._shm_on, self._shm_sent, shm))
+            for on, sent, wanted in places:
+                if wanted and key not in on:  # a state that the camera has not seen is news, even if nothing moves now
+                    sent[key] = max(sent.get(key, 0), running.cameras.newest(key))
                 (on.add if wanted else on.discard)(key)
             if self._memory is not None:
                 size = running.cameras.resolutions()[key] if shm else None
@@ -230,14 +236,13 @@ class CameraStreams:
 
     def _run(self) -> None:
         pause = 0.0
-        with self._health.watch():
-            while not self._stopping.wait(pause):
-                began = time.monotonic()
-                try:
-                    self._publish()
-                except Exception as error:  # noqa: BLE001 - the next images may do better
-                    self._skip("the camera images of a moment are not published", error)
-                pause = max(0.0, began + PERIOD_S - time.monotonic())
+        while not self._stopping.wait(pause):
+            began = time.monotonic()
+            try:
+                self._publish()
+            except Exception as error:  # noqa: BLE001 - the next images may do better
+                self._skip("the camera images of a moment are not published", error)
+            pause = max(0.0, began + PERIOD_S - time.monotonic())
 
     def _skip(self, what: str, error: Exception) -> None:
         """Log an error, unless the sockets were closed because the server is closing."""
@@ -263,15 +268,16 @@ class CameraStreams:
                 film = running.cameras.capture(shots, running.engine.snapshots.number)
         except Refusal:  # physics is busy; retried next time
             return
-        payloads = self._payloads(running, shots, film)
+        places = (shared, self._shm_sent), (topics, self._zmq_sent)
+        for_memory, for_topics = self._payloads(running, shots, film, places)
         if self._memory is not None:
             with self._lock:
-                for key, payload in payloads.items() if self._running is running else ():
+                for key, payload in for_memory.items() if self._running is running else ():
                     self._memory.publish_picture(key, payload)
         images: dict[str, bytes] = {}
-        for key in filter(payloads.__contains__, topics):
+        for key, payload in for_topics.items():
             try:
-                image = self._filtered(topics[key], payloads[key])
+                image = self._filtered(topics[key], payload)
             except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
                 self._skip(f"an image of '{key}' is not published", error)
                 continue
@@ -283,27 +289,28 @@ class CameraStreams:
                     if stream.key in images:
                         stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
 
-    def _payloads(self, running: Running, shots: Sequence[Shot], film: Film) -> dict[str, bytes]:
-        """Draw, and return the messages to send."""
+    def _payloads(
+        self, running: Running, shots: Sequence[Shot], film: Film, places: Sequence[tuple[Collection[str], _Sent]]
+    ) -> list[dict[str, bytes]]:
+        """Draw, and return the messages for each place, given by its cameras and the last pictures sent there."""
         frames = running.cameras.frames(shots, film) or {}
+        news: list[dict[str, bytes]] = [{} for _ in places]
         with self._lock:
-            if self._running is not running:
-                return {}
-            news: dict[str, bytes] = {}
-            for shot in shots:
+            for shot in shots if self._running is running else ():
                 frame = frames.get(shot.key)
                 if frame is None:
                     continue
                 number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
-                if self._is_news(running, shot.key, number):
-                    news[shot.key] = self._headed(frame, film.capture_time(shot))
+                for (keys, sent), messages in zip(places, news, strict=True):
+                    if shot.key in keys and self._is_news(running, shot.key, number, sent):
+                        messages[shot.key] = self._headed(frame, film.capture_time(shot))
         return news
 
-    def _is_news(self, running: Running, key: str, number: int) -> bool:
+    def _is_news(self, running: Running, key: str, number: int, sent: _Sent) -> bool:
         """Whether to send a picture of snapshot `number`, if the camera sends only changes."""
         latency = running.cameras.latency(key)
         repeats = self._dialect.cameras_repeat if latency is None else not latency.on_state_change
-        before, self._sent[key] = self._sent.get(key), number
+        before, sent[key] = sent.get(key), number
         return repeats or before != number
 
     def _headed(self, frame: CameraFrame, captured: float) -> bytes:

@@ -103,7 +103,6 @@ class StreamServer:
         self._context = zmq.Context()
         self._context.linger = 0
         self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
-        self._health = health
         self._failed = 0
         # XPUB is PUB that reports subscriptions.
         self._state = self._context.socket(zmq.XPUB)
@@ -139,7 +138,7 @@ class StreamServer:
         self._subscribed: dict[zmq.Socket[bytes], set[bytes]] = {self._state: set(), self._info: set()}
         self._listening: list[bytes] = []
         self._broadcast: Broadcast | None = None
-        self._thread = threading.Thread(target=self._run, name="urlab-streams", daemon=True)
+        self._thread = health.thread("urlab-streams", self._run)
 
     @property
     def alive(self) -> bool:
@@ -207,8 +206,6 @@ class StreamServer:
                     if self._broadcast is None and self._shown is not None:
                         raise  # the play session cannot be streamed, and subscribers would wait in vain
                     self._skip(error)
-        except BaseException as error:  # noqa: BLE001 - subscribers hear of it by the next request
-            self._health.report(error)
         finally:
             self._leave()
             self._close()

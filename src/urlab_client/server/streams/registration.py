@@ -9,8 +9,10 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from urlab_client._whole_files import write_whole
 from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 
 __all__ = ["Registration"]
@@ -21,18 +23,19 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 class Registration:
     """Keeps the file of one server in the registry for as long as the server is open."""
 
-    def __init__(self, directory: Path, describe: Callable[[], InstanceInfo]) -> None:
+    def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
         """Configure the registration; `start` writes the file.
 
         Args:
             directory: The registry.
             describe: Returns the contents of the file.
+            health: Notified when the thread dies.
         """
         self._directory = directory
         self._describe = describe
         self._path: Path | None = None
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="urlab-registry", daemon=True)
+        self._thread = health.thread("urlab-registry", self._run)
 
     def start(self) -> None:
         """Write the file, and renew it before it would be considered stale."""
@@ -59,11 +62,8 @@ class Registration:
     def _write(self) -> None:
         instance = self._describe()
         path = self._directory / f"{instance.instance_id}_{instance.pid}.json"
-        fresh = path.with_suffix(".new")
         try:
-            self._directory.mkdir(parents=True, exist_ok=True)
-            fresh.write_bytes(instances.encode(instance, dt.datetime.now(dt.UTC)))
-            fresh.replace(path)
+            write_whole(path, instances.encode(instance, dt.datetime.now(dt.UTC)), durable=False)
         except OSError as error:
             logger.warning("the server is not in the registry: %s", error)
         else:

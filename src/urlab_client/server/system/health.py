@@ -1,19 +1,23 @@
 """Health of a server's threads, and callbacks for when one dies.
 
-Threads report their unexpected end here. The dispatcher then refuses every request, and `SimulatedServer` calls the
-user's callbacks.
+`Health.thread` makes all threads of a server, and reports their unexpected end here. The dispatcher then refuses every
+request, and `SimulatedServer` calls the user's callbacks.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
+from typing import TypeVarTuple
+
+from urlab_client._background import daemon
 
 __all__ = ["Health"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+Ts = TypeVarTuple("Ts")
 
 
 class Health:
@@ -43,13 +47,22 @@ class Health:
             _tell(callback, reason)
         return reason
 
-    @contextmanager
-    def watch(self) -> Generator[None]:
-        """Report an exception that ends the block, and suppress it so that the thread ends quietly."""
-        try:
-            yield
-        except BaseException as error:  # noqa: BLE001 - whatever it is, nobody else hears of it
-            self.report(error)
+    def thread(
+        self,
+        name: str,
+        run: Callable[[*Ts], object],
+        *arguments: *Ts,
+        on_death: Callable[[str], object] = lambda _: None,
+    ) -> threading.Thread:
+        """Return a daemon thread, not started, whose death by an exception is reported.
+
+        Args:
+            name: Its name.
+            run: Its body.
+            arguments: Arguments of `run`.
+            on_death: Called with the message after the report, on that thread, to fail what waits for it.
+        """
+        return daemon(name, run, *arguments, failed=lambda error: on_death(self.report(error)))
 
     def add_callback(self, callback: Callable[[str], None]) -> None:
         """Call `callback` once with the first failure, on the thread that dies; immediately if there was one."""

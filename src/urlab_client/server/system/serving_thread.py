@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 
 __all__ = ["ServingThread"]
@@ -17,21 +18,23 @@ __all__ = ["ServingThread"]
 class ServingThread:
     """The current serving thread. It calls `begin` before a request and `finish` after it."""
 
-    def __init__(self, name: str, run: Callable[[bytes | None], None]) -> None:
+    def __init__(self, name: str, run: Callable[[bytes | None], None], health: Health) -> None:
         """Configure the thread; `start` starts it.
 
         Args:
             name: Name of the thread.
-            run: Target of the thread. Its argument is the reply to send first when it replaces another thread.
+            run: Body of the thread. Its argument is the reply to send first when it replaces another thread.
+            health: Notified when the thread dies.
         """
         self._name = name
         self._run = run
+        self._health = health
         self._lock = threading.Lock()
         self._working = False
         self._thread = self._made(None)
 
     def _made(self, owed: bytes | None) -> threading.Thread:
-        return threading.Thread(target=self._run, args=(owed,), name=self._name, daemon=True)
+        return self._health.thread(self._name, self._run, owed)
 
     def start(self) -> None:
         """Start the thread."""

@@ -115,8 +115,7 @@ class ZapAuthenticator:
         self._stopper = context.socket(zmq.PAIR)
         self._stopper.linger = 0
         self._stopper.connect(_STOP)
-        arguments = (curve_keys, questions, stop, health)
-        self._thread = threading.Thread(target=_answer, args=arguments, name="urlab-auth", daemon=True)
+        self._thread = health.thread("urlab-auth", _answer, curve_keys, questions, stop)
         self._thread.start()
 
     def protect(self, socket: zmq.Socket[bytes]) -> None:
@@ -134,13 +133,13 @@ class ZapAuthenticator:
             self._stopper.close()
 
 
-def _answer(curve_keys: CurveKeys, questions: zmq.Socket[bytes], stop: zmq.Socket[bytes], health: Health) -> None:
+def _answer(curve_keys: CurveKeys, questions: zmq.Socket[bytes], stop: zmq.Socket[bytes]) -> None:
     """Answer ZAP requests (ZeroMQ RFC 27) until told to stop."""
     poller = zmq.Poller()
     poller.register(questions, zmq.POLLIN)
     poller.register(stop, zmq.POLLIN)
     refused = 0
-    with health.watch(), questions, stop:
+    with questions, stop:
         while stop not in dict(poller.poll()):
             version, number, _, address, _, mechanism, *credentials = questions.recv_multipart()
             welcome = (

@@ -198,7 +198,7 @@ class RpcEndpoint:
         self._waker = self._context.socket(zmq.DEALER)
         self._waker.connect(_WAKE)
         self._stopping = False
-        self.serving = ServingThread("urlab-rpc", self._run)
+        self.serving = ServingThread("urlab-rpc", self._run, health)
 
     @property
     def alive(self) -> bool:
@@ -236,8 +236,6 @@ class RpcEndpoint:
                 self._send_owed(owed)
             while self._serve():
                 pass
-        except zmq.ZMQError as error:
-            self._health.report(error)
         finally:
             if self.serving.is_current:
                 self._close()

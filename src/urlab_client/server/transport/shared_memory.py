@@ -95,7 +95,6 @@ class SharedMemoryServer:
         Raises:
             OSError: The disk is full, or `base` cannot be used.
         """
-        self._health = health
         with contextlib.ExitStack() as made:
             self._instance = InstanceDirectory(base)
             made.callback(self._instance.remove)
@@ -121,7 +120,7 @@ class SharedMemoryServer:
         self._given_up = False
         self._seen = 0  # so that a request before the thread's start is served
         self._answer: Answer = bytes
-        self.serving: ServingThread = ServingThread("urlab-shm", self._run)
+        self.serving: ServingThread = ServingThread("urlab-shm", self._run, health)
 
     def start(self, answer: Answer) -> None:
         """Start the thread that serves.
@@ -272,9 +271,9 @@ class SharedMemoryServer:
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
             self._give_up()
-        except BaseException as error:  # noqa: BLE001 - clients over ZMQ learn of it with their next request
-            self._health.report(error)
+        except BaseException:
             self._give_up()
+            raise
         finally:
             with self._lock:
                 given_up = self._given_up

@@ -83,8 +83,8 @@ function ping() {
 }
 setInterval(ping, PING_MS);
 
-/** Send an HTTP request with a file or JSON; a failure shows a toast and returns null. */
-export async function ask(method, path, body, { quiet = false } = {}) {
+/** Send an HTTP request with a file or JSON; a failure that `refused` does not handle shows a toast and returns null. */
+export async function ask(method, path, body, { quiet = false, refused = () => false } = {}) {
   let answer;
   try {
     answer = await fetch(new URL(path, base), {
@@ -98,7 +98,7 @@ export async function ask(method, path, body, { quiet = false } = {}) {
   }
   const said = await answer.json().catch(() => ({}));
   if (answer.ok) return said;
-  if (!quiet) toast([said.error?.message ?? answer.statusText, said.error?.hint].filter(Boolean).join(" "));
+  if (!quiet && !refused(said.error)) toast([said.error?.message ?? answer.statusText, said.error?.hint].filter(Boolean).join(" "));
   return null;
 }
 

@@ -15,6 +15,7 @@ const importing = h("button", { class: "quiet", title: "An MJCF file, or a ZIP a
 const warning = h("div", { class: "line warning", id: "no-manager", hidden: true },
   h("span", {}, "Play cannot begin: this level has no manager."),
   h("button", { id: "add-manager", onclick: async () => done(await op("ensure_manager")) }, "Add manager"));
+const replacing = h("div", { class: "line warning", id: "would-replace", role: "alert", hidden: true });
 /** Actors that the plugin itself needs; users do not place or remove them. */
 const isManager = (actor) => /^A?Mj(Replay)?Manager$/.test(actor.class);
 const managesPlay = (actor) => /^A?MjManager$/.test(actor.class);
@@ -103,10 +104,10 @@ function free([x, y, z]) {
   return [x, y, z];
 }
 
-/** A free name: the base without its final number, and the next number. */
+/** A free name for one more, which does not begin as another's does: some programs tell robots apart by that. */
 function unused(name) {
-  const stem = name.replace(/[_-]?\d+$/, "");
-  for (let n = 2; ; n++) if (!document.querySelector(`[data-actor="${stem}_${n}"]`)) return `${stem}_${n}`;
+  const stem = name.replace(/^copy\d+_/, "");
+  for (let n = 1; ; n++) if (!document.querySelector(`[data-actor="copy${n}_${stem}"]`)) return `copy${n}_${stem}`;
 }
 
 /** Propose a name and a free position for the next actor, unless the user has typed one. */
@@ -126,12 +127,18 @@ async function spawn() {
   done(answer);
 }
 
-async function importModel() {
+function importModel() {
   const [chosen] = file.files;
-  if (!chosen) return;
   file.value = "";
+  if (chosen) sendModel(chosen);
+}
+
+/** Import a file; `replace` names the blueprint that may be lost. */
+async function sendModel(chosen, replace = "") {
+  replacing.hidden = true;
   text(importing, "Importing …");
-  const answer = await ask("PUT", `api/models/${encodeURIComponent(chosen.name)}`, chosen);
+  const path = `api/models/${encodeURIComponent(chosen.name)}?replace=${encodeURIComponent(replace)}`;
+  const answer = await ask("PUT", path, chosen, { refused: (error) => error?.code === "would_replace" && confirmReplacing(chosen, error) });
   text(importing, "Import a model …");
   if (!answer) return;
   toast(`${answer.name} can be spawned.`, "good");
@@ -140,10 +147,19 @@ async function importModel() {
   propose();
 }
 
+function confirmReplacing(chosen, { message, name }) {
+  replacing.replaceChildren(h("span", {}, `${chosen.name}: ${message}`),
+    h("span", { class: "acts" },
+      h("button", { onclick: () => sendModel(chosen, name) }, `Replace ${name}`),
+      h("button", { onclick: () => { replacing.hidden = true; } }, "Cancel")));
+  replacing.hidden = false;
+  return true;
+}
+
 export function makeScene() {
   for (const input of place) input.addEventListener("input", () => { input.dataset.typed = "yes"; });
   blueprint.addEventListener("change", propose);
-  $("scene").append(h("h2", {}, "Scene", h("span", { class: "space" }), importing, file), warning, actors,
+  $("scene").append(h("h2", {}, "Scene", h("span", { class: "space" }), importing, file), warning, replacing, actors,
     h("div", { class: "spawn" }, h("h3", {}, "Add to the level"),
       h("span", { class: "fields" }, h("label", {}, "blueprint ", blueprint), h("label", {}, "name ", id)),
       fields(place, yaw), h("button", { id: "spawn", onclick: spawn }, "Spawn")));

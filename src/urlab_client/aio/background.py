@@ -1,0 +1,118 @@
+"""Tasks and threads in the background of a client: none ends unnoticed.
+
+An unexpected end is logged, reported as an event, and passed on to whatever waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, TypeAlias, TypeVarTuple
+
+from urlab_client._background import daemon
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.streams import ClientEvent, TaskFailed
+
+__all__ = ["Tell", "background_task", "background_thread", "kept_running"]
+
+log: logging.Logger = logging.getLogger("urlab_client.background")
+
+Ts = TypeVarTuple("Ts")
+
+_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 30.0
+
+Tell: TypeAlias = Callable[[ClientEvent], object]
+"""Publishes an event; called on the event loop."""
+
+
+def background_task(
+    name: str,
+    work: Coroutine[Any, Any, None],
+    *,
+    tell: Tell | None = None,
+    failed: Callable[[URLabError], object] = lambda _: None,
+) -> asyncio.Task[None]:
+    """Start a task that nobody awaits, or not at once. The caller must keep a reference to it.
+
+    Args:
+        name: Its name.
+        work: What it does.
+        tell: Publishes the event of its unexpected end; None where there are no events.
+        failed: Called on the event loop with the error of its unexpected end, to fail what waits for it.
+    """
+
+    def note_end(task: asyncio.Task[None]) -> None:
+        if task.cancelled() or (error := task.exception()) is None:
+            return
+        failed(_noted(name, error))
+        if tell is not None:
+            tell(TaskFailed(task=name, error=_said(error)))
+
+    task = asyncio.create_task(work, name=name)
+    task.add_done_callback(note_end)
+    return task
+
+
+def background_thread(
+    name: str,
+    run: Callable[[*Ts], object],
+    *arguments: *Ts,
+    tell: Tell | None = None,
+    failed: Callable[[URLabError], object] = lambda _: None,
+) -> threading.Thread:
+    """Return a daemon thread, not started.
+
+    Args:
+        name: Its name.
+        run: What it does.
+        arguments: Arguments of `run`.
+        tell: Publishes the event of its unexpected end, on the running event loop; None where there are no events.
+        failed: Called on the thread with the error of its unexpected end, to fail what waits for it.
+    """
+    loop = None if tell is None else asyncio.get_running_loop()
+
+    def note_end(error: BaseException) -> None:
+        failed(_noted(name, error))
+        if loop is not None and tell is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(tell, TaskFailed(task=name, error=_said(error)))
+
+    return daemon(name, run, *arguments, failed=note_end)
+
+
+async def kept_running(name: str, work: Callable[[], Awaitable[None]], failed: Callable[[URLabError], object]) -> None:
+    """Run something until it returns, and whenever it fails, run it again after a pause, which grows to half a minute.
+
+    Args:
+        name: Its name.
+        work: What to run.
+        failed: Called with the error of each failure, which has been logged.
+    """
+    loop, pause = asyncio.get_running_loop(), _PAUSE_S
+    while True:
+        began = loop.time()
+        try:
+            return await work()
+        except Exception as error:  # noqa: BLE001 - whatever it is, nobody else hears of it
+            failed(_noted(name, error))
+        if loop.time() - began > _LONGEST_PAUSE_S:
+            pause = _PAUSE_S
+        await asyncio.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _noted(name: str, error: BaseException) -> URLabError:
+    """Log an unexpected end, and return the error for whatever waits."""
+    log.error("%s ended unexpectedly", name, exc_info=error)
+    failure = URLabError(f"{name} ended unexpectedly: {_said(error)}.", hint="The log has the details.")
+    failure.__cause__ = error
+    return failure
+
+
+def _said(error: BaseException) -> str:
+    text = str(error).rstrip(".")
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

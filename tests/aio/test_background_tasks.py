@@ -1,0 +1,258 @@
+"""Tasks and threads of a client that fail: an event and the log name them, and what waits for them hears why."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bare_loop import run_bare
+from ports import free_port
+from waiting import DEADLINE_S
+from waiting import until as wait_until
+
+from urlab_client.aio import Stream, URLabClient
+from urlab_client.aio import launch as launching
+from urlab_client.aio.control import Control
+from urlab_client.aio.launch import LaunchedTransport
+from urlab_client.aio.live.camera_switch import CameraSwitch
+from urlab_client.aio.live.live_state import LiveState
+from urlab_client.aio.state import session_keeper
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.session_keeper import SessionKeeper
+from urlab_client.aio.transport import readiness
+from urlab_client.aio.transport.poller import Poller
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.protocol.errors import ServerRestarted, ServerUnreachable, URLabError
+from urlab_client.protocol.messages.streams import ClientEvent, ServerReconnected, TaskFailed
+from urlab_client.server import SimulatedServer
+
+
+async def fail(*_: Any, **__: Any) -> None:
+    raise MemoryError("none left")
+
+
+def die(*_: Any, **__: Any) -> Any:
+    raise MemoryError("none left")
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[SimulatedServer]:
+    async with SimulatedServer("arm", play=True) as made:
+        yield made
+
+
+async def until(events: Stream[ClientEvent], kind: type[ClientEvent]) -> ClientEvent:
+    async with asyncio.timeout(DEADLINE_S):
+        async for event in events:
+            if isinstance(event, kind):
+                return event
+    raise AssertionError(kind)
+
+
+async def is_told(events: Stream[ClientEvent], caplog: pytest.LogCaptureFixture, name: str) -> None:
+    event = await until(events, TaskFailed)
+    assert isinstance(event, TaskFailed)
+    assert (event.task, event.error) == (name, "MemoryError: none left")
+    (record,) = [one for one in caplog.records if one.name == "urlab_client.background" and name in one.getMessage()]
+    assert record.exc_info is not None
+    assert isinstance(record.exc_info[1], MemoryError)
+
+
+async def test_the_keeper_of_the_session(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_keeper, "_LOOK_S", 0.01)
+    ports = {f"{name}_port": free_port() for name in ("step", "state", "ctrl", "info", "camera")}
+    async with SimulatedServer("arm", play=True, **ports) as first:
+        client = URLabClient(**first.client_options(), step_mode="direct", keep_session=True)
+        events = client.events()
+        with monkeypatch.context() as patch:
+            patch.setattr(SessionKeeper, "_look", fail)
+            await client.discover()
+            await is_told(events, caplog, "urlab-keeper")
+        assert (await client.step()).step == 1
+    await wait_until(lambda: client._transport.refused)  # type: ignore[union-attr]
+    async with SimulatedServer("arm", play=True, **ports), client:
+        assert await until(events, ServerReconnected)
+        with pytest.raises(ServerRestarted) as caught:
+            await client.step()
+        assert "urlab-keeper ended unexpectedly: MemoryError: none left" in str(caught.value.__cause__)
+        await client.discover()
+        assert client._session.unkept is None
+        assert client._keeper._task is not None
+        assert not client._keeper._task.done()
+
+
+async def test_the_watch_on_the_connection(
+    server: SimulatedServer, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ConnectionMonitor, "_find_out", fail)
+    async with URLabClient(**server.client_options(), step_mode="direct") as client:
+        await client.discover()
+        async with client.events() as events:
+            client._watch._look()
+            await is_told(events, caplog, "urlab-watch")
+            assert (await client.step()).step == 1
+
+
+async def test_the_renewal_of_claims(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Control, "_renew_one", fail)
+    async with (
+        SimulatedServer("arm", play=True, dialect="beta") as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        await client.discover()
+        async with client.events() as events:
+            await client.articulations["arm"].claim(ttl=0.01)
+            await is_told(events, caplog, "urlab-claims")
+            assert (await client.step()).step == 1
+
+
+async def test_the_switching_of_cameras(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with (
+        SimulatedServer("arm", play=True, dialect="beta") as server,
+        URLabClient(**server.client_options(), live_pictures=False) as client,
+    ):
+        await client.discover()
+        view, switch = client.articulations["arm"].cameras["wrist"], client._publishers.camera_switch
+        assert switch is not None
+        async with client.events() as events:
+            with monkeypatch.context() as patch:
+                patch.setattr(CameraSwitch, "_send", fail)
+                async with view.frames():
+                    await is_told(events, caplog, "urlab-cameras")
+                    with pytest.raises(URLabError, match="urlab-cameras ended unexpectedly: MemoryError") as caught:
+                        await switch.settled()
+                    assert isinstance(caught.value.__cause__, MemoryError)
+            async with view.frames():
+                await switch.settled()
+                assert switch.is_on(view.info)
+
+
+async def test_the_log_and_the_end_of_a_started_server(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launching, "_log_lines", fail)
+    monkeypatch.setattr(LaunchedTransport, "_tell_end", fail)
+    async with URLabClient("sim://arm", step_mode="direct") as client, client.events() as events:
+        await client.discover()
+        await is_told(events, caplog, "urlab-server-log")
+        await is_told(events, caplog, "urlab-server-end")
+        assert (await client.step()).step == 1
+
+
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An event loop that starts no processes, as uvloop's."""
+
+    async def refuse(*_: Any, **__: Any) -> None:
+        raise NotImplementedError
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
+
+
+@pytest.mark.usefixtures("no_processes")
+async def test_threads_that_read_from_a_started_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launching, "_CHUNK_BYTES", "many")
+    async with URLabClient("sim://arm") as client:
+        with pytest.raises(URLabError, match="urlab-server ended unexpectedly: TypeError") as caught:
+            await client.discover()
+        assert isinstance(caught.value.__cause__, TypeError)
+
+
+@pytest.mark.usefixtures("no_processes")
+async def test_the_thread_that_waits_for_a_started_server(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launching._Watched, "_watch", die)
+    client = URLabClient("sim://arm", step_mode="direct")
+    async with client.events() as events:
+        await client.discover()
+        assert (await client.step()).step == 1
+        await is_told(events, caplog, "urlab-server")
+    await client.close()
+
+
+async def test_the_thread_that_polls_shared_memory(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SharedMemoryRegions, "connect_bell", lambda _: None)
+    async with (
+        SimulatedServer("arm", play=True, shm_dir=tmp_path) as server,
+        URLabClient(**server.client_options(), transport="shm", step_mode="direct") as client,
+    ):
+        await client.discover()
+        async with client.events() as events:
+            with monkeypatch.context() as patch:
+                patch.setattr(Poller, "_look", die)
+                step = 0
+                async with asyncio.timeout(DEADLINE_S):
+                    while not events.stats.received:  # a step that is answered at once needs no poll
+                        step += 200
+                        assert (await client.step(200)).step == step
+                await is_told(events, caplog, "urlab-shm")
+            look, looked = Poller._look, list[Poller]()
+
+            def note(poller: Poller) -> Any:
+                looked.append(poller)
+                return look(poller)
+
+            monkeypatch.setattr(Poller, "_look", note)
+            async with asyncio.timeout(DEADLINE_S):
+                while not looked:  # by the next thread
+                    step += 200
+                    assert (await client.step(200)).step == step
+
+
+def test_the_thread_that_watches_sockets(
+    scripted: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readiness, "_AGAIN_S", 0.01)
+    look, lives, again = readiness._Watcher._look, iter([True, True, False]), list[bool]()
+
+    def look_or_die(self: Any) -> bool:
+        alive = next(lives, None)
+        if alive is None:
+            again.append(True)  # the next thread
+        return die() if alive is False else look(self)
+
+    async def main() -> None:
+        client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False)
+        async with client, client.events() as events:
+            monkeypatch.setattr(readiness._Watcher, "_look", look_or_die)
+            for _ in range(3):
+                assert await client.meta()
+            await is_told(events, caplog, "urlab-sockets")
+            await wait_until(lambda: again)
+            assert await client.meta()
+
+    run_bare(main())
+
+
+async def test_an_error_in_one_receiver_costs_the_others_nothing(
+    server: SimulatedServer, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with URLabClient(**server.client_options(), step_mode="live") as client:
+        await client.discover()
+        monkeypatch.setattr(LiveState, "_take_over", die)
+        async with client.state_stream("all") as states:
+            for _ in range(3):
+                await states.receive(timeout=DEADLINE_S)
+    (record, *_) = [one for one in caplog.records if "could not be handled" in one.getMessage()]
+    assert record.exc_info is not None
+    assert isinstance(record.exc_info[1], MemoryError)
+
+
+async def test_a_failing_listener_hides_no_lost_connection(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with SimulatedServer("arm", play=True) as server:
+        client = URLabClient(**server.client_options(), rcv_timeout_ms=60_000)
+        await client.discover()
+        monkeypatch.setattr(ConnectionMonitor, "on_connection", die)
+        client._transport.on_event = die
+    async with client:
+        with pytest.raises(ServerUnreachable):
+            await client.meta(timeout=0.05)
+    assert "could not be handled" in caplog.text

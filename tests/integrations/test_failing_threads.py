@@ -1,0 +1,174 @@
+"""Threads and tasks of integrations that fail: whatever waits for them fails with the cause, and the log names them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import AsyncIterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from waiting import DEADLINE_S, eventually, until
+
+from urlab_client.aio import URLabClient
+from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations.gym import pictures as drawing
+from urlab_client.integrations.gym import vector
+from urlab_client.integrations.record import RecordingError, lerobot_process, read_run, record
+from urlab_client.integrations.record import writer as writing
+from urlab_client.integrations.record.lerobot_process import LeRobot
+from urlab_client.integrations.view.view import AsyncView, ViewOptions
+from urlab_client.protocol.errors import ConnectionLost, URLabError
+from urlab_client.server import SimulatedServer
+
+
+def die(*_: Any, **__: Any) -> Any:
+    raise SystemExit("enough")
+
+
+async def fail(*_: Any, **__: Any) -> None:
+    raise MemoryError("none left")
+
+
+async def lose(*_: Any, **__: Any) -> None:
+    raise ConnectionLost("gone")
+
+
+@pytest.fixture
+async def client() -> AsyncIterator[URLabClient]:
+    async with (
+        SimulatedServer("arm", play=True, unpaused=True) as server,
+        URLabClient(**server.client_options()) as made,
+    ):
+        await made.discover()
+        yield made
+
+
+def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:
+    return any(f"{name} ended unexpectedly" in record.getMessage() and record.exc_info for record in caplog.records)
+
+
+async def test_the_thread_that_writes(
+    client: URLabClient, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = record(client, tmp_path / "run.mcap")
+    with pytest.raises(RecordingError, match=r"broke off: SystemExit\('enough'\)") as caught:  # noqa: PT012
+        async with recorder:
+            monkeypatch.setattr(writing._Sink, "write", die)
+            await until(lambda: recorder.failed)
+    assert isinstance(caught.value.__cause__, RecordingError)
+    assert isinstance(caught.value.__cause__.__cause__, SystemExit)
+    assert logged(caplog, "urlab-record")
+
+
+async def test_the_tasks_that_feed_a_recording(
+    client: URLabClient, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Follower, "_follow_states", fail)
+    recorder = record(client, tmp_path / "run.mcap")
+    with pytest.raises(RecordingError, match=r"broke off: MemoryError\('none left'\)"):
+        async with recorder:
+            await until(lambda: recorder.failed)
+    assert logged(caplog, "urlab-feed")
+    assert read_run(tmp_path / "run.mcap").damage == "", "what it holds is whole"
+
+
+class Display:
+    """A display that fails with its first state."""
+
+    address = ""
+
+    def __init__(self) -> None:
+        self.closed = False
+
+    def open(self) -> None: ...
+    def idle(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.closed = True
+
+    use = show = show_picture = die
+
+
+async def test_the_thread_that_shows(client: URLabClient, caplog: pytest.LogCaptureFixture) -> None:
+    display = Display()
+    options = ViewOptions(cameras=(), camera_hz=10.0, max_hz=100.0, contacts=False)
+    async with AsyncView(client, display, options, "view") as view:
+        await until(lambda: view.closed)
+        assert isinstance(view.error, URLabError)
+        assert isinstance(view.error.__cause__, SystemExit)
+    assert display.closed
+    assert logged(caplog, "urlab-view")
+
+
+async def test_the_tasks_that_feed_a_view(client: URLabClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Fine(Display):
+        def use(self, *_: Any) -> None: ...
+
+        show = show_picture = use
+
+    monkeypatch.setattr(Follower, "_follow_states", fail)
+    options = ViewOptions(cameras=(), camera_hz=10.0, max_hz=100.0, contacts=False)
+    async with AsyncView(client, Fine(), options, "view") as view:
+        await until(lambda: view.closed)
+        assert isinstance(view.error, URLabError)
+        assert isinstance(view.error.__cause__, MemoryError)
+
+
+def test_the_thread_that_draws_for_a_batch(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: Future[None] = Future()
+
+    class Stuck(Future[Any]):
+        def set_running_or_notify_cancel(self) -> bool:
+            begun.result(DEADLINE_S)
+            raise MemoryError("none left")
+
+    scene: Any = None
+    thread = drawing._Thread(scene, scene)
+    visible: Any = None
+    monkeypatch.setattr(drawing, "Future", Stuck)
+    thread.submit([], visible)
+    monkeypatch.setattr(drawing, "Future", Future)
+    waiting = thread.submit([], visible)
+    begun.set_result(None)
+    eventually(lambda: not thread._thread.is_alive())
+    for drawn in (lambda: waiting, lambda: thread.submit([], visible)):
+        with pytest.raises(URLabError, match="urlab-pictures ended unexpectedly: MemoryError") as caught:
+            drawn().result(DEADLINE_S)
+        assert isinstance(caught.value.__cause__, MemoryError)
+    assert logged(caplog, "urlab-pictures")
+    thread.close()
+
+
+def test_the_thread_that_listens_to_lerobot(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("import sys\nsys.stdout.buffer.write(b'\\xff\\n')\nsys.stdout.flush()\nsys.stdin.read()\n")
+    monkeypatch.setattr(lerobot_process, "_SCRIPT", script)
+    with LeRobot(sys.executable, tmp_path) as robot:
+        robot.add({"state": np.zeros((1, 2))}, ends_episode=True)
+        with pytest.raises(RecordingError, match="could not be read: UnicodeDecodeError") as caught:
+            robot.finish()
+    assert isinstance(caught.value.__cause__, UnicodeDecodeError)
+    assert logged(caplog, "urlab-lerobot")
+
+
+def test_the_restart_of_an_environment(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        envs = vector.URLabVectorEnv([f"{server.address}:{server.step_port}"])
+        try:
+            envs.reset(seed=1)
+            session = envs._sessions[0]
+            with monkeypatch.context() as patch:
+                patch.setattr(session, "open", fail)
+                patch.setattr(session, "step", lose)
+                infos = envs.step(envs.action_space.sample())[4]
+                assert "gone" in str(infos["error"][0])
+                eventually(lambda: logged(caplog, "urlab-environment"))
+            envs.reset(seed=1)
+        finally:
+            envs.close()

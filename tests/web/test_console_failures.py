@@ -1,0 +1,177 @@
+"""A console whose loops fail goes on, and says so in the log and to its viewers; the program around it is unharmed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import math
+from collections.abc import AsyncGenerator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.applications import Starlette
+from starlette.routing import Mount
+from waiting import DEADLINE_S, until
+
+from urlab_client.aio import URLabClient, background
+from urlab_client.aio.state.step_mode import ask_mode
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.server import SimulatedServer
+from urlab_client.web import app
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.controls import Controls
+from urlab_client.web.driving_lease import DrivingLease, Viewer
+from urlab_client.web.hand_driving import HandDriving
+from urlab_client.web.pictures import Feed
+from urlab_client.web.replay import Replay
+
+ME = Viewer("key", "me")
+LOOPS = [
+    (ConsoleSession, "_keep"),
+    (ConsoleSession, "_receive"),
+    (ConsoleSession, "_pulse"),
+    (Controls, "send_set_points"),
+    (Controls, "keep_stepping"),
+    (HandDriving, "keep_driving"),
+    (Replay, "keep_playing"),
+]
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(background, "_PAUSE_S", 0.01)
+
+
+def once(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+    """Let the first call of a coroutine function fail."""
+    method, calls = getattr(owner, name), iter([True])
+
+    @functools.wraps(method)
+    async def failing(*arguments: Any) -> Any:
+        if next(calls, False):
+            raise MemoryError("none left")
+        return await method(*arguments)
+
+    monkeypatch.setattr(owner, name, failing)
+
+
+@contextlib.asynccontextmanager
+async def mounted(folder: Path, mode: str = "direct") -> AsyncGenerator[tuple[URLabClient, ConsoleSession]]:
+    """Run a program that mounts a console."""
+    async with (
+        SimulatedServer("arm", play=True) as server,
+        URLabClient(**server.client_options(), step_mode=mode) as client,
+    ):
+        site = app(client, recordings=folder)
+
+        @contextlib.asynccontextmanager
+        async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+            async with site.router.lifespan_context(site):
+                yield
+
+        program = Starlette(routes=[Mount("/console", site)], lifespan=lifespan)
+        async with program.router.lifespan_context(program):
+            console: ConsoleSession = site.state.console
+            await until(lambda: any(entry.what == "session_opened" for entry in console.entries))
+            yield client, console
+
+
+def errors(console: ConsoleSession) -> dict[str, str]:
+    """Return what viewers read about the console's own errors."""
+    return {entry.what: entry.text for entry in console.entries if (entry.kind, entry.who) == ("error", "console")}
+
+
+def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:
+    return any(f"{name} ended unexpectedly" in record.getMessage() and record.exc_info for record in caplog.records)
+
+
+async def test_a_number_that_the_program_wrote_stops_the_steps_and_nothing_else(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with mounted(tmp_path) as (client, console):
+        arm = client.articulations["arm"]
+        await console.controls.run(ME, running=True)
+        await until(lambda: client.step_count > 0)
+        arm.ctrl_array[0] = math.nan
+        await until(lambda: not console.controls.running)
+        assert "not finite" in errors(console)["step"]
+        assert "not finite" in caplog.text
+        arm.ctrl_array[0] = 0.0
+        stopped = client.step_count
+        await console.controls.run(ME, running=True)
+        await until(lambda: client.step_count > stopped)
+
+
+async def test_a_number_that_the_program_wrote_is_not_sent_in_live_mode(tmp_path: Path) -> None:
+    async with mounted(tmp_path, "live") as (client, console):
+        arm = client.articulations["arm"]
+        arm.ctrl_array[:] = math.nan
+        name, *others = arm.actuators
+        console.controls.set_points(ME, {"arm": {name: 0.1}})
+        await until(lambda: "set-points" in errors(console))
+        assert "finite" in errors(console)["set-points"]
+        arm.set_ctrl(dict.fromkeys(others, 0.0))
+        console.controls.set_points(ME, {"arm": {name: 0.2}})
+        await until(lambda: console.snapshot is not None and 0.2 in arm_set_points(console))
+
+
+def arm_set_points(console: ConsoleSession) -> list[float]:
+    assert console.snapshot is not None
+    ctrl = console.snapshot.per_articulation["arm"].ctrl
+    return [] if ctrl is None else [round(value, 6) for value in ctrl.tolist()]
+
+
+async def test_each_loop_goes_on_after_a_failure(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for owner, name in LOOPS:
+        once(monkeypatch, owner, name)
+    async with mounted(tmp_path) as (client, console):
+        for _, name in LOOPS:
+            what = name.lstrip("_")
+            assert "MemoryError: none left" in errors(console)[what]
+            assert logged(caplog, f"urlab-web-{what}")
+        await until(lambda: console.state_json is not None)
+        await console.controls.run(ME, running=True)
+        await until(lambda: client.step_count > 0)
+
+
+async def test_a_mode_that_changes_meanwhile_makes_no_step_of_set_points(tmp_path: Path) -> None:
+    async with mounted(tmp_path, "live") as (client, console):
+        actuator = next(iter(client.articulations["arm"].actuators))
+        session = client._session
+        async with session.turn(SetMode) as turn:
+            console.controls.set_points(ME, {"arm": {actuator: 0.1}})
+            await until(lambda: session.turns._waiting or session.line._waiting)
+            await ask_mode(client._state, turn, StepMode.DIRECT)
+        assert (await client.step()).step == 1
+        assert errors(console) == {}
+
+
+async def test_pictures_go_on_after_a_failure(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once(monkeypatch, Feed, "_run")
+    async with mounted(tmp_path, "live") as (_, console):
+        feed = console.feed("arm/wrist")
+        assert feed is not None
+        async with feed.watch(), asyncio.timeout(DEADLINE_S):
+            assert (await feed.after(0)).jpeg
+        assert "MemoryError: none left" in errors(console)["camera arm/wrist"]
+        assert logged(caplog, "urlab-web-camera")
+
+
+async def test_a_lease_that_cannot_be_kept_ends_what_it_is_held_for(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once(monkeypatch, DrivingLease, "_keep")
+    lease = DrivingLease()
+    with pytest.raises(MemoryError, match="none left"):
+        async with lease.hold(ME), asyncio.timeout(DEADLINE_S):
+            await asyncio.Event().wait()
+    assert logged(caplog, "urlab-web-lease")
+    async with lease.hold(ME):
+        assert lease.holder is ME
