@@ -318,6 +318,7 @@ def test_importing_the_same_content_makes_the_same_snapshot(workspace: Workspace
     first, _ = workspace.content.import_xml(str(workshop))
     second, _ = workspace.content.import_xml(str(workshop), force_reimport=True)
 
+    assert tree(second.folder) == tree(first.folder)
     assert second.folder == first.folder
 
 

@@ -23,7 +23,9 @@ FLAGS = (
 )  # fmt: skip
 FLAT = ("--disable-gpu", "--disable-3d-apis")
 SOLID = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
-PATIENCE_S = 40
+PATIENCE_S = 120
+"""Only there so that nothing hangs: a busy machine without a graphics card takes seconds for a picture."""
+
 RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
 SLIDER = "[data-robot=arm] [data-actuator=elbow]"
 
@@ -142,6 +144,7 @@ def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[P
     for flag in (*FLAGS, *flags, f"--user-data-dir={folder}"):
         options.add_argument(flag)
     driver = webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
+    driver.set_script_timeout(PATIENCE_S)
     try:
         driver.get(link)
         yield Page(driver)

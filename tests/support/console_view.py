@@ -25,7 +25,7 @@ class View:
     def __init__(self, page: Page) -> None:
         self.page = page
         # A screenshot gets 10 seconds, which may be too few where the processor draws and has other things to do.
-        self._wait = WebDriverWait(page.driver, 1.5 * PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
+        self._wait = WebDriverWait(page.driver, PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
 
     def picture(self) -> Picture:
         self.page.driver.execute_script(INTO_VIEW)

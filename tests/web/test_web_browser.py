@@ -18,7 +18,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from urlab_client.integrations.record import read_run
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]  # drawing without a graphics card takes its time
 
 TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
   .filter((one) => !one.closest('.frame, .entries, .actors, .recordings'))
