@@ -6,16 +6,17 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol import mujoco_fields
-
 _Floats: TypeAlias = NDArray[np.float64]
 
 class FatalError(Exception): ...
 class UnexpectedError(Exception): ...
-class MjOption(mujoco_fields.MjOption): ...
 
-class MjModel(mujoco_fields.MjModel):
+class MjOption:
+    def __getattr__(self, name: str) -> Any: ...
+
+class MjModel:
     opt: MjOption
+    def __getattr__(self, name: str) -> Any: ...
     @classmethod
     def from_xml_string(cls, xml: str, assets: Mapping[str, bytes] | None = ...) -> MjModel: ...
     @classmethod
@@ -23,7 +24,8 @@ class MjModel(mujoco_fields.MjModel):
     @classmethod
     def from_binary_path(cls, filename: str, assets: Mapping[str, bytes] | None = ...) -> MjModel: ...
 
-class MjData(mujoco_fields.MjData):
+class MjData:
+    def __getattr__(self, name: str) -> Any: ...
     def __init__(self, model: MjModel) -> None: ...
 
 class mjtJoint:

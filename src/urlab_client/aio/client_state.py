@@ -24,7 +24,7 @@ from urlab_client.protocol.names import NameMap, unknown_name
 from urlab_client.protocol.observer import ClientObserver
 
 if TYPE_CHECKING:
-    from urlab_client.protocol.mujoco_types import MjData, MjModel
+    from mujoco import MjData, MjModel
 
 __all__ = ["ClientState"]
 

@@ -20,7 +20,7 @@ from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 
 if TYPE_CHECKING:
-    from urlab_client.protocol.mujoco_types import MjData, MjModel
+    from mujoco import MjData, MjModel
 
 __all__ = ["ClientState"]
 
