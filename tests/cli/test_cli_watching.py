@@ -14,7 +14,7 @@ from waiting import eventually, until
 
 from urlab_client.aio import URLabClient
 from urlab_client.cli import _watching
-from urlab_client.cli._failure import CommandError
+from urlab_client.cli._common import CommandError
 from urlab_client.cli._watching import run_session
 from urlab_client.integrations.record import read_run
 from urlab_client.server import SimulatedServer

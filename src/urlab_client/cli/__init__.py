@@ -19,7 +19,7 @@ from importlib import import_module
 import urlab_client
 from urlab_client._extras import MissingExtra
 from urlab_client.cli._arguments import Parser
-from urlab_client.cli._failure import CommandError, one_line
+from urlab_client.cli._common import CommandError, one_line
 from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]

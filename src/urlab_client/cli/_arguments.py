@@ -8,7 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, NoReturn, Protocol, TypeVar, cast
 
-from urlab_client.cli._failure import CommandError
+from urlab_client.cli._common import CommandError
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import did_you_mean
 

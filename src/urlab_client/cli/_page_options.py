@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from urlab_client.cli._arguments import ServerArguments, add_handshake, port
-from urlab_client.cli._failure import CommandError
+from urlab_client.cli._common import CommandError
 
 __all__ = ["PageArguments", "add_page", "check_page", "host_names", "page_url"]
 

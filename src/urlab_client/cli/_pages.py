@@ -12,8 +12,8 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from urlab_client.aio.background import background_task
+from urlab_client.cli._common import in_background, sigterm_interrupts
 from urlab_client.cli._connections import bounded_connections
-from urlab_client.cli._ending import in_background, sigterm_interrupts
 from urlab_client.cli._requests import RunningRequests
 
 __all__ = ["bound", "graceful_exit", "serve"]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from urlab_client._background import daemon
 from urlab_client._windows import read_aside
-from urlab_client.cli._ending import in_background
+from urlab_client.cli._common import in_background
 
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Generator
 from typing import Any
 
-from urlab_client.cli._failure import CommandError
+from urlab_client.cli._common import CommandError
 
 __all__ = ["terminal_keys"]
 

@@ -13,8 +13,7 @@ from urlab_client.cli._arguments import (
     add_ports,
     make_client,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 
 __all__ = ["PAGE_PORT", "add_parser", "run"]

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli._arguments import Commands, count, seconds
-from urlab_client.cli._ending import sigterm_interrupts
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._output import progress_bar
+from urlab_client.cli._common import CommandError, progress_bar, sigterm_interrupts
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Episodes, Run

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from urlab_client._extras import need
+from urlab_client._whole_files import replaced
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -28,10 +29,7 @@ from urlab_client.cli._arguments import (
     count,
     running_address,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import replaced
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import output
+from urlab_client.cli._common import CommandError, import_mujoco, output
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -14,7 +14,7 @@ import mujoco
 from urlab_client import CreateLevelFailed, ImportFailed, URLabClient
 from urlab_client._mujoco import flat_model
 from urlab_client.cli._arguments import ServerArguments, make_client
-from urlab_client.cli._failure import CommandError, one_line
+from urlab_client.cli._common import CommandError, one_line
 from urlab_client.cli.robot_file import RobotFile
 from urlab_client.protocol.base import DialectName
 from urlab_client.server.assets.bundled_robots import bundled_models

@@ -19,8 +19,7 @@ from urlab_client.cli._arguments import (
     one_of,
     seconds,
 )
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import json_line
+from urlab_client.cli._common import import_mujoco, json_line
 from urlab_client.protocol.client_types import Diagnosis
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from urlab_client.aio.launch import with_model_options, with_option
 from urlab_client.cli._arguments import Commands, count, seconds
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import json_line, output, progress_bar
+from urlab_client.cli._common import CommandError, import_mujoco, json_line, output, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.cli._files import replaced
+from urlab_client._whole_files import replaced
 
 __all__ = ["Quantity", "Trace", "plot_trace"]
 

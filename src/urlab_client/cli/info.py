@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._output import counted, json_line, output, progress_bar
+from urlab_client.cli._common import counted, json_line, output, progress_bar
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.cli._files import replaced
+from urlab_client._whole_files import replaced
 from urlab_client.server.editor.geometry import Box, box_around
 from urlab_client.server.render.opengl import ADVICE
 

@@ -23,8 +23,7 @@ from urlab_client.cli._arguments import (
     make_client,
     seconds,
 )
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import counted, json_line
+from urlab_client.cli._common import counted, import_mujoco, json_line
 from urlab_client.protocol.errors import (
     ModeLocked,
     URLabConnectionError,

@@ -11,9 +11,7 @@ import numpy as np
 
 from urlab_client._extras import need
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import check_ending
-from urlab_client.cli._output import progress_bar
+from urlab_client.cli._common import CommandError, check_ending, progress_bar
 from urlab_client.protocol.names import did_you_mean
 
 if TYPE_CHECKING:

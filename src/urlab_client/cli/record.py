@@ -19,10 +19,7 @@ from urlab_client.cli._arguments import (
     make_client,
     seconds,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import check_ending
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import progress_bar
+from urlab_client.cli._common import CommandError, check_ending, import_mujoco, progress_bar
 from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.protocol.enums import StepMode
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from urlab_client._mujoco import actuator_count, control_starts
-from urlab_client.cli._failure import CommandError, one_line
+from urlab_client.cli._common import CommandError, one_line
 from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.assets.importer import mujoco_messages
 from urlab_client.server.editor.geometry import box_around

@@ -8,8 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import json_line
+from urlab_client.cli._common import import_mujoco, json_line
 
 __all__ = ["add_parser", "run"]
 

@@ -23,10 +23,7 @@ from urlab_client.cli._arguments import (
     one_of,
     seconds,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import check_ending
-from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._output import json_line, output, progress_bar
+from urlab_client.cli._common import CommandError, check_ending, import_mujoco, json_line, output, progress_bar
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:

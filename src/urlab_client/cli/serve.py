@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from urlab_client._installation import install_command
 from urlab_client.cli._arguments import Commands, add_dialect, count, image_size, index, port
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._serve_events import Event, Events, Starter, next_event, stop_on_signals, watch_input
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import CameraMode, StepMode

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._extras import need
+from urlab_client._whole_files import replaced
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -21,9 +22,7 @@ from urlab_client.cli._arguments import (
     make_client,
     seconds,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import check_ending, replaced
-from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabTimeoutError
 from urlab_client.protocol.names import did_you_mean

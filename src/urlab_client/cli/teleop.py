@@ -25,9 +25,7 @@ from urlab_client.cli._arguments import (
     make_client,
     seconds,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import check_ending
-from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.cli._terminal_keys import terminal_keys
 from urlab_client.cli._watching import interruptible
 from urlab_client.protocol.names import did_you_mean

@@ -21,8 +21,7 @@ from urlab_client.cli._arguments import (
     port,
     seconds,
 )
-from urlab_client.cli._failure import CommandError
-from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._page_options import PageArguments
 from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.protocol.enums import StepMode

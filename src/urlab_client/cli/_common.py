@@ -1,0 +1,121 @@
+"""What the commands share: failures, endings, files and output."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Generator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class CommandError(Exception):
+    """An expected failure; its text is one line that says what failed, where, and what would be right."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return an exception's text on one line."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        # Leave out the error number, which does not help users.
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(text.split()) or type(error).__name__
+
+
+def in_background() -> bool:
+    """Whether this command was started so that it ignores Ctrl-C, which is then for others; SIGTERM still ends it."""
+    return signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+
+
+@contextlib.contextmanager
+def sigterm_interrupts() -> Generator[None]:
+    """Let SIGTERM end the block as SIGINT does, so that it cleans up."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        if in_background():
+            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def check_ending(path: Path, *endings: str) -> None:
+    """Check the ending of an output file.
+
+    Raises:
+        CommandError: The name has another ending.
+    """
+    if path.suffix.lower() not in endings:
+        better = path.with_suffix(endings[0]).name if path.name else f"FILE{endings[0]}"
+        raise CommandError(f"{path}: write a file that ends in {' or '.join(endings)}, for example {better}")
+
+
+_COLUMNS = 120  # where the output is not a terminal
+
+
+@contextlib.contextmanager
+def progress_bar(description: str, total: float) -> Generator[Callable[[float], None]]:
+    """Show a bar while the block runs, if standard error is a terminal; yields a callback that sets its position."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(description, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+def output() -> Console:
+    """Return a console that writes tables to standard output, with brackets and colons in names as they are."""
+    from rich.console import Console  # noqa: PLC0415
+
+    console = Console(markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = _COLUMNS
+    return console
+
+
+def json_line(value: object) -> str:
+    """Return a value as JSON in ASCII, which every terminal and locale can encode; NaN is null."""
+    import msgspec  # noqa: PLC0415
+
+    return json.dumps(msgspec.json.decode(msgspec.json.encode(value, enc_hook=str)))
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, as in `1 joint` and `2 joints`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+_VARIABLE = "MUJOCO_GL"
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo without OpenGL.
+
+    Importing it loads the OpenGL platform that `MUJOCO_GL` names, and fails if that is missing. A user who sets the
+    variable for other programs can still serve and drive robots. Pictures are drawn in a separate process.
+    """
+    chosen = os.environ.get(_VARIABLE)
+    os.environ[_VARIABLE] = "disable"
+    try:
+        import mujoco  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # for its effect
+    finally:
+        if chosen is None:
+            del os.environ[_VARIABLE]
+        else:
+            os.environ[_VARIABLE] = chosen
