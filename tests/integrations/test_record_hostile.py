@@ -52,10 +52,10 @@ from urlab_client.integrations.record import (
 from urlab_client.randomise import Randomisation
 from urlab_client.server import SimulatedServer
 from urlab_client.server.physics import recording
+from urlab_client.web.messages import state_message
 from urlab_client.web.pictures import _jpeg_of
 from urlab_client.web.recordings import _described
 from urlab_client.web.replay import _opened, _present, _Robot, _snapshot
-from urlab_client.web.state_message import state_message
 
 STATE = schema_name(ArticulationMessage)
 MIB = 1 << 20

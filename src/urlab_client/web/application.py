@@ -30,7 +30,6 @@ from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.explained_errors import explain_error
 from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
-from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
     from urlab_client.aio import URLabClient
-
-__all__ = ["app", "entrance"]
 
 _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
@@ -479,3 +476,14 @@ def _json(body: bytes, status: int = 200) -> Response:
 
 def _error(status: int, code: str, message: str, hint: str = "") -> Response:
     return _json(encode({"error": {"code": code, "message": message, "hint": hint}}), status)
+
+
+def showing(registry: CollectorRegistry) -> Callable[[Request], Response]:
+    """Return a handler that serves the metrics of a registry in the requested format."""
+    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
+
+    def show(request: Request) -> Response:
+        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
+        return Response(encode_all(registry), headers={"content-type": media_type})
+
+    return show

@@ -38,13 +38,12 @@ from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.hand_driving import HandDriving
-from urlab_client.web.messages import Ctrl, Hand, Link, LogEntry, Status, World
+from urlab_client.web.messages import Ctrl, Hand, Link, LogEntry, Status, World, rounded, state_message
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
 from urlab_client.web.recordings import Recordings
 from urlab_client.web.replay import Replay
-from urlab_client.web.state_message import rounded, state_message
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient

@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, TypeAlias
 
+import numpy as np
 from msgspec import Meta, Struct
 
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.web.description import WorldDescription
 from urlab_client.web.recordings import Conversion, RunningRecording
 from urlab_client.web.replay import ReplayView
-
-__all__ = [
-    "Ack",
-    "ArticulationSample",
-    "Ctrl",
-    "EntitySample",
-    "FromViewer",
-    "Hand",
-    "Link",
-    "Log",
-    "LogEntry",
-    "Name",
-    "PictureHead",
-    "Ping",
-    "Pong",
-    "Refused",
-    "State",
-    "Status",
-    "World",
-    "You",
-]
 
 Numbers: TypeAlias = list[float | None]
 """Numbers with five digits; null for a number that is not finite."""
@@ -194,3 +176,36 @@ class PictureHead(Struct):
     sim_time: float | None
     mode: str
     recorded: bool = False
+
+
+_DIGITS = 5
+
+
+def state_message(seq: int, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> State:
+    """Return the message of a state, with what viewers have commanded by articulation."""
+    wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
+    received = snapshot.recv_wall_time_ns / 1e9
+    # The server's own clock where it can be the same as ours; else what we know, when it got here.
+    made = wall if 0 <= received - wall < 10 else received
+    return State(
+        seq=seq,
+        time=snapshot.time,
+        step=snapshot.step,
+        made=made * 1e3,
+        articulations={
+            key: ArticulationSample(
+                qpos=rounded(state.qpos),
+                qvel=rounded(state.qvel),
+                ctrl=None if state.ctrl is None else rounded(state.ctrl),
+                sensors={name: rounded(value) for name, value in (state.sensors or {}).items()},
+                targets=targets.get(key),
+            )
+            for key, state in snapshot.per_articulation.items()
+        },
+        entities={name: EntitySample(rounded(pose.xpos)) for name, pose in snapshot.entities.items()},
+    )
+
+
+def rounded(values: Any) -> list[Any]:
+    """Return numbers of as many digits as browsers are told."""
+    return np.round(np.asarray(values, dtype=np.float64), _DIGITS).tolist()

@@ -15,9 +15,9 @@ from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from urlab_client.integrations._feed.messages import EpisodeOutcome
+from urlab_client.web.messages import state_message
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import JOB, Handler, RouteGroup
-from urlab_client.web.state_message import state_message
 
 __all__ = ["RecordingRoutes"]
 

@@ -17,8 +17,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.routing import Mount, Route
 
 from urlab_client.web.access import Access, Guarded
-from urlab_client.web.application import app, entrance
-from urlab_client.web.metrics import showing
+from urlab_client.web.application import app, entrance, showing
 from urlab_client.web.ops import encode
 
 if TYPE_CHECKING:
