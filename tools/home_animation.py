@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from urlab_client import URLabClient
-from urlab_client.cli.demo_controllers import TrotController
+from urlab_client.cli.demo import Trot
 from urlab_client.server import SimulatedServer
 
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "images" / "trot.webp"
@@ -27,7 +27,7 @@ def main() -> int:
         client.discover()
         client.reset("home")
         robot = client.articulations["quadruped"]
-        trot = TrotController(robot)
+        trot = Trot(robot)
         end = START_S + LENGTH_S
         while client.sim_time < end - 1e-9:
             due = START_S + len(pictures) / FRAMES_PER_S

@@ -1,56 +1,51 @@
-"""`urlab demo`: author a level, drive a robot through both clients, and write the results to disk.
-
-The demo starts its own simulated server, so it needs only this package, or uses a running server.
-"""
+"""`urlab demo`: drive a robot through both clients on a simulated server, and write the results to disk."""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import contextlib
 import hashlib
 import logging
+import math
 import platform
-from collections.abc import Callable, Generator
+import time
+from collections.abc import Generator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 
 from urlab_client._extras import need
 from urlab_client._whole_files import replaced
-from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
-    add_dialect,
-    add_keys,
-    add_ports,
-    count,
-    running_address,
-)
-from urlab_client.cli._common import CommandError, import_mujoco, output
+from urlab_client.cli._arguments import Commands, add_dialect, count
+from urlab_client.cli._common import CommandError, import_mujoco, one_line, output
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
-    from rich.table import Table
 
-    from urlab_client.cli.demo_runs import DemoRun, Outcome
-    from urlab_client.cli.robot_file import RobotFile
-    from urlab_client.protocol.base import DialectName
+    from urlab_client import URLabArticulation, URLabClient, aio
+    from urlab_client.protocol.base import DialectName, Floats
+    from urlab_client.server import SimulatedServer
 
-__all__ = ["add_parser", "run"]
+    Robot = URLabArticulation | aio.URLabArticulation
 
 _ASYNC_SHARE = 4  # the async run takes a quarter of the steps
-_REPORT_EVERY = 20  # steps between two updates of the progress bar
+_SEED = 0
+_TURNS = (-0.4, 0.4)  # the robot on the right walks to the right
+_PICTURE = (1280, 960)
+_FREE = 0  # MuJoCo's number of a free joint
+_LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 
 
-class DemoArguments(ServerArguments):
+class DemoArguments(argparse.Namespace):
     """The parsed command line."""
 
     model: str
-    address: str | None
     dialect: DialectName
     output: Path
     steps: int
@@ -62,14 +57,12 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "demo",
         help="drive a robot end to end; keep a plot, a picture and the configuration",
-        description="Start a simulated server, or use a running one, author levels, drive one robot through the "
-        "blocking client and two robots through the async client, and write joints.png, last_state.png and run.json. "
-        "Needs the extra 'urlab-client[demo]'.",
+        description="Start a simulated server, drive one robot through the blocking client and two robots through the "
+        "async client, and write joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'.",
         examples=(
             ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
             ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
             ("urlab demo arm --no-render", "without a picture of the last state"),
-            ("urlab demo robot.xml --address tcp://lab-7", "on a running server, whose play session it ends"),
         ),
     )
     parser.add_argument(
@@ -79,16 +72,6 @@ def add_parser(commands: Commands) -> None:
         metavar="MODEL",
         help="an MJCF file or the name of a bundled robot (default: %(default)s)",
     )
-    parser.add_argument(
-        "--address",
-        type=running_address,
-        metavar="ADDRESS",
-        help="HOST[:PORT], tcp://HOST[:PORT] or ipc://PATH of a running server (default: start one). The demo ends "
-        "play there and opens its own levels; it uploads a model that is not on the server's disk, if the server "
-        "accepts uploads",
-    )
-    add_ports(parser, state=False)
-    add_keys(parser)
     add_dialect(parser)
     parser.add_argument(
         "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
@@ -101,96 +84,300 @@ def add_parser(commands: Commands) -> None:
         help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
     )
     parser.add_argument("--no-render", action="store_true", help="do not draw the picture of the last state")
-    parser.set_defaults(run=run, mjcf_options=False)
+    parser.set_defaults(run=run)
 
 
 def run(arguments: DemoArguments) -> int:
     """Run the demonstration.
 
     Raises:
-        CommandError: The model or the output folder cannot be used, or the server cannot load the model.
+        CommandError: The model or the output folder cannot be used.
         MissingExtra: A library is missing.
-        URLabError: The server refused a request.
     """
     need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from urlab_client.cli.demo_controllers import NOTHING_DRIVEN  # noqa: PLC0415
-    from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
-    from urlab_client.cli.demo_server import running_server, started_server  # noqa: PLC0415
-    from urlab_client.cli.robot_file import read_robot  # noqa: PLC0415
+    from urlab_client import URLabClient
 
-    robot = read_robot(arguments.model)
-    folder = _writable(arguments.output)
-    steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
-    console = output()
-    address = arguments.address
-    place = started_server(robot, arguments.dialect) if address is None else running_server(robot, address, arguments)
-    with _warnings_of(robot), place as server, _progress(console) as progress:
-        one = drive_one(server, steps, _bar(progress, "blocking client, one robot", steps))
-        two = asyncio.run(drive_two(server, fewer, _bar(progress, "async client, two robots", fewer)))
-    console.print(_table(robot, [one.outcome, two.outcome]))
-    if not one.driven:
-        console.print(f"{robot.name}: {NOTHING_DRIVEN}; gravity alone moves it.", soft_wrap=True, highlight=False)
-    written = _write(folder, robot, one, two, address=address, render=not arguments.no_render)
-    for file, note in written.items():
-        console.print(f"{file}  {note}", soft_wrap=True, highlight=False)
+    name, file = _model(arguments.model)
+    folder, console = arguments.output, output()
+    steps = arguments.steps
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CommandError(f"--output {folder}: cannot write there: {error.strerror or error}") from None
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console) as progress:
+        with _serving(name, file, 1, arguments.dialect) as (server, options), URLabClient(**options) as client:
+            client.discover()
+            client.reset(seed=_SEED)
+            run = _Run(client, progress, "blocking client, one robot", steps)
+            for _ in range(steps):
+                run.act()
+                client.step()
+                run.note()
+            one, physics = run.outcome("blocking"), _physics(client)
+            picture = "not drawn: --no-render" if arguments.no_render else _draw(server, one.sim_time, folder)
+        with _serving(name, file, 2, arguments.dialect) as (_, options):
+            two = asyncio.run(_drive_two(options, progress, max(1, steps // _ASYNC_SHARE)))
+    _print_table(console, name, [one, two])
+    if one.controllers == ["none"]:
+        console.print(f"{name}: 0 actuators: nothing is driven; gravity alone moves it.", soft_wrap=True)
+    run.plot(f"{name}, {steps} steps through the blocking client", folder / "joints.png")
+    _write_record(folder / "run.json", file, {"options": physics, "runs": [one, two]})
+    for written, note in (
+        ("joints.png", f"joint positions over the {one.sim_time:.3f} s of the blocking run"),
+        ("last_state.png", picture),
+        ("run.json", "versions, model, options, seed and results"),
+    ):
+        console.print(f"{folder / written}  {note}", soft_wrap=True, highlight=False)
     return 0
 
 
+async def _drive_two(options: dict[str, Any], progress: Progress, steps: int) -> Outcome:
+    from urlab_client import aio
+
+    async with aio.URLabClient(**options) as client:
+        await client.discover()
+        await client.reset(seed=_SEED)
+        run = _Run(client, progress, "async client, two robots", steps)
+        for _ in range(steps):
+            run.act()
+            await client.step()
+            run.note()
+        return run.outcome("async")
+
+
+# The robot and its server.
+
+
+def _model(given: str) -> tuple[str, str]:
+    """Return a robot's name, and what the server takes for it."""
+    import mujoco
+
+    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
+    from urlab_client.server.assets.importer import mujoco_messages
+
+    path = Path(given)
+    if not path.is_file():
+        path = bundled_models().get(given, path)
+    if not path.is_file():
+        raise CommandError(unknown_model(given))
+    try:
+        with mujoco_messages():  # the server repeats MuJoCo's messages about the model
+            model = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise CommandError(f"MuJoCo rejects {path}: {one_line(error)}") from None
+    if not model.njnt:
+        raise CommandError(f"{path} has no joints, so nothing in it can move; name a robot")
+    return path.stem, str(path.resolve())
+
+
 @contextlib.contextmanager
-def _warnings_of(robot: RobotFile) -> Generator[None]:
-    """Hide the server's warnings about bundled robots: the only one is about the floor in each copy."""
+def _serving(
+    name: str, file: str, number: int, dialect: DialectName
+) -> Generator[tuple[SimulatedServer, dict[str, Any]]]:
+    """Serve a number of equal robots, in play, on a floor if they can fall and bring none; yield a client's options."""
+    import mujoco
+
+    from urlab_client.server import SimulatedServer, bundled_models
+
+    model = mujoco.MjModel.from_xml_path(file)
+    falls = (model.jnt_type == _FREE).any() and not model.nhfield
+    floor = ["floor"] if falls and not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any() else []
     logger = logging.getLogger("urlab_client.server")
     before = logger.level
-    if robot.bundled:
-        logger.setLevel(logging.ERROR)
+    if name in bundled_models():
+        logger.setLevel(logging.ERROR)  # the only warning would be about the floor in each copy
     try:
-        yield
+        models = *[file] * number, *floor
+        with SimulatedServer(*models, play=True, mjcf_options=True, render_quality="high", dialect=dialect) as server:
+            yield server, {**server.client_options(), "step_mode": "direct"}
     finally:
         logger.setLevel(before)
 
 
-def _writable(folder: Path) -> Path:
+def _draw(server: SimulatedServer, moment: float, folder: Path) -> str:
+    """Draw the robot as the editor's viewport would show it; return what is in the picture, or why there is none."""
+    from PIL import Image
+
+    from urlab_client.server import RenderingUnavailable
+
+    file = folder / "last_state.png"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(_Probed), replaced(folder / "probe"):
-            raise _Probed
-    except OSError as error:
-        raise CommandError(f"--output {folder}: cannot write there: {error.strerror or error}") from None
-    return folder
+        picture = server.snapshot(_PICTURE, frame_all=True)
+    except RenderingUnavailable as reason:
+        file.unlink(missing_ok=True)  # one of an earlier run would show another state
+        return f"not drawn: {one_line(reason)}"
+    with replaced(file) as temporary:
+        Image.fromarray(picture).convert("RGB").save(temporary, format="png")
+    return f"last state of the blocking run, after {moment:.3f} s"
 
 
-class _Probed(Exception):
-    """Raised to discard the probe file."""
+# Driving.
 
 
-def _progress(console: Console) -> Progress:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+class Trot:
+    """Makes the bundled quadruped trot: diagonal pairs of feet take turns, and torques move the joints.
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    return Progress(*columns, console=console)
+    A foot moves straight back on the ground and in an arc forward through the air; the leg's two equal links give the
+    joint angles in closed form.
+    """
+
+    STRIDES_PER_S = 2.0
+    STRIDE_M, LIFT_M, LINK_M = 0.12, 0.05, 0.2
+    ON_GROUND = 0.6  # share of a stride
+    KP, KD = 150.0, 4.0  # N m / rad, N m s / rad
+    RAMP_S = 0.6  # until full stride
+    BEND = math.pi / 4  # slope of both links where the joint angles are zero, radians
+    LEGS = ("FL", "FR", "RL", "RR")
+    PHASES = np.array([0.0, 0.5, 0.5, 0.0])
+    SIDES = np.array([-1.0, 1.0, -1.0, 1.0])
+
+    def __init__(self, robot: Robot, turn: float = 0.0) -> None:
+        """Control a standing robot.
+
+        Args:
+            robot: The bundled quadruped.
+            turn: How much longer the strides of the right legs are than average, as a share; positive turns left.
+        """
+        self._robot = robot
+        joints = [robot.joints[f"{leg}_{part}"] for leg in self.LEGS for part in ("hip", "thigh", "calf")]
+        self._qpos = np.array([joint.qpos_local_offset for joint in joints])
+        self._qvel = np.array([joint.qvel_local_offset for joint in joints])
+        self._ctrl = np.array([robot.actuators[joint.name].ctrl_local.start for joint in joints])
+        self._strides = self.STRIDE_M * (1 + turn * self.SIDES)
+        self._height = 2 * self.LINK_M * math.cos(self.BEND)
+
+    def act(self, time: float) -> None:
+        """Write the set-points for the next step, `time` seconds into the simulation."""
+        error = self._angles(time) - self._robot.qpos_array[self._qpos]
+        self._robot.ctrl_array[self._ctrl] = self.KP * error - self.KD * self._robot.qvel_array[self._qvel]
+
+    def _angles(self, time: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+        phase = (time * self.STRIDES_PER_S + self.PHASES) % 1
+        grounded = phase < self.ON_GROUND
+        # Progress through the part of the stride the leg is in; the arc starts and ends at rest.
+        part = np.where(grounded, phase / self.ON_GROUND, (phase - self.ON_GROUND) / (1 - self.ON_GROUND))
+        arc = part - np.sin(2 * math.pi * part) / (2 * math.pi)
+        share = min(1.0, time / self.RAMP_S)
+        x = share * self._strides * np.where(grounded, 0.5 - part, arc - 0.5)
+        z = np.where(grounded, 0.0, share * self.LIFT_M * np.sin(math.pi * part) ** 2) - self._height
+        slope = np.arctan2(-x, -z)
+        bend = np.arccos(np.hypot(x, z) / (2 * self.LINK_M))
+        thigh, calf = slope + bend - self.BEND, 2 * (self.BEND - bend)
+        return np.column_stack([np.zeros_like(thigh), thigh, calf]).ravel()
 
 
-def _bar(progress: Progress, description: str, steps: int) -> Callable[[], None]:
-    """Return a callback to invoke after each step."""
-    bar = progress.add_task(description, total=steps)
-    done = 0
+class Swing:
+    """Moves each actuator gently back and forth within its control range, each with its own phase."""
 
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        if done % _REPORT_EVERY == 0 or done == steps:
-            progress.update(bar, completed=done)
+    HERTZ = 0.5
+    SHARE = 0.2  # amplitude as a share of half the control range
+    UNLIMITED = 0.1  # amplitude of an actuator without a control range
+    RAMP_S = 1.0  # until the full amplitude
+    PHASE_STEP = math.pi * (3 - math.sqrt(5))  # golden angle: no two actuators are ever in phase
 
-    return advance
+    def __init__(self, robot: Robot) -> None:
+        """Control a robot that starts at rest."""
+        self._robot = robot
+        count = len(robot.ctrl_array)
+        self._centre, self._amplitude = np.zeros(count), np.zeros(count)
+        self._phase = self.PHASE_STEP * np.arange(count)
+        for actuator in robot.actuators.values():
+            low, high = actuator.ctrlrange or (-math.inf, math.inf)
+            amplitude = self.UNLIMITED if math.isinf(high - low) else self.SHARE * (high - low) / 2
+            joint = robot.joints.get(actuator.joint or "") if actuator.type == "position" else None
+            rest = 0.0 if joint is None else float(robot.qpos_array[joint.qpos_local_offset])
+            self._centre[actuator.ctrl_local] = min(max(rest, low + amplitude), high - amplitude)
+            self._amplitude[actuator.ctrl_local] = amplitude
+
+    def act(self, time: float) -> None:
+        """Write the set-points for the next step, `time` seconds into the simulation."""
+        swing = np.sin(2 * math.pi * self.HERTZ * time + self._phase)
+        self._robot.ctrl_array[:] = self._centre + min(1.0, time / self.RAMP_S) * self._amplitude * swing
 
 
-def _table(robot: RobotFile, outcomes: list[Outcome]) -> Table:
-    from rich import box  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
+def _controller(robot: Robot, turn: float = 0.0) -> Trot | Swing:
+    trots = all(f"{leg}_{part}" in robot.actuators for leg in Trot.LEGS for part in ("hip", "thigh", "calf"))
+    return Trot(robot, turn) if trots and len(robot.actuators) == 12 else Swing(robot)
 
-    table = Table(title=f"{robot.name}, direct mode", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+
+class Outcome(msgspec.Struct):
+    """Result of a run; times in seconds, positions in metres, quaternions (w, x, y, z), world frame."""
+
+    client: str
+    robots: int
+    steps: int
+    sim_time: float
+    wall_time: float
+    steps_per_second: float
+    real_time_factor: float
+    final_base_poses: list[list[float]]
+    controllers: list[str]
+
+
+class _Run:
+    """A run under way: the robots with their controllers, and the positions of the first robot."""
+
+    def __init__(self, client: URLabClient | aio.URLabClient, progress: Progress, description: str, steps: int) -> None:
+        self._client, self._progress = client, progress
+        self._task = progress.add_task(description, total=steps)
+        self._robots: list[Robot] = [one for one in client.articulations_by_id.values() if one.joints]  # no floor
+        turns = _TURNS if len(self._robots) > 1 else (0.0,)
+        self._controllers = [_controller(robot, turn) for robot, turn in zip(self._robots, turns, strict=True)]
+        self._lines: list[tuple[str, str, int]] = []  # axis label, name and index of each position
+        for joint in self._robots[0].joints.values():
+            place = joint.qpos_local_offset
+            if joint.jnt_type == _FREE:
+                self._lines += [("base position (m)", axis, place + index) for index, axis in enumerate("xyz")]
+            elif joint.jnt_type in _LABELS:
+                self._lines.append((_LABELS[joint.jnt_type], joint.name, place))
+        self._times: list[float] = []
+        self._positions: list[Floats] = []
+        self._began = time.perf_counter()
+
+    def act(self) -> None:
+        """Write all set-points for the next step."""
+        for controller in self._controllers:
+            controller.act(self._client.sim_time)
+
+    def note(self) -> None:
+        """Note the positions after a step."""
+        self._times.append(self._client.sim_time)
+        self._positions.append(self._robots[0].qpos_array[[place for _, _, place in self._lines]])
+        self._progress.advance(self._task)
+
+    def outcome(self, flavour: str) -> Outcome:
+        """Return the result so far."""
+        wall, steps, passed = time.perf_counter() - self._began, self._client.step_count, self._client.sim_time
+        poses = [[*robot.root_pos_w.tolist(), *robot.root_quat_w.tolist()] for robot in self._robots]
+        kinds = [
+            type(controller).__name__.lower() if robot.actuators else "none"
+            for controller, robot in zip(self._controllers, self._robots, strict=True)
+        ]
+        return Outcome(flavour, len(self._robots), steps, passed, wall, steps / wall, passed / wall, poses, kinds)
+
+    def plot(self, title: str, file: Path) -> None:
+        """Draw the positions over simulation time."""
+        from urlab_client.cli.figures import Quantity, Trace, plot_trace
+
+        quantities: list[Quantity] = []
+        for label in dict.fromkeys(label for label, _, _ in self._lines):
+            lines = [(index, name) for index, (own, name, _) in enumerate(self._lines) if own == label]
+            quantities.append(Quantity(label, [name for _, name in lines], [index for index, _ in lines]))
+        plot_trace(Trace(title, np.array(self._times), np.array(self._positions), quantities), file)
+
+
+# Results.
+
+
+def _print_table(console: Console, name: str, outcomes: Sequence[Outcome]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=f"{name}, direct mode", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     table.add_column("client")
     for heading in ("robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"):
         table.add_column(heading, justify="right")
@@ -204,75 +391,42 @@ def _table(robot: RobotFile, outcomes: list[Outcome]) -> Table:
             f"{outcome.steps_per_second:.0f}",
             f"{outcome.real_time_factor:.2f}",
             "\n".join(
-                _numbers(values) for pose in outcome.final_base_poses for values in (pose.position, pose.quaternion)
+                " ".join(f"{value:6.3f}" for value in values)
+                for pose in outcome.final_base_poses
+                for values in (pose[:3], pose[3:])
             ),
         )
-    return table
+    console.print(table)
 
 
-def _numbers(values: list[float]) -> str:
-    return " ".join(f"{value:6.3f}" for value in values)
+def _physics(client: URLabClient) -> dict[str, Any]:
+    import mujoco
 
-
-def _write(
-    folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, address: str | None, render: bool
-) -> dict[Path, str]:
-    """Write the files and return what is in each, or why it is missing."""
-    from urlab_client.cli.figures import plot_trace  # noqa: PLC0415
-    from urlab_client.cli.picture import NoPicture, draw_state  # noqa: PLC0415
-
-    plot, picture, record = folder / "joints.png", folder / "last_state.png", folder / "run.json"
-    plot_trace(one.trace, plot)
-    moment = one.outcome.sim_time
-    notes = {plot: f"joint positions over the {moment:.3f} s of the blocking run"}
-    drawn_by: str | None = None
-    if render:
-        try:
-            drawn_by = draw_state(one.model, one.data, picture)
-            notes[picture] = f"last state of the blocking run, after {moment:.3f} s (OpenGL: {drawn_by})"
-        except NoPicture as reason:
-            notes[picture] = f"not drawn: {reason}"
-    else:
-        notes[picture] = "not drawn: --no-render"
-    if drawn_by is None:
-        picture.unlink(missing_ok=True)  # one of an earlier run would show another state
-    configuration = _configuration(robot, one, two) | {"address": address, "opengl": drawn_by}
-    with replaced(record) as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(configuration), indent=2) + b"\n")
-    notes[record] = "versions, model, options, seed and results"
-    return notes
-
-
-def _configuration(robot: RobotFile, one: DemoRun, two: DemoRun) -> dict[str, Any]:
-    import mujoco  # noqa: PLC0415
-
-    from urlab_client.cli.demo_runs import SEED  # noqa: PLC0415
-
-    option = one.model.opt
+    if client.model is None:  # never so for the bundled server
+        return {}
+    option = client.model.opt
     return {
+        "step_mode": "direct",
+        "timestep": option.timestep,
+        "integrator": mujoco.mjtIntegrator(option.integrator).name,
+        "cone": mujoco.mjtCone(option.cone).name,
+        "solver": mujoco.mjtSolver(option.solver).name,
+        "gravity": option.gravity.tolist(),
+    }
+
+
+def _write_record(target: Path, model: str, results: dict[str, Any]) -> None:
+    packages = ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")
+    record = {
         "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {
             "python": platform.python_version(),
             "platform": platform.platform(),
-            **{name: version(name) for name in ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")},
+            **{package: version(package) for package in packages},
         },
-        "model": {
-            "name": robot.name,
-            "path": str(robot.path),
-            "sha256": hashlib.sha256(robot.path.read_bytes()).hexdigest(),
-        },
-        "options": {
-            "step_mode": "direct",
-            "timestep": option.timestep,
-            "integrator": mujoco.mjtIntegrator(option.integrator).name,
-            "cone": mujoco.mjtCone(option.cone).name,
-            "solver": mujoco.mjtSolver(option.solver).name,
-            "gravity": option.gravity.tolist(),
-        },
-        "seed": SEED,
-        "controllers": {
-            run.outcome.level: [controller.settings for controller in run.controllers] for run in (one, two)
-        },
-        "runs": [one.outcome, two.outcome],
-        "joints_png_and_last_state_png": one.outcome.level,
+        "model": {"path": model, "sha256": hashlib.sha256(Path(model).read_bytes()).hexdigest()},
+        "seed": _SEED,
+        **results,
     }
+    with replaced(target) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
