@@ -15,7 +15,7 @@ import pytest
 from plugin_memory import PluginMemory
 from samples import sample
 from shm_clients import shared, shm_clients
-from waiting import DEADLINE_S, pass_time, until
+from waiting import DEADLINE_S, gives_up, pass_time, until
 
 from urlab_client._windows import NamedEvent
 from urlab_client.aio import URLabClient
@@ -400,18 +400,6 @@ async def test_regions_made_anew_are_found(connect: Any, plugin: PluginMemory, d
 async def test_a_directory_without_shm_is_a_mistake() -> None:
     with pytest.raises(ValueError, match="shm_dir"):
         URLabClient("tcp://127.0.0.1", shm_dir="/tmp")
-
-
-async def gives_up(call: Callable[..., Any], arrived: Callable[[], object], fault: str) -> None:
-    """Cancel a call once it has arrived, or let its deadline pass."""
-    abandoned = asyncio.create_task(call(timeout=DEADLINE_S))
-    await until(arrived)
-    if fault == "cancelled":
-        abandoned.cancel()
-    else:
-        pass_time(DEADLINE_S)
-    with pytest.raises(asyncio.CancelledError if fault == "cancelled" else URLabTimeoutError):
-        await abandoned
 
 
 @pytest.mark.parametrize("fault", ["cancelled", "timed out"])
