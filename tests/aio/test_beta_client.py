@@ -477,8 +477,9 @@ async def test_a_camera_streams_while_somebody_looks(served: SimulatedServer) ->
             await client.sim.stop()
             await client.sim.start()
             # Play began with the camera off, and it was switched on again for whoever still looks.
-            while picture.gap is None:
-                picture = await next_picture(frames)
+            async with asyncio.timeout(DEADLINE_S):
+                while picture.gap is None:
+                    picture = await next_picture(frames)
 
 
 async def test_the_state_stream_goes_on_outside_live_mode(served: SimulatedServer) -> None:

@@ -209,8 +209,7 @@ def test_closing_a_blocking_client_while_its_server_starts(never_ready: None) ->
     client = urlab_client.URLabClient("sim://ball")
     with ThreadPoolExecutor(1) as pool:
         call = pool.submit(client.discover)
-        while not children():
-            pass
+        eventually(children)
         client.close()
         assert children() == set()
         with pytest.raises(ClientClosed):

@@ -146,8 +146,9 @@ async def published(client: AsyncClient, key: str) -> None:
     """Wait until some states of this articulation have arrived, whatever the client was told of it."""
     seen = 0
     async with client.state_stream(timeout=DEADLINE_S) as states:
-        while seen < 5:
-            seen += key in (await states.receive()).per_articulation
+        async with asyncio.timeout(DEADLINE_S):
+            while seen < 5:
+                seen += key in (await states.receive()).per_articulation
 
 
 @pytest.mark.parametrize("looks_on", [False, True])

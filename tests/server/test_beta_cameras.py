@@ -168,8 +168,7 @@ def test_a_camera_that_is_switched_on_at_standstill_shows_what_it_has_missed(pla
     playing.wire.ask("set_mode", mode=mode)
     if mode == "live":
         playing.wire.ask("set_paused", paused=False)
-    while not playing.step()["frame_id"]:
-        pass
+    eventually(lambda: playing.step()["frame_id"])
     playing.wire.ask("set_mode", mode="direct")
     camera = f"{playing.b}/cam"  # on a port of this session alone: nobody who has left seems to listen still
     told = playing.wire.ask("set_camera_streaming", cameras={camera: True})["cameras"][camera]
