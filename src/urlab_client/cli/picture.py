@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._children import why_it_failed
 from urlab_client.cli._files import replaced
 from urlab_client.server.editor.geometry import Box, box_around
 from urlab_client.server.render.opengl import ADVICE
@@ -106,10 +107,7 @@ def _draw_in_child(folder: Path, platform: str) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return f"nothing drawn within {_DEADLINE_S:g} s"
-    if child.returncode == 0:
-        return None
-    lines = child.stderr.decode(errors="replace").strip().splitlines()
-    return lines[-1].strip() if lines else f"the renderer exited with code {child.returncode}"
+    return why_it_failed(child) if child.returncode else None
 
 
 # What follows runs in the child.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from urlab_client._children import APART
+from urlab_client._children import APART, why_it_failed
 from urlab_client.protocol.errors import URLabError
 
 __all__ = [
@@ -183,5 +183,4 @@ def _probe(name: str) -> Backend | str:
         return str(error)
     if child.returncode == 0:
         return Backend(name, child.stdout.decode(errors="replace").strip())
-    lines = child.stderr.decode(errors="replace").strip().splitlines()
-    return lines[-1].strip() if lines else f"the probe ended with code {child.returncode}"
+    return why_it_failed(child)
