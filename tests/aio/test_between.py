@@ -61,6 +61,7 @@ SERVERS = {
 }
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("name", SERVERS)
 async def test_the_same_program_runs(name: str) -> None:
     """Beta statement 67, feature by feature."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pytest
 from PIL import Image
 
 from urlab_client.cli.picture import draw_state
@@ -17,6 +18,7 @@ SCENE = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
+@pytest.mark.opengl
 def test_a_robot_that_has_walked_away_keeps_its_shadow(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)

@@ -6,6 +6,7 @@ import asyncio
 from typing import Any
 
 import numpy as np
+import pytest
 from waiting import DEADLINE_S
 
 
@@ -55,6 +56,7 @@ async def test_events_tell_the_story(connect: Any, serve: Any) -> None:
         assert told == ["ServerConnected", "SessionOpened", "PlayStarted", "PlayEnded"]
 
 
+@pytest.mark.opengl
 async def test_pictures_by_themselves(connect: Any, serve: Any) -> None:
     with serve("quadruped", play=True, unpaused=True, camera_size=(64, 48)) as server:
         client = connect(server, step_mode="live")

@@ -52,6 +52,7 @@ async def test_a_rollout_is_the_same_over_either_transport(connect: Any, server:
     assert await rollout("shm") == await rollout("zmq")
 
 
+@pytest.mark.opengl
 async def test_every_kind_of_op_works_beside_it(connect: Any, server: SimulatedServer) -> None:
     client = await discovered(connect, server, transport="shm")
     await client.step()
@@ -67,6 +68,7 @@ async def test_every_kind_of_op_works_beside_it(connect: Any, server: SimulatedS
     assert any("editor" in reason for reason in over_zmq)
 
 
+@pytest.mark.opengl
 async def test_state_and_pictures_stream_in_live_mode(connect: Any, server: SimulatedServer) -> None:
     client = await discovered(connect, server, transport="shm", step_mode="live")
     await client.runtime.set_paused(False)

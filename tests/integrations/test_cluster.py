@@ -156,6 +156,7 @@ def test_a_run_goes_on_with_what_is_missing_on_workers_that_stay_up(expected: di
         missing_ids(saved, 6, seed=5)
 
 
+@pytest.mark.opengl
 def test_dictionaries_and_pictures_come_back_as_they_were_seen(cluster: Any, tmp_path: Path) -> None:
     from urlab_client.cluster import load_episodes, rollouts, save_episode
     from urlab_client.integrations.gym import Reach

@@ -102,6 +102,12 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return what was logged, but for that of a machine that cannot draw."""
+    logged = [record.getMessage() for record in caplog.records]
+    return [message for message in logged if not message.startswith("camera images are left out: ")]
+
+
 async def test_ending_breaks_off_what_takes_long_without_a_trace(
     folder: Path, converting: threading.Event, compiling: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -118,7 +124,7 @@ async def test_ending_breaks_off_what_takes_long_without_a_trace(
             ended.set()
             for reader, _ in (conversion, uploading, again, importing):
                 assert await reader.readline() == b"HTTP/1.1 503 Service Unavailable\r\n"
-    assert sorted(record.getMessage() for record in caplog.records) == [
+    assert sorted(messages(caplog)) == [
         "the conversion of short.mcap to csv was broken off",
         f"the download of {LONG} was broken off",
         "the import of robot.zip was broken off",
@@ -143,4 +149,4 @@ async def test_a_browser_that_leaves_ends_what_was_made_for_it(
                 await until(lambda: len(os.listdir(folder)) == 2)
             assert converting.is_set()
             ended.set()
-    assert caplog.records == []
+    assert messages(caplog) == []

@@ -128,6 +128,7 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
 
 
+@pytest.mark.opengl
 def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) -> None:
     from jsonschema import Draft202012Validator
 
@@ -314,6 +315,7 @@ def test_one_drives_and_the_others_wait(http: TestClient) -> None:
         assert http.post("/api/ops/reset", json={}, headers=second).status_code == 200
 
 
+@pytest.mark.opengl
 def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
     try:
         assert http.post("/api/ops/set_mode", json={"mode": "direct"}).json()["current_mode"] == "direct"
@@ -349,6 +351,7 @@ def picture_of(socket: Any, time: float) -> tuple[dict[str, Any], bytes]:
     return next(picture for picture in pictures if picture[0]["sim_time"] == pytest.approx(time, abs=1e-6))
 
 
+@pytest.mark.opengl
 def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
     server: SimulatedServer, http: TestClient, tmp_path: Path
 ) -> None:
@@ -497,6 +500,7 @@ def test_a_replay_that_is_at_its_end_plays_from_the_start(http: TestClient, tmp_
         http.delete("/api/recordings/odd.mcap")
 
 
+@pytest.mark.opengl
 def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
     def shown(kind: str) -> tuple[int, int]:
         answer = http.get(f"/api/cameras/arm/overview.{kind}")
@@ -708,6 +712,7 @@ def test_agents_give_way_to_people_and_not_to_each_other() -> None:
     assert lease.holder is two
 
 
+@pytest.mark.opengl
 def test_a_paused_beta_is_seen_and_driven() -> None:
     with (
         SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,
