@@ -119,6 +119,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """Look for OpenGL once for all workers, which collect the tests."""
     if getattr(config.option, "numprocesses", None):
         without_opengl()
+    elif os.environ.pop("PYTHONDEVMODE", None):
+        # Programs have the rest of the development mode: asyncio would tell of whatever takes long on a busy machine.
+        os.environ.update(PYTHONWARNINGS="default", PYTHONFAULTHANDLER="1", PYTHONMALLOC="debug")
 
 
 @pytest.hookimpl(trylast=True)
