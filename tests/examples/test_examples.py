@@ -23,6 +23,7 @@ FOREIGN = {"push_by_sight", "rllib_reach"}
 MARKED = {
     "ray_rollouts": pytest.mark.ray,
     "view_rerun": pytest.mark.view,
+    "viewport_picture": pytest.mark.opengl,
     **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
 }
 
