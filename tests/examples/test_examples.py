@@ -24,7 +24,8 @@ MARKED = {
     "ray_rollouts": pytest.mark.ray,
     "view_rerun": pytest.mark.view,
     "viewport_picture": pytest.mark.opengl,
-    **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
+    "vector_env": pytest.mark.long,
+    **dict.fromkeys(("gym_env", "record_run", "run_policy"), (pytest.mark.long, pytest.mark.opengl)),
 }
 
 EXAMPLES = sorted(
