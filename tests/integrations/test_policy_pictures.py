@@ -194,6 +194,7 @@ def test_a_simulated_server_gets_the_cameras_that_are_declared() -> None:
     assert spec.simulated("a/arm.xml", "arm") == wanted
 
 
+@pytest.mark.opengl
 @pytest.mark.long
 def test_the_command_runs_a_network_that_sees(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run-policy", str(PUSH), "--seconds", "0.2", "--compare", "--json"]) == 0

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._children import why_it_failed
 from urlab_client.cli._files import replaced
 from urlab_client.server.editor.geometry import Box, box_around
-from urlab_client.server.render.opengl import ADVICE
+from urlab_client.server.render.opengl import ADVICE, why_it_failed
 
 if TYPE_CHECKING:
     import mujoco
