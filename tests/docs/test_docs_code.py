@@ -51,7 +51,7 @@ LONG = {
 }
 """Pages whose code takes several seconds."""
 
-PICTURES = re.compile(r'include_cameras|\bcameras(=|": )|\.capture\(|\.frames\(|server\.snapshot\(|urlab snapshot')
+PICTURES = re.compile(r'include_cameras|\bcameras(=|": \[)|\.capture\(|\.frames\(|server\.snapshot\(|urlab snapshot')
 """In the code of pages that have pictures drawn."""
 
 CANNOT_DRAW = re.compile(r"^camera images are left out: .*\n", re.MULTILINE)
