@@ -101,10 +101,27 @@ def lacking(item: pytest.Item) -> str:
     return ""
 
 
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Look for OpenGL, which the first picture would wait for. Tests whose fixtures request this get the mark."""
+    from urlab_client.server.render.opengl import search_backend
+
+    search_backend()
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark the tests whose fixtures have pictures drawn."""
+    if "opengl" in getattr(item, "fixturenames", ()):
+        item.add_marker("opengl")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Look for OpenGL once for all workers, which collect the tests."""
     if getattr(config.option, "numprocesses", None):
         without_opengl()
+    elif os.environ.pop("PYTHONDEVMODE", None):
+        # Programs have the rest of the development mode: asyncio would tell of whatever takes long on a busy machine.
+        os.environ.update(PYTHONWARNINGS="default", PYTHONFAULTHANDLER="1", PYTHONMALLOC="debug")
 
 
 @pytest.hookimpl(trylast=True)

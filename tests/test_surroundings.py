@@ -39,14 +39,23 @@ def test_needs_a_later_release():
 @pytest.mark.opengl
 def test_draws(camera):
     raise AssertionError
+
+@pytest.fixture
+def picture(opengl):
+    raise AssertionError
+
+def test_looks(picture):
+    raise AssertionError
 """
 
 LEFT_OUT = [
     "1 left out, which need MuJoCo 99.0 or later; this is",
     "test_inner.py: test_needs_a_later_release",
-    "2 left out, which need OpenGL: MUJOCO_GL=off disables OpenGL; unset it",
-    "test_inner.py: test_draws",
+    "3 left out, which need OpenGL: MUJOCO_GL=off disables OpenGL; unset it",
+    "test_inner.py: test_draws, test_looks",
 ]
+
+WITH_PICTURES = ["server/test_rendering.py", "server/test_snapshot.py", "conformance/test_capture.py"]
 
 
 def test_in_the_background_without_opengl(tmp_path: Path) -> None:
@@ -75,3 +84,21 @@ def test_in_the_background_without_opengl(tmp_path: Path) -> None:
     assert len(started) == 2
     for process in started:
         eventually(lambda process=process: not Path(f"/proc/{process}/exe").exists(), "a child is left")
+
+
+def test_where_pictures_are_the_subject_the_rest_passes_without_opengl() -> None:
+    """Exactly what draws is left out: nothing fails, and nothing waits for a picture."""
+    environment = {**os.environ, "MUJOCO_GL": "off"}
+    environment.pop("URLAB_TESTS_WITHOUT_OPENGL", None)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *WITH_PICTURES],
+        cwd=TESTS,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "left out, which need OpenGL: MUJOCO_GL=off disables OpenGL; unset it" in done.stdout
+    assert "server/test_rendering.py: test_a_bare_name_means_the_last_robot, " in done.stdout

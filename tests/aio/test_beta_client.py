@@ -421,6 +421,7 @@ async def served(tmp_path: Path) -> AsyncIterator[SimulatedServer]:
         yield server
 
 
+@pytest.mark.opengl
 async def test_pictures_of_a_step(served: SimulatedServer) -> None:
     """Beta statements 50 and 75. Generation 2 statements 54 and 55."""
     async with URLabClient(**served.client_options(), step_mode="direct") as client:
@@ -457,6 +458,7 @@ async def test_an_older_picture_is_not_handed_out_as_that_of_the_step(client: UR
     assert (camera.delivered, camera.frame_id, camera.sim_time) == (True, 0, 0.0)
 
 
+@pytest.mark.opengl
 async def test_a_camera_streams_while_somebody_looks(served: SimulatedServer) -> None:
     """Beta statements 53 and 56. Generation 2 statements 35 and 56."""
     async with URLabClient(**served.client_options(), step_mode="direct", live_pictures=False) as client:
@@ -477,8 +479,9 @@ async def test_a_camera_streams_while_somebody_looks(served: SimulatedServer) ->
             await client.sim.stop()
             await client.sim.start()
             # Play began with the camera off, and it was switched on again for whoever still looks.
-            while picture.gap is None:
-                picture = await next_picture(frames)
+            async with asyncio.timeout(DEADLINE_S):
+                while picture.gap is None:
+                    picture = await next_picture(frames)
 
 
 async def test_the_state_stream_goes_on_outside_live_mode(served: SimulatedServer) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import pytest
+from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.base import Op
@@ -59,6 +61,7 @@ SERVERS = {
 }
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("name", SERVERS)
 async def test_the_same_program_runs(name: str) -> None:
     """Beta statement 67, feature by feature."""
@@ -79,8 +82,9 @@ async def test_the_same_program_runs(name: str) -> None:
 
         async with client.state_stream() as states:
             stepped = await client.step()
-            while (await states.receive(timeout=10)).time < stepped.time:
-                pass
+            async with asyncio.timeout(DEADLINE_S):
+                while (await states.receive(timeout=10)).time < stepped.time:
+                    pass
 
         for _ in range(2):
             await client.step(include_cameras={"wrist": "sync"})
@@ -105,8 +109,9 @@ async def test_the_same_program_runs(name: str) -> None:
         await client.runtime.set_paused(False)
         async with client.state_stream() as states:
             first = await states.receive(timeout=10)
-            while (await states.receive(timeout=10)).time <= first.time:
-                pass
+            async with asyncio.timeout(DEADLINE_S):
+                while (await states.receive(timeout=10)).time <= first.time:
+                    pass
         async with arm.cameras["wrist"].frames() as frames:
             for _ in range(2):
                 assert (await frames.receive(timeout=20)).pixels.shape == (12, 16, 4)

@@ -145,6 +145,7 @@ async def test_latencies(client: URLabClient, beta: ScriptedBeta) -> None:
     assert sent["arm_C_1/wrist"] == {"delay_s": 0.5, "jitter_s": 0.1, "clock": "wall", "max_fps": 30.0}
 
 
+@pytest.mark.opengl
 async def test_a_camera_of_the_simulated_server_is_late(tmp_path: Path) -> None:
     arm = tmp_path / "arm.xml"
     arm.write_text(ROBOT)

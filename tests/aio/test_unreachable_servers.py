@@ -33,8 +33,9 @@ async def test_what_accepts_and_says_nothing_is_tried_again() -> None:
                 connection, _ = await asyncio.to_thread(mute.accept)
                 with connection:
                     connection.settimeout(DEADLINE_S)
-                    while await asyncio.to_thread(connection.recv, 65536):  # until the client gives it up
-                        pass
+                    async with asyncio.timeout(DEADLINE_S):
+                        while await asyncio.to_thread(connection.recv, 65536):  # until the client gives it up
+                            pass
             call.cancel()
             await asyncio.wait((call,))
             for _ in range(10):  # also between two attempts

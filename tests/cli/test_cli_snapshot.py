@@ -31,12 +31,14 @@ def picture(*arguments: str) -> np.ndarray[Any, Any]:
     return np.asarray(Image.open("out.png")) / 255
 
 
+@pytest.mark.opengl
 def test_models_in_a_process_of_its_own(tmp_path: Path) -> None:
     done = urlab("snapshot", "quadruped", "arm", "--size", "160x90", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "snapshot.png: 160x90\n", "")
     assert np.asarray(Image.open(tmp_path / "snapshot.png")).shape == (90, 160, 4)
 
 
+@pytest.mark.opengl
 def test_the_ending_chooses_the_format(tmp_path: Path) -> None:
     picture = tmp_path / "ball.jpg"
     assert main(["snapshot", "ball", "--size", "32x24", "-o", str(picture)]) == 0
@@ -44,6 +46,7 @@ def test_the_ending_chooses_the_format(tmp_path: Path) -> None:
         assert (image.format, image.size) == ("JPEG", (32, 24))
 
 
+@pytest.mark.opengl
 def test_modes_and_moments_differ() -> None:
     size = ["--size", "64x48"]
     pictures = [
@@ -54,6 +57,7 @@ def test_modes_and_moments_differ() -> None:
     assert len({image.tobytes() for image in pictures}) == len(pictures)
 
 
+@pytest.mark.opengl
 def test_a_saved_level(tmp_path: Path) -> None:
     with SimulatedServer(saved_dir=tmp_path) as server, URLabClient(**server.client_options()) as client:
         client.discover()
@@ -63,6 +67,7 @@ def test_a_saved_level(tmp_path: Path) -> None:
     assert picture(str(tmp_path / "Levels" / "lab.json"), "--size", "64x64")[28:36, 28:36, :3].max() > 0.2
 
 
+@pytest.mark.opengl
 def test_cameras_and_what_their_pixels_mean() -> None:
     camera = ["arm", "--camera", "arm/overview", "--size", "64x48"]
     real, depth, semantic = (picture(*camera, "--mode", mode) for mode in ("real", "depth", "semantic"))
@@ -72,6 +77,7 @@ def test_cameras_and_what_their_pixels_mean() -> None:
     assert len(np.unique(semantic.reshape(-1, 4), axis=0)) == 2
 
 
+@pytest.mark.opengl
 def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> None:
     with SimulatedServer("arm", play=True, unpaused=True) as server:
         address = f"{server.address}:{server.step_port}"
@@ -84,12 +90,14 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
         assert "--seconds are for models" in capsys.readouterr().err
 
 
+@pytest.mark.opengl
 def test_a_camera_of_a_paused_beta_whose_streams_are_silent() -> None:
     with SimulatedServer("arm", play=True, dialect="beta") as server:
         address = f"{server.address}:{server.step_port}"
         assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 4)
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
 def test_a_camera_of_a_server_that_somebody_steps(dialect: DialectName) -> None:
     with (
@@ -114,6 +122,7 @@ def test_a_server_that_is_pinned_to_steps_says_so(capsys: pytest.CaptureFixture[
     assert "In this mode, pictures come with steps" in capsys.readouterr().err
 
 
+@pytest.mark.opengl
 def test_a_picture_beside_the_client_that_drives(tmp_path: Path) -> None:
     with (
         SimulatedServer("arm", play=True, unpaused=True) as server,
@@ -126,18 +135,21 @@ def test_a_picture_beside_the_client_that_drives(tmp_path: Path) -> None:
         driver.step()
 
 
+SERVED = pytest.mark.opengl  # found out by the server, which is started only where it can draw
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["nosuch"], ["nosuch", "quadruped"]),
-        (["arm", "--camera", "arm/tail"], ["arm/tail", "arm/wrist"]),
-        (["arm", "--camera", "arm/tail", "--mode", "depth"], ["arm/tail", "arm/wrist"]),
-        (["arm", "--keyframe", "nope"], ["nope", "arm_home"]),
+        pytest.param(["nosuch"], ["nosuch", "quadruped"], marks=SERVED),
+        pytest.param(["arm", "--camera", "arm/tail"], ["arm/tail", "arm/wrist"], marks=SERVED),
+        pytest.param(["arm", "--camera", "arm/tail", "--mode", "depth"], ["arm/tail", "arm/wrist"], marks=SERVED),
+        pytest.param(["arm", "--keyframe", "nope"], ["nope", "arm_home"], marks=SERVED),
         (["arm", "--mode", "depth"], ["without --camera", "wireframe"]),
         (["arm", "--mode", "unlit", "--camera", "arm/wrist"], ["with --camera", "semantic"]),
         (["arm", "-o", "nowhere/x.png"], ["nowhere"]),
         (["arm", "-o", "x.txt"], ["x.txt", ".png or .jpg", "x.png"]),
-        (["amr"], ["amr", "Did you mean 'arm'?"]),
+        pytest.param(["amr"], ["amr", "Did you mean 'arm'?"], marks=SERVED),
         (["tcp://localhost:1", "--mjcf-options"], ["sim://MODEL", "tcp://localhost:1"]),
         (["tcp://localhost:1", "arm"], ["one address"]),
         (["arm", "--handshake", "x"], ["--handshake", "running server"]),

@@ -38,6 +38,7 @@ def moved(first: Any, second: Any) -> bool:
     return bool((np.abs(first.astype(float) - second.astype(float)) > 0.2 * float(np.ptp(first))).any())
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("mode", ["direct", "puppet"])
 async def test_a_picture_costs_no_step(connect: Any, server: Any, mode: str) -> None:
     client = connect(server, step_mode=mode)
@@ -59,6 +60,7 @@ async def test_a_picture_costs_no_step(connect: Any, server: Any, mode: str) -> 
     assert (await client.step()).time == pytest.approx(at + 0.002)
 
 
+@pytest.mark.opengl
 async def test_in_live_mode_time_goes_on_or_rests_as_before(connect: Any, server: Any) -> None:
     client = connect(server, step_mode="live")
     await client.discover()
@@ -76,6 +78,7 @@ async def test_in_live_mode_time_goes_on_or_rests_as_before(connect: Any, server
     await client.wait_until(lambda: client.sim_time > now)
 
 
+@pytest.mark.opengl
 async def test_several_at_once_show_one_moment(connect: Any, server: Any) -> None:
     client = connect(server, step_mode="direct")
     await client.discover()
@@ -94,6 +97,7 @@ async def test_several_at_once_show_one_moment(connect: Any, server: Any) -> Non
         await client.capture("near")
 
 
+@pytest.mark.opengl
 async def test_a_pause_that_the_user_set_outlasts_it(connect: Any, server: Any) -> None:
     client = connect(server, step_mode="direct")
     await client.discover()

@@ -68,6 +68,7 @@ async def test_an_observer_is_told_of_handshakes_and_of_every_kind_of_state(conn
         assert len(notes.told) == 4
 
 
+@pytest.mark.opengl
 async def test_an_observer_gets_pictures_with_the_steps_of_others(connect: Any, serve: Any) -> None:
     with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")

@@ -19,6 +19,7 @@ def looking_on(connect: Any, server: Any) -> Any:
     return connect(server, transport="zmq", read_only=True)
 
 
+@pytest.mark.opengl
 async def test_it_sees_what_the_driver_sees_and_disturbs_nobody(connect: Any, server: Any) -> None:
     driver, other = connect(server, step_mode="live"), looking_on(connect, server)
     await driver.discover()

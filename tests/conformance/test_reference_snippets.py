@@ -102,6 +102,7 @@ async def test_controllers(connect: Any, scene: Any) -> None:
     assert art.resolve_actuator("nonsense") is None
 
 
+@pytest.mark.opengl
 async def test_cameras(connect: Any, scene: Any) -> None:
     client = connect(scene, step_mode="direct")
     await client.discover()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import DEADLINE_S
 
 from urlab_client.protocol.base import DialectName
 from urlab_client.server import SimulatedServer
@@ -50,6 +52,7 @@ async def test_a_rollout_is_the_same_over_either_transport(connect: Any, server:
     assert await rollout("shm") == await rollout("zmq")
 
 
+@pytest.mark.opengl
 async def test_every_kind_of_op_works_beside_it(connect: Any, server: SimulatedServer) -> None:
     client = await discovered(connect, server, transport="shm")
     await client.step()
@@ -65,12 +68,14 @@ async def test_every_kind_of_op_works_beside_it(connect: Any, server: SimulatedS
     assert any("editor" in reason for reason in over_zmq)
 
 
+@pytest.mark.opengl
 async def test_state_and_pictures_stream_in_live_mode(connect: Any, server: SimulatedServer) -> None:
     client = await discovered(connect, server, transport="shm", step_mode="live")
     await client.runtime.set_paused(False)
     stream = client.state_stream()
-    while (time := (await stream.receive(timeout=10)).time) == 0:
-        pass  # of the pause, and still on its way
+    async with asyncio.timeout(DEADLINE_S):
+        while (time := (await stream.receive(timeout=10)).time) == 0:
+            pass  # of the pause, and still on its way
     times = [time, *[(await stream.receive(timeout=10)).time for _ in range(4)]]
     assert times == sorted(set(times))
     frames = client.articulations["quadruped"].cameras["side"].frames()

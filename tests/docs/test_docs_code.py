@@ -51,6 +51,12 @@ LONG = {
 }
 """Pages whose code takes several seconds."""
 
+PICTURES = re.compile(r'include_cameras|\bcameras(=|": \[)|\.capture\(|\.frames\(|server\.snapshot\(|urlab snapshot')
+"""In the code of pages that have pictures drawn."""
+
+CANNOT_DRAW = re.compile(r"^camera images are left out: .*\n", re.MULTILINE)
+"""What a server says that was asked for pictures which no code of the page needs."""
+
 # Runs the blocks of a page as one program; a separator tells their outputs apart. Tracebacks name the page's lines.
 DRIVER = r"""
 import json, sys
@@ -103,14 +109,18 @@ def run_python(page: Path, chosen: list[Block], folder: Path, **environment: str
 
 def page_param(page: Path) -> Any:
     """Return a page as a parameter; what takes several seconds runs with the long tests."""
-    return pytest.param(page, id=shown(page), marks=[pytest.mark.long] if shown(page) in LONG else [])
+    code = [block.code for block in python_blocks(page)] + [command for _, command, _ in shell_steps(page)]
+    marks = [pytest.mark.long] if shown(page) in LONG else []
+    if any(PICTURES.search(block) for block in code):
+        marks.append(pytest.mark.opengl)
+    return pytest.param(page, id=shown(page), marks=marks)
 
 
 @pytest.mark.parametrize("page", [page_param(p) for p in pages() if python_blocks(p) or shell_steps(p)])
 def test_code_runs(page: Path, tmp_path: Path) -> None:
     # The commands come second, in the same folder, so that they find what the page's program has written.
     if chosen := python_blocks(page):
-        assert run_python(page, chosen, tmp_path) == ""
+        assert CANNOT_DRAW.sub("", run_python(page, chosen, tmp_path)) == ""
     shell = Shell(tmp_path)
     try:
         for block, command, output in shell_steps(page):

@@ -23,7 +23,9 @@ FOREIGN = {"push_by_sight", "rllib_reach"}
 MARKED = {
     "ray_rollouts": pytest.mark.ray,
     "view_rerun": pytest.mark.view,
-    **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
+    "viewport_picture": pytest.mark.opengl,
+    "vector_env": pytest.mark.long,
+    **dict.fromkeys(("gym_env", "record_run", "run_policy"), (pytest.mark.long, pytest.mark.opengl)),
 }
 
 EXAMPLES = sorted(

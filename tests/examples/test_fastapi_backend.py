@@ -16,7 +16,7 @@ import httpx2
 import pytest
 from http_served import served
 from served import Served
-from waiting import until
+from waiting import DEADLINE_S, until
 from websockets.asyncio.client import connect
 
 from urlab_client.aio import URLabClient
@@ -110,5 +110,6 @@ async def test_a_restart_of_the_server_is_told_and_survived(monkeypatch: pytest.
                 await program.client.runtime.set_paused(False)
                 moved = await http.post("/robots/arm/move", json={"elbow": 0.3})
                 assert moved.status_code == 200, moved.text
-                while json.loads(await browser.recv())["time"] >= before:
-                    pass  # of the server before
+                async with asyncio.timeout(DEADLINE_S):
+                    while json.loads(await browser.recv())["time"] >= before:
+                        pass  # of the server before

@@ -32,6 +32,7 @@ LOOK = Randomisation(
 )
 
 
+@pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("quality", ["fast", pytest.param("high", marks=pytest.mark.long)])
 def test_a_batch_sees_what_a_server_shows(quality: Literal["fast", "high"], made: list[Any]) -> None:
     options: Any = {"space_mode": "dict", "cameras": list(MODES), "n_substeps": 20, "reset_noise": 0.2}
@@ -44,7 +45,6 @@ def test_a_batch_sees_what_a_server_shows(quality: Literal["fast", "high"], made
         camera_modes={name: mode for name, mode in MODES.items() if mode is not CameraMode.REAL},
         randomise=LOOK,
     ) as server:
-        assert server.can_render  # the first picture would wait for that
         address = f"{server.address}:{server.step_port}"
         batch, wire = URLabBatchEnv(address, 2, **options), URLabVectorEnv([address], **options)
         made += [batch, wire]
@@ -88,6 +88,7 @@ def test_what_follows_from_a_varied_camera_is_known_before_mujoco_has_batches() 
     assert batch.expand("cam_pos")[1].tolist() == [[0.0, 0.0, 3.0]]
 
 
+@pytest.mark.opengl
 @pytest.mark.long
 def test_a_program_that_forgets_to_close_a_batch_ends(tmp_path: Any) -> None:
     script = tmp_path / "forgetful.py"

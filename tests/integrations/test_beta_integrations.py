@@ -38,6 +38,7 @@ def clients(servers: list[SimulatedServer]) -> Iterator[list[urlab_client.URLabC
         client.close()
 
 
+@pytest.mark.opengl
 def test_an_environment(clients: list[urlab_client.URLabClient]) -> None:
     alpha, beta = (
         URLabEnv(client, space_mode="dict", cameras=["quadruped/side"], n_substeps=5, reset_noise=0.05)
@@ -74,6 +75,7 @@ def test_a_batch_and_a_server() -> None:
             batch.close()
 
 
+@pytest.mark.opengl
 def test_a_recording(clients: list[urlab_client.URLabClient], tmp_path: Path) -> None:
     runs = []
     for name, client in zip(("alpha", "beta"), clients, strict=True):

@@ -156,6 +156,7 @@ def test_a_run_goes_on_with_what_is_missing_on_workers_that_stay_up(expected: di
         missing_ids(saved, 6, seed=5)
 
 
+@pytest.mark.opengl
 def test_dictionaries_and_pictures_come_back_as_they_were_seen(cluster: Any, tmp_path: Path) -> None:
     from urlab_client.cluster import load_episodes, rollouts, save_episode
     from urlab_client.integrations.gym import Reach
@@ -338,12 +339,9 @@ def waits_forever(notes: Path, fifo: Path) -> Any:
     return policy
 
 
-def test_an_attempt_that_takes_too_long_is_ended_with_its_server(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from urlab_client.cluster import RolloutError, rollouts
-
-    policy = waits_forever(tmp_path / "notes", tmp_path / "fifo")
+@pytest.fixture
+def too_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let 100 s pass for the run as soon as a policy waits at the other end of `fifo`."""
     writers: list[int] = []
 
     def clock() -> float:
@@ -353,10 +351,19 @@ def test_an_attempt_that_takes_too_long_is_ended_with_its_server(
         return time.monotonic() + 100 * len(writers)
 
     monkeypatch.setattr(import_module("urlab_client.cluster.rollouts"), "time", SimpleNamespace(monotonic=clock))
+    yield
+    for writer in writers:
+        os.close(writer)
+
+
+@pytest.mark.usefixtures("too_late")
+def test_an_attempt_that_takes_too_long_is_ended_with_its_server(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    policy = waits_forever(tmp_path / "notes", tmp_path / "fifo")
     with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 90 s"):
         list(rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=90, **OPTIONS))
     assert gone(tmp_path / "notes")
-    os.close(writers[0])
 
 
 def waits_once(fifo: Path, notes: Path, pool: Any) -> Any:
@@ -377,20 +384,10 @@ def waits_once(fifo: Path, notes: Path, pool: Any) -> Any:
     return policy
 
 
-def test_an_attempt_that_takes_too_long_leaves_its_lease_to_the_next(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("too_late")
+def test_an_attempt_that_takes_too_long_leaves_its_lease_to_the_next(cluster: Any, tmp_path: Path) -> None:
     from urlab_client.cluster import LeasePool, rollouts
 
-    writers: list[int] = []
-
-    def clock() -> float:
-        if not writers:
-            with contextlib.suppress(OSError):  # as long as nobody reads: the policy does not wait yet
-                writers.append(os.open(tmp_path / "fifo", os.O_WRONLY | os.O_NONBLOCK))
-        return time.monotonic() + 100 * len(writers)
-
-    monkeypatch.setattr(import_module("urlab_client.cluster.rollouts"), "time", SimpleNamespace(monotonic=clock))
     with SimulatedServer("arm", play=True) as server:
         address = f"{server.address}:{server.step_port}"
         pool = LeasePool([address], ttl=600)  # far longer than this test
@@ -401,7 +398,6 @@ def test_an_attempt_that_takes_too_long_leaves_its_lease_to_the_next(
         assert first != second, "what the first attempt gives back late is not the second's"
         assert pool.holders() == {address: None}
         pool.close()
-    os.close(writers[0])
 
 
 async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from urlab_client.integrations.gym import envhub
 from urlab_client.server import SimulatedServer
 
 
+@pytest.mark.opengl
 def test_lerobot_sees_what_datasets_hold_under_their_names() -> None:
     with SimulatedServer("arm", play=True) as server:
         options: dict[str, Any] = {

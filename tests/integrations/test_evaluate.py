@@ -82,6 +82,7 @@ def test_outcomes_are_those_of_single_episodes_whatever_the_batch() -> None:
     assert found[0].success_rate == wilson(sum(outcome.success for outcome in found[0].outcomes), 5)
 
 
+@pytest.mark.opengl
 @pytest.mark.long
 def test_a_network_that_sees_pictures_is_evaluated_on_servers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

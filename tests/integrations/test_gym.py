@@ -53,14 +53,18 @@ def without_advice() -> Iterator[None]:
 
 @pytest.mark.parametrize(
     "options",
-    [{"space_mode": "flat"}, {"space_mode": "dict"}, {"space_mode": "dict", "cameras": ["quadruped/side"]}],
-    ids=["flat", "dict", "cameras"],
+    [
+        pytest.param({"space_mode": "flat"}, id="flat"),
+        pytest.param({"space_mode": "dict"}, id="dict"),
+        pytest.param({"space_mode": "dict", "cameras": ["quadruped/side"]}, id="cameras", marks=pytest.mark.opengl),
+    ],
 )
 def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, options: dict[str, Any]) -> None:
     with without_advice():
         check_env(make_env(n_substeps=2, reset_noise=0.05, **options), skip_close_check=True)
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize(
     "task_id",
     [pytest.param(task, marks=[pytest.mark.long] if number else []) for number, task in enumerate(sorted(TASKS))],
@@ -187,6 +191,7 @@ def test_a_reset_can_start_from_a_keyframe(make_env: MakeEnv) -> None:
     assert observation["quadruped"]["qpos"][2] == pytest.approx(0.3038)
 
 
+@pytest.mark.opengl
 def test_pictures_show_the_state_and_leave_physics_alone(make_env: MakeEnv) -> None:
     actions = [{"quadruped": np.zeros(12), "arm": np.full(7, 0.04)}] * 30
 
@@ -210,6 +215,7 @@ def test_pictures_show_the_state_and_leave_physics_alone(make_env: MakeEnv) -> N
     assert not np.array_equal(first, last)
 
 
+@pytest.mark.opengl
 def test_pictures_of_depths_and_segmentations_are_rendered_as_colours() -> None:
     modes = {"arm/wrist": "depth", "arm/overview": "semantic"}
     with SimulatedServer("arm", play=True, camera_size=(16, 12), camera_modes=modes) as server:
@@ -333,6 +339,7 @@ def test_noise_at_a_reset_stays_within_the_joints_ranges_and_knows_metres_from_r
         ResetNoise(slide=-1)
 
 
+@pytest.mark.opengl
 def test_an_observed_picture_is_what_render_returns(make_env: MakeEnv) -> None:
     camera = "quadruped/side"
     env = make_env(space_mode="dict", cameras=[camera], render_mode="rgb_array", render_camera=camera)

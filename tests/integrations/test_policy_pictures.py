@@ -75,13 +75,14 @@ def policy_of(text: str, network: Callable[[Any], Any]) -> Policy:
 
 
 @pytest.fixture(scope="module")
-def arm() -> Iterator[URLabClient]:
+def arm(opengl: None) -> Iterator[URLabClient]:
     modes = {"arm/wrist": CameraMode.DEPTH}
-    with SimulatedServer("arm", play=True, camera_size=(48, 32), camera_modes=modes) as server:
-        assert server.can_render  # the first picture would wait for that
-        with URLabClient(f"{server.address}:{server.step_port}", step_mode="direct") as client:
-            client.discover()
-            yield client
+    with (
+        SimulatedServer("arm", play=True, camera_size=(48, 32), camera_modes=modes) as server,
+        URLabClient(f"{server.address}:{server.step_port}", step_mode="direct") as client,
+    ):
+        client.discover()
+        yield client
 
 
 def test_a_network_sees_each_state_that_it_acts_on(arm: URLabClient) -> None:
@@ -149,11 +150,11 @@ def test_a_declaration_that_cannot_work_is_refused(old: str, new: str, said: str
         parse_spec(looks((old, new)), "it.toml")
 
 
+@pytest.mark.usefixtures("opengl")
 def test_the_published_declaration_says_what_the_task_shows_the_network(tmp_path: Path) -> None:
     """Described and in its task the network gets the same numbers and pictures, and does the same."""
     policy = load(PUSH)
     with SimulatedServer("arm", "block", "floor", play=True, camera_size=(96, 72)) as server:
-        assert server.can_render
         env = URLabEnv.connect(f"{server.address}:{server.step_port}", task=PushPictures())
         network = OnnxDictNetwork(PUSH, env.observation_space, 7)
         observation, _ = env.reset(seed=3)
@@ -193,6 +194,7 @@ def test_a_simulated_server_gets_the_cameras_that_are_declared() -> None:
     assert spec.simulated("a/arm.xml", "arm") == wanted
 
 
+@pytest.mark.opengl
 @pytest.mark.long
 def test_the_command_runs_a_network_that_sees(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run-policy", str(PUSH), "--seconds", "0.2", "--compare", "--json"]) == 0

@@ -320,6 +320,7 @@ def test_what_varied_is_recorded_and_shown(tmp_path: Path, capsys: pytest.Captur
     assert f"varied: mass, scale {min(factors):.4g} to {max(factors):.4g} on 1 element" in capsys.readouterr().out
 
 
+@pytest.mark.opengl
 def test_pictures_vary_and_come_late_by_the_simulations_clock(made: list[Any]) -> None:
     look = Randomisation(
         vary=(

@@ -247,6 +247,7 @@ def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path:
 # Pictures
 
 
+@pytest.mark.opengl
 def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client.URLabClient, tmp_path: Path) -> None:
     view = client.articulations["arm"].cameras["wrist"]
     with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50, image_format="png") as recorder:
@@ -278,6 +279,7 @@ def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client
 # Live mode
 
 
+@pytest.mark.opengl
 def test_a_step_that_fails_costs_no_picture(tmp_path: Path) -> None:
     faults = Faults()
     with (
@@ -532,6 +534,7 @@ def seeing() -> Iterator[urlab_client.URLabClient]:
         yield client
 
 
+@pytest.mark.opengl
 def test_steps_wait_for_a_file_that_cannot_keep_up(
     seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -596,6 +599,7 @@ def test_a_file_that_takes_nothing_any_more_is_not_waited_for_without_end(
         drive()
 
 
+@pytest.mark.opengl
 def test_pictures_that_a_server_did_not_send_are_told(
     seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

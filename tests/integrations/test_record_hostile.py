@@ -141,7 +141,7 @@ def complaints(path: Path, folder: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def good(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Recordings of both dialects: states, colours, depths, episodes that vary, and their outcomes."""
     folder = tmp_path_factory.mktemp("good")
     found: list[Path] = []
@@ -158,7 +158,6 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             ) as server,
             urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
         ):
-            assert server.can_render
             client.discover()
             with record(client, folder / f"{dialect}.mcap", cameras=["arm/wrist"], camera_hz=500) as recorder:
                 for seed in range(2):

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message_factory import GetMessages
@@ -70,6 +71,7 @@ def with_their_times(node: Any) -> Any:
     return {key: with_their_times(each) for key, each in node.items()} if isinstance(node, dict) else node
 
 
+@pytest.mark.opengl
 def test_foxglove_knows_every_schema_and_reads_every_message(tmp_path: Path) -> None:
     with (
         SimulatedServer("quadruped", "arm", play=True, camera_modes={"arm/wrist": "depth"}) as server,

@@ -55,7 +55,6 @@ def pushers() -> Iterator[list[str]]:
         SimulatedServer(*models, play=True, camera_size=(96, 72)) as one,
         SimulatedServer(*models, play=True, camera_size=(96, 72)) as two,
     ):
-        assert one.can_render  # the first picture would wait for that
         yield [f"{server.address}:{server.step_port}" for server in (one, two)]
 
 
@@ -246,6 +245,7 @@ def test_an_argument_wins_over_the_task_and_what_is_judged_needs_not_be_observed
         SpaceMapping(whole.model, {"arm": "arm_"}, ["qpos"]).field(np.zeros(8), "arm", "sensors")
 
 
+@pytest.mark.usefixtures("opengl")
 def test_a_block_is_pushed_to_its_target_and_seen_in_pictures_alone(pushers: list[str], made: list[Any]) -> None:
     class Ahead(Push):
         def reset(self, rng: np.random.Generator, start: Start) -> None:

@@ -357,6 +357,7 @@ def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made:
         assert np.array_equal(wire.step(action)[1], batch.step(action)[1])
 
 
+@pytest.mark.opengl
 @pytest.mark.long
 def test_servers_and_batch_render_each_environment(servers: list[str], made: list[Any]) -> None:
     options: Any = {"render_mode": "rgb_array", "render_camera": "arm/overview", "keyframe": "home", "reset_noise": 0.3}

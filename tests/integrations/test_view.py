@@ -146,8 +146,9 @@ async def published(client: AsyncClient, key: str) -> None:
     """Wait until some states of this articulation have arrived, whatever the client was told of it."""
     seen = 0
     async with client.state_stream(timeout=DEADLINE_S) as states:
-        while seen < 5:
-            seen += key in (await states.receive()).per_articulation
+        async with asyncio.timeout(DEADLINE_S):
+            while seen < 5:
+                seen += key in (await states.receive()).per_articulation
 
 
 @pytest.mark.parametrize("looks_on", [False, True])
@@ -192,6 +193,7 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
     assert "the new scene has no camera 'wrist'; there are: quadruped/head, quadruped/side" in caplog.text
 
 
+@pytest.mark.opengl
 def test_rerun_is_shown_what_the_cameras_see(tmp_path: Path) -> None:
     from PIL import Image
 
@@ -362,6 +364,7 @@ async def test_foxglove_is_told_frames_geometry_joints_and_contacts(server: Simu
         assert [getattr(sphere.pose.position, axis) for axis in "xyz"] == list(contact["position"].values())
 
 
+@pytest.mark.opengl
 async def test_pictures_are_compressed_only_for_somebody_who_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     from websockets.asyncio.client import connect
 
@@ -388,6 +391,7 @@ async def test_pictures_are_compressed_only_for_somebody_who_looks(monkeypatch: 
     assert len(made) > 1
 
 
+@pytest.mark.opengl
 async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove() -> None:
     from PIL import Image
     from websockets.asyncio.client import connect

@@ -54,6 +54,7 @@ async def direct(server: SimulatedServer) -> AsyncGenerator[Desk]:
     await task
 
 
+@pytest.mark.opengl
 async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True, camera_size=(64, 48)) as server:
         async with desk(server, step_mode="live", recordings=tmp_path) as one:
@@ -111,6 +112,7 @@ async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> Non
         assert "--allow-drive, --allow-edit" in (one.mcp.instructions or "")
 
 
+@pytest.mark.opengl
 async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> None:
     with SimulatedServer("arm", play=True, unpaused=True, camera_size=(64, 48)) as server:
         async with (
@@ -363,6 +365,7 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             await until(lambda: not one.console._feeds)  # nor is the robot kept by its pictures
 
 
+@pytest.mark.opengl
 async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_path: Path) -> None:
     async with desk(server, recordings=tmp_path) as one:
         await one.call("run", steps=1)
@@ -396,6 +399,7 @@ async def test_resources(direct: Desk) -> None:
         await direct.mcp.read_resource("urlab://nothing")
 
 
+@pytest.mark.opengl
 async def test_pictures_are_not_larger_than_they_may_be(direct: Desk) -> None:
     result = await direct.mcp.call_tool("picture", {"camera": "arm/overview", "size": 32})
     assert not result.is_error, text_of(result)

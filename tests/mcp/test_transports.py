@@ -69,8 +69,7 @@ def test_a_signal_ends_a_command_that_serves_pages_in_good_order(
     arguments = ["-m", "urlab_client", *command, "sim://arm", "--port", str(free_port())]
     with child(*arguments, cwd=tmp_path, stderr=subprocess.STDOUT) as process:
         assert process.stdout is not None
-        while "Ctrl-C ends it" not in process.stdout.readline():
-            pass
+        assert any("Ctrl-C ends it" in line for line in iter(process.stdout.readline, ""))
         process.send_signal(number)
         assert process.wait(DEADLINE_S) == 0
         assert process.stdout.read() == ""

@@ -23,6 +23,7 @@ from urlab_client.server.render.camera_renderer import GIVEN_UP, CameraRenderer
 from urlab_client.server.render.drawing import Stage
 
 
+@pytest.mark.opengl
 def test_pictures_in_steps(playing: Bench) -> None:
     """Beta statements 48, 49, 50 and 52. Generation 2 statements 25, 26 and 28."""
     assert "cameras" not in playing.step(include_cameras={"cam": "sync"})
@@ -38,6 +39,7 @@ def test_pictures_in_steps(playing: Bench) -> None:
     assert set(playing.step(include_cameras=True)["cameras"]) == {"arm_a/cam", f"{playing.b}/cam"}
 
 
+@pytest.mark.opengl
 def test_the_camera_switch(playing: Bench) -> None:
     """Beta statements 53 and 56. Generation 2 statements 35, 36, 38, 39 and 40."""
     on = {"cameras": {"arm_a/cam": {"zmq": True, "shm": False}, "nobody/cam": True}}
@@ -86,6 +88,7 @@ def regions(bench: Bench) -> set[str]:
     return {path.name for path in bench.server.shm_dir.glob("cam_*.shm")}
 
 
+@pytest.mark.opengl
 def test_a_picture_of_a_later_snapshot(playing: Bench) -> None:
     """Generation 2 statement 27."""
     last = playing.step()["frame_id"]
@@ -95,6 +98,7 @@ def test_a_picture_of_a_later_snapshot(playing: Bench) -> None:
         last = reply["frame_id"]
 
 
+@pytest.mark.opengl
 def test_cameras_are_off_until_they_are_switched_on(playing: Bench) -> None:
     """Generation 2 statements 34 and 44."""
     (told, _) = playing.wire.hello()["articulations"]
@@ -111,6 +115,7 @@ def test_cameras_are_off_until_they_are_switched_on(playing: Bench) -> None:
     assert regions(playing) == set()
 
 
+@pytest.mark.opengl
 def test_a_region_has_room_for_the_header(playing: Bench) -> None:
     """Generation 2 statements 37, 41 and 42."""
     both: dict[str, Any] = {"cameras": {"arm_a/cam": {"zmq": True, "shm": True}}}
@@ -135,6 +140,7 @@ def test_a_region_has_room_for_the_header(playing: Bench) -> None:
         assert np.frombuffer(message[1], "<f8", count=1, offset=16)[0] == reply["time"]
 
 
+@pytest.mark.opengl
 def test_a_stream_is_silent_while_the_state_stands_still(playing: Bench) -> None:
     """Beta statement 55."""
     other = f"{playing.b}/cam"
@@ -162,14 +168,14 @@ def test_a_stream_is_silent_while_the_state_stands_still(playing: Bench) -> None
         assert number_of(socket.recv_multipart()) == third, "what it has drawn for a step is not news, either"
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("mode", ["direct", "live"])
 def test_a_camera_that_is_switched_on_at_standstill_shows_what_it_has_missed(playing: Bench, mode: str) -> None:
     """Beta statement 55, the other way round."""
     playing.wire.ask("set_mode", mode=mode)
     if mode == "live":
         playing.wire.ask("set_paused", paused=False)
-    while not playing.step()["frame_id"]:
-        pass
+    eventually(lambda: playing.step()["frame_id"])
     playing.wire.ask("set_mode", mode="direct")
     camera = f"{playing.b}/cam"  # on a port of this session alone: nobody who has left seems to listen still
     told = playing.wire.ask("set_camera_streaming", cameras={camera: True})["cameras"][camera]
@@ -187,6 +193,7 @@ def test_a_camera_that_is_switched_on_at_standstill_shows_what_it_has_missed(pla
         region.close()
 
 
+@pytest.mark.opengl
 def test_a_picture_that_a_reply_takes_along_is_streamed_all_the_same(
     playing: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -238,6 +245,7 @@ def drawing(playing: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[threadi
     may.set()
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("wait", [{"render": "sync"}, {"wait_cameras": True}])
 def test_a_step_waits_for_pictures_only_as_long_as_it_says(
     playing: Bench, drawing: threading.Event, wait: dict[str, Any]
@@ -271,6 +279,7 @@ WIDE = """
 </worldbody></mujoco>"""
 
 
+@pytest.mark.opengl
 def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
     """Generation 2 statement 43."""
     seen = []
@@ -300,6 +309,7 @@ def sim_time_of(message: list[bytes]) -> float:
     return float(np.frombuffer(message[1], "<f8", count=1, offset=16)[0])
 
 
+@pytest.mark.opengl
 def test_a_delayed_camera(playing: Bench) -> None:
     """Beta statement 54."""
     other = f"{playing.b}/cam"
@@ -332,6 +342,7 @@ def test_a_delayed_camera(playing: Bench) -> None:
         assert sim_time_of(second) == pytest.approx(later["time"] - 0.5)
 
 
+@pytest.mark.opengl
 def test_two_cameras_jitter_apart(playing: Bench) -> None:
     cameras = ["arm_a/cam", f"{playing.b}/cam"]
     playing.wire.ask("set_camera_delay", cameras={key: {"delay_s": 0.05, "jitter_s": 0.04} for key in cameras})
@@ -344,6 +355,7 @@ def test_two_cameras_jitter_apart(playing: Bench) -> None:
     assert seen[cameras[0]] != seen[cameras[1]]
 
 
+@pytest.mark.opengl
 def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> None:
     """Beta statement 94."""
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 10})
@@ -355,6 +367,7 @@ def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> 
     assert late["cameras"]["arm_a/cam"]["sim_time"] <= late["time"] - 10
 
 
+@pytest.mark.opengl
 def test_a_reset_forgets_what_a_camera_saw(playing: Bench) -> None:
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.02})
     assert shown(playing) is None
@@ -369,6 +382,7 @@ def test_a_reset_forgets_what_a_camera_saw(playing: Bench) -> None:
     assert shown(playing) is None, "not even when the clock goes on to a later time"
 
 
+@pytest.mark.opengl
 def test_a_delay_is_changed_and_taken_back(playing: Bench) -> None:
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.05})
     playing.step(n_steps=20)
@@ -384,12 +398,14 @@ def test_a_delay_is_changed_and_taken_back(playing: Bench) -> None:
     assert playing.core.play.current.engine.snapshots.hooks == [], "nothing is kept for cameras that are not late"
 
 
+@pytest.mark.opengl
 def test_a_camera_with_a_limit_of_pictures(playing: Bench) -> None:
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": {"max_fps": 50}})
     numbers = [frame["frame_id"] for _ in range(9) if (frame := shown(playing))]
     assert [number - numbers[0] for number in numbers] == [0, 0, 0, 4, 4, 4, 4, 8, 8]
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize("bad", [{"delay_s": float("nan")}, {"max_fps": 1e300}, {"clock": "sun"}])
 def test_a_delay_that_cannot_be_changes_nothing(playing: Bench, bad: dict[str, Any]) -> None:
     cameras = {f"{playing.b}/cam": 5, "arm_a/cam": bad}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import zmq
 from beta_bench import ME, OTHER, Bench, Clock
+from waiting import eventually
 from wire import Wire
 
 from urlab_client.protocol.control_messages import ControlPayload
@@ -27,8 +28,7 @@ def test_streamed_controls_of_a_robot_with_an_owner_are_dropped(bench: Bench) ->
         publisher.rcvtimeo = 20_000
         publisher.connect(f"{bench.server.address}:{bench.server.ctrl_port}")
         wanted = f"{bench.b}/control ".encode()
-        while publisher.recv() != b"\x01" + wanted:
-            pass
+        eventually(lambda: publisher.recv() == b"\x01" + wanted, look=0)
         for actuator in (0, 1):  # the owned robot's first
             payload = ControlPayload(np.array([actuator]), np.array([0.5], np.float32)).encode()
             publisher.send_multipart([wanted, payload])

@@ -74,6 +74,7 @@ def test_each_camera_has_its_port_from_the_first_on(
     assert all(camera["zmq_endpoint"].startswith("tcp://127.0.0.1:") for camera in found.values())
 
 
+@pytest.mark.opengl
 def test_messages_are_topic_and_pixels(
     server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
 ) -> None:
@@ -90,6 +91,7 @@ def test_messages_are_topic_and_pixels(
     assert len(data) == 8 * 6 * 4
 
 
+@pytest.mark.opengl
 def test_the_stream_shows_live_physics(
     server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
 ) -> None:
@@ -101,6 +103,7 @@ def test_the_stream_shows_live_physics(
     eventually(lambda: np.frombuffer(socket.recv_multipart()[1], "<f4").min() >= 300.0)
 
 
+@pytest.mark.opengl
 def test_stepped_modes_publish_nothing(
     server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
 ) -> None:
@@ -118,6 +121,7 @@ def test_stepped_modes_publish_nothing(
     assert np.frombuffer(data, "<f4").min() >= last
 
 
+@pytest.mark.opengl
 def test_images_go_on_after_one_that_failed(
     server: SimulatedServer,
     connect: Callable[[SimulatedServer], Wire],
@@ -141,6 +145,7 @@ def test_images_go_on_after_one_that_failed(
     assert server.failure is None
 
 
+@pytest.mark.opengl
 def test_streams_survive_a_new_play_session(
     server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
 ) -> None:

@@ -42,12 +42,18 @@ def guarded(keys: Path) -> Iterator[SimulatedServer]:
         yield server
 
 
-def test_requests_state_and_pictures_reach_a_client_with_the_right_keys(guarded: SimulatedServer, keys: Path) -> None:
+def test_requests_and_state_reach_a_client_with_the_right_keys(guarded: SimulatedServer, keys: Path) -> None:
     with URLabClient(**guarded.client_options(), client_key=keys / "clients/me.key_secret") as client:
         client.discover()
         assert list(client.articulations) == ["arm"]
         with client.state_stream() as stream:
             assert next(stream).time >= 0.0
+
+
+@pytest.mark.opengl
+def test_so_do_pictures(guarded: SimulatedServer, keys: Path) -> None:
+    with URLabClient(**guarded.client_options(), client_key=keys / "clients/me.key_secret") as client:
+        client.discover()
         view = client.articulations["arm"].cameras["wrist"]
         with view.frames() as pictures:
             assert next(pictures).pixels.any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 import socket as sockets
 import struct
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from waiting import eventually
+from waiting import attempts, eventually
 from wire import Wire, pack
 
 from urlab_client.protocol.dialects import ALPHA
@@ -197,8 +198,8 @@ def test_a_subscriber_that_never_reads_slows_nobody(connect: Callable[..., Wire]
         eager.recv_multipart()
         for count in range(1, 2001):
             assert wire.ask("step", n_steps=1)["step"] == count
-        while struct.pack(">d", 2000.0) not in eager.recv_multipart()[1]:  # whoever reads gets the newest
-            pass
+        newest = struct.pack(">d", 2000.0)  # which whoever reads gets
+        eventually(lambda: newest in eager.recv_multipart()[1], look=0)
 
 
 def test_connections_that_say_nothing_do_not_keep_others_out() -> None:
@@ -217,8 +218,7 @@ def test_connections_that_never_become_peers_are_closed(monkeypatch: pytest.Monk
     with SimulatedServer() as server:
         for port in (server.step_port, server.state_port, server.ctrl_port, server.info_port):
             with sockets.create_connection(("127.0.0.1", port), timeout=30) as connection:
-                while connection.recv(1024):
-                    pass
+                eventually(lambda: not connection.recv(1024), "the connection was not closed", look=0)
 
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -238,9 +238,8 @@ def test_peers_that_answer_no_heartbeat_are_closed(monkeypatch: pytest.MonkeyPat
         for port, kind in [*ports, (server.info_port, b"SUB"), (server.camera_port, b"SUB")]:
             with sockets.create_connection(("127.0.0.1", port), timeout=30) as connection:
                 connection.sendall(GREETING + ready(kind))
-                heard = b""
-                while received := connection.recv(1024):
-                    heard += received
+                received = (connection.recv(1024) for _ in attempts("the connection was not closed"))
+                heard = b"".join(itertools.takewhile(bool, received))
             assert b"\x04PING" in heard, "it was a peer"
 
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 import zmq
-from waiting import eventually
+from waiting import attempts, eventually
 from wire import Wire, check_numbers, float32, server_threads, write_level
 
 from urlab_client.protocol.control_messages import ControlPayload, encode_gains
@@ -113,7 +113,7 @@ def ticks(socket: zmq.Socket[bytes]) -> Iterator[Tick]:
     """Yield what comes up to and with each snapshot, beginning after the first one."""
     tick: Tick = []
     whole = False
-    while True:
+    for _ in attempts("not all of the ticks that the test waits for came"):
         topic, payload = socket.recv_multipart()
         tick.append((topic, payload))
         if topic == b"state/full":
@@ -333,11 +333,11 @@ def test_a_subscriber_that_never_reads_slows_nobody(play: Play, monkeypatch: pyt
     lazy.recv_multipart()
     reader = bench.subscribe(b"state/full")
     first = StateSnapshot.decode(reader.recv_multipart()[1]).time
-    read = 0
-    time = first
-    while time < first + 0.4 or read < 1000:  # times 5 messages; 1000 and what the kernel holds wait for the lazy one
+    for read, _ in enumerate(attempts("too few snapshots came"), start=1):
         time = StateSnapshot.decode(reader.recv_multipart()[1]).time
-        read += 1
+        # 1000 times 5 messages: as many wait for the lazy one, and what the kernel holds.
+        if time >= first + 0.4 and read >= 1000:
+            break
     sent = read * (len(ROWS) + 1)
     bench.wire.ask("set_mode", mode="direct")
     bench.wire.ask("step")  # from now on its snapshot comes ten times a second: also to the lazy one, when it has room

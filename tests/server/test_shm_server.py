@@ -204,6 +204,7 @@ def test_snapshots_come_with_each_step_to_whom_asks_for_them(server: SimulatedSe
         state.close()
 
 
+@pytest.mark.opengl
 def test_pictures_come_to_whom_asks_for_them_in_every_mode(server: SimulatedServer, session: str) -> None:
     directory = directory_of(server)
     with RawShm(directory, bell=True) as shm:

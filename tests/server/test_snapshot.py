@@ -78,7 +78,9 @@ def shade(image: Image, row: int, column: int) -> list[int]:
     return [int(value) for value in image[row, column, :3]]
 
 
+@pytest.mark.opengl
 def test_the_camera_is_that_of_the_ops(stage: Stage) -> None:
+    assert stage.server.can_render
     ahead = stage.picture()
     assert len(set(shade(ahead, *CENTER))) == 1  # the cube is grey
     assert shade(ahead, 60, 10) == [0, 0, 0]
@@ -90,6 +92,7 @@ def test_the_camera_is_that_of_the_ops(stage: Stage) -> None:
     assert red == blue
 
 
+@pytest.mark.opengl
 def test_unreal_yaw_turns_right_and_roll_tilts(stage: Stage) -> None:
     stage.wire.ask("set_camera", location=[-4, 0, 0], rotation_euler=[0, 0, 20])
     columns = np.flatnonzero(stage.picture()[60, :, :3].any(axis=1))
@@ -100,6 +103,7 @@ def test_unreal_yaw_turns_right_and_roll_tilts(stage: Stage) -> None:
     assert len(columns) > 1.5 * len(rows)
 
 
+@pytest.mark.opengl
 def test_play_shows_the_state_and_no_play_the_level(stage: Stage) -> None:
     stage.wire.ask("set_camera", location=[-4, 3, 0])
     assert shade(stage.picture(), *CENTER)[1] > 50
@@ -111,11 +115,13 @@ def test_play_shows_the_state_and_no_play_the_level(stage: Stage) -> None:
     assert shade(stage.picture(), *CENTER) == [0, 0, 0]
 
 
+@pytest.mark.opengl
 def test_a_tracked_actor_stays_in_the_middle(stage: Stage) -> None:
     stage.wire.ask("track_actor", target="things", offset=[0, -4, 0])
     assert shade(stage.picture(), *CENTER) != [0, 0, 0]
 
 
+@pytest.mark.opengl
 def test_a_picture_of_everything(stage: Stage) -> None:
     stage.wire.ask("set_camera", location=[900, 0, 0], rotation_euler=[0, 0, 0], fov=90)
     image = stage.server.snapshot(SIZE, frame_all=True)
@@ -126,6 +132,7 @@ def test_a_picture_of_everything(stage: Stage) -> None:
     assert stage.wire.ask("get_camera")["location"] == [900.0, 0.0, 0.0]
 
 
+@pytest.mark.opengl
 def test_a_picture_larger_than_any_camera(stage: Stage) -> None:
     image = stage.server.snapshot((1000, 700))
     assert image.shape == (700, 1000, 4)
@@ -133,12 +140,14 @@ def test_a_picture_larger_than_any_camera(stage: Stage) -> None:
     assert not image[0, 0, :3].any()
 
 
+@pytest.mark.opengl
 def test_unlit_shows_the_material_and_lit_the_light(stage: Stage) -> None:
     lit, unlit = stage.before_and_after("set_viewport_mode", mode="Unlit")
     assert shade(unlit, *CENTER) == pytest.approx([128, 128, 128], abs=1)
     assert shade(lit, *CENTER) != shade(unlit, *CENTER)
 
 
+@pytest.mark.opengl
 def test_wireframe_shows_through(stage: Stage) -> None:
     lit, wires = stage.before_and_after("set_viewport_mode", mode="wireframe")
     solid, lines = (int(image[:, :, :3].any(axis=2).sum()) for image in (lit, wires))
@@ -147,6 +156,7 @@ def test_wireframe_shows_through(stage: Stage) -> None:
     assert (stage.picture() == lit).all()
 
 
+@pytest.mark.opengl
 def test_collision_leaves_out_what_does_not_collide(stage: Stage) -> None:
     changed = stage.changed("set_viewport_mode", mode="collision")
     assert changed[25, 80]  # the stick
@@ -155,6 +165,7 @@ def test_collision_leaves_out_what_does_not_collide(stage: Stage) -> None:
     assert stage.picture()[25, 80, :3].any()
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize(
     ("op", "fields", "colored"),
     [
@@ -178,6 +189,7 @@ def test_drawing(stage: Stage, op: str, fields: dict[str, Any], colored: set[tup
     assert not (stage.picture()[:, :, 0] > 200).any()
 
 
+@pytest.mark.opengl
 def test_an_arrow_has_a_head_at_its_tip(stage: Stage) -> None:
     fields = {"from": [-2, 0, 0], "to": [-2, 0, 1], "arrow_size": 0.4}
     changed = stage.changed("draw_arrow", **fields, color=RED, ttl=-1)
@@ -186,6 +198,7 @@ def test_an_arrow_has_a_head_at_its_tip(stage: Stage) -> None:
     assert max(widths[tip : tip + 36]) > 3 * max(widths[tip + 40 : 60]) > 0
 
 
+@pytest.mark.opengl
 def test_axes_are_those_of_unreal(stage: Stage) -> None:
     stage.wire.ask("set_camera", location=[-2, 0, 4], rotation_euler=[0, -90, 0], fov=53.13)  # +x is up, -y right
     _, image = stage.before_and_after("draw_axes", location=[-2, 0, 2], scale=0.5, ttl=-1)
@@ -201,6 +214,7 @@ def test_axes_are_those_of_unreal(stage: Stage) -> None:
     assert rows.mean() == pytest.approx(60, abs=3)
 
 
+@pytest.mark.opengl
 def test_labels_are_text_at_their_place(stage: Stage) -> None:
     before = stage.picture()
     stage.wire.ask("draw_marker", location=[-1, 0.9, 0.7], color=RED, ttl=-1)
@@ -214,12 +228,14 @@ def test_labels_are_text_at_their_place(stage: Stage) -> None:
     assert abs(columns.mean() - places[1].mean()) < 40
 
 
+@pytest.mark.opengl
 def test_what_lives_for_one_frame_is_seen_once(stage: Stage) -> None:
     before, first = stage.before_and_after("draw_marker", location=[-1, 0, 0], color=RED)
     assert (first != before).any()
     assert (stage.picture() == before).all()
 
 
+@pytest.mark.opengl
 def test_time_to_live_ends(stage: Stage) -> None:
     now = [0.0]
     core = stage.server._running._core
@@ -237,6 +253,7 @@ def test_time_to_live_ends(stage: Stage) -> None:
     assert (stage.picture() == before).all()
 
 
+@pytest.mark.opengl
 def test_overlay_text_is_in_the_upper_left_corner(stage: Stage) -> None:
     rows, columns = np.nonzero(stage.changed("set_overlay_text", text="näh\N{BELL}"))
     assert rows.max() < 40
@@ -244,12 +261,14 @@ def test_overlay_text_is_in_the_upper_left_corner(stage: Stage) -> None:
     stage.wire.ask("set_overlay_text", text="")
 
 
+@pytest.mark.opengl
 def test_what_is_selected_has_a_box(stage: Stage) -> None:
     stage.wire.ask("set_camera", location=[-9, 1.5, 0], rotation_euler=[0, 0, 0])
     _, image = stage.before_and_after("select_actor", target="things")
     assert (np.abs(image[:, :, :3].astype(int) - np.array(SELECTED) * 255) < 8).all(axis=2).sum() > 50
 
 
+@pytest.mark.opengl
 def test_drawings_of_play_and_level_are_apart(stage: Stage) -> None:
     _, playing = stage.before_and_after("draw_marker", location=[-1, 0, 0], color=RED, ttl=-1)
     stage.wire.ask("stop_pie")
@@ -258,6 +277,7 @@ def test_drawings_of_play_and_level_are_apart(stage: Stage) -> None:
     assert shade(edited, *CENTER) == shade(playing, *CENTER)
 
 
+@pytest.mark.opengl
 def test_another_level_shows_nothing_of_what_was_drawn_before(stage: Stage) -> None:
     stage.wire.ask("stop_pie")
     stage.wire.ask("draw_marker", location=[-1, 0, 0], color=RED, ttl=-1)
@@ -266,6 +286,7 @@ def test_another_level_shows_nothing_of_what_was_drawn_before(stage: Stage) -> N
     assert shade(stage.picture(), *CENTER) != shade(drawn, *CENTER)
 
 
+@pytest.mark.opengl
 def test_robot_cameras_show_no_drawing(stage: Stage, tmp_path: Path) -> None:
     path = tmp_path / "eye.xml"
     path.write_text(
@@ -284,6 +305,7 @@ def test_robot_cameras_show_no_drawing(stage: Stage, tmp_path: Path) -> None:
         assert frames[0] == frames[1]
 
 
+@pytest.mark.opengl
 def test_an_empty_level_is_an_empty_picture(tmp_path: Path) -> None:
     with SimulatedServer() as server:
         assert not server.snapshot((16, 9))[:, :, :3].any()
@@ -302,7 +324,6 @@ def test_a_closed_server_has_no_picture() -> None:
 
 
 def test_no_opengl_is_a_clear_error(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert stage.server.can_render
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert not stage.server.can_render
     with pytest.raises(RenderingUnavailable, match="MUJOCO_GL=disable"):
@@ -310,12 +331,14 @@ def test_no_opengl_is_a_clear_error(stage: Stage, monkeypatch: pytest.MonkeyPatc
 
 
 def test_broken_opengl_names_the_package(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(opengl, "_PROBE", "import os; os.abort()  # {name}")
     monkeypatch.setattr(opengl, "_find", opengl._find.__wrapped__)
-    with pytest.raises(RenderingUnavailable, match=f"{opengl.ADVICE}.*ended with code"):
+    with pytest.raises(RenderingUnavailable, match=f"{opengl.ADVICE}.*exited with code"):
         stage.server.snapshot(SIZE)
 
 
+@pytest.mark.opengl
 def test_drawing_that_fails_is_an_error(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: object) -> None:
         raise RuntimeError("the driver is gone")

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import struct
 import threading
-import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 import zmq
-from waiting import DEADLINE_S
+from waiting import attempts
 
 from urlab_client.server import SimulatedServer
 
@@ -189,10 +188,8 @@ class Wire:
 
     def until(self, op: str, /, **fields: Any) -> Iterator[dict[str, Any]]:
         """Ask again and again, until the caller has seen enough; fail when that takes too long."""
-        deadline = time.monotonic() + DEADLINE_S
-        while time.monotonic() < deadline:
+        for _ in attempts(f"no reply to {op} was what the test waits for"):
             yield self.ask(op, **fields)
-        raise AssertionError(f"no reply to {op} within {DEADLINE_S:g} s was what the test waits for")
 
 
 def check_numbers(frame: bytes) -> None:

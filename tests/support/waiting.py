@@ -5,8 +5,12 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any, TypeVar
+
+import pytest
+
+from urlab_client import URLabTimeoutError
 
 T = TypeVar("T")
 
@@ -33,18 +37,32 @@ async def until(condition: Callable[[], object], *, look: float = LOOK_S) -> Non
             await asyncio.sleep(look)
 
 
-def eventually(condition: Callable[[], T], otherwise: str = "it did not happen") -> T:
+def attempts(otherwise: str = "it did not happen") -> Iterator[None]:
+    """Yield until the caller has seen enough; fail when that takes too long.
+
+    Args:
+        otherwise: What to complain of.
+    """
+    deadline = time.monotonic() + DEADLINE_S
+    while time.monotonic() < deadline:
+        yield
+    raise AssertionError(f"{otherwise} within {DEADLINE_S:g} s")
+
+
+def eventually(condition: Callable[[], T], otherwise: str = "it did not happen", *, look: float = LOOK_S) -> T:
     """Block until something is so; return what the condition then gives.
 
     Args:
         condition: Whether it is.
         otherwise: What to complain of.
+        look: Seconds between two looks; 0 where the condition itself waits, as for a message.
     """
-    deadline, nothing = time.monotonic() + DEADLINE_S, threading.Event()
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"{otherwise} within {DEADLINE_S:g} s"
-        nothing.wait(LOOK_S)
-    return found
+    nothing = threading.Event()
+    for _ in attempts(otherwise):
+        if found := condition():
+            return found
+        nothing.wait(look)
+    raise AssertionError
 
 
 async def in_time(deadline: float, call: Awaitable[T]) -> T:
@@ -71,3 +89,21 @@ def pass_time(seconds: float) -> None:
     loop = asyncio.get_running_loop()
     now = loop.time
     loop.time = lambda: now() + seconds  # type: ignore[method-assign]
+
+
+async def gives_up(call: Callable[..., Awaitable[Any]], arrived: Callable[[], object], fault: str) -> None:
+    """Abandon a call once the server has it: cancel it, or let its deadline pass.
+
+    Args:
+        call: What makes the call, given its `timeout`.
+        arrived: Whether the server has it.
+        fault: `cancelled` or `timed out`.
+    """
+    abandoned = asyncio.ensure_future(call(timeout=DEADLINE_S))
+    await until(lambda: arrived() or abandoned.done())
+    if fault == "cancelled":
+        abandoned.cancel()
+    else:
+        pass_time(DEADLINE_S)
+    with pytest.raises(asyncio.CancelledError if fault == "cancelled" else URLabTimeoutError):
+        await abandoned

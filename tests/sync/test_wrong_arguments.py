@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import product
 from typing import Any
@@ -41,6 +42,20 @@ def methods(of: object) -> list[tuple[str, inspect.Signature]]:
     return [(name, inspect.signature(method)) for name, method in found if name[0] != "_" and name not in LEFT_OUT]
 
 
+@contextmanager
+def noting(unnamed: list[str], shown: str) -> Iterator[None]:
+    """Let a call fail that says what was wrong, and note one whose error is Python's own."""
+    try:
+        yield
+    except (URLabError, ValueError, KeyError, OSError):
+        pass
+    except TypeError as error:
+        if PYTHONS_OWN.search(str(error)):
+            unnamed.append(f"{shown}: {error}")
+    except Exception as error:  # noqa: BLE001
+        unnamed.append(f"{shown}: {error!r}")
+
+
 PARTS = (
     *("client", "articulation", "camera"),
     *("scene", "outliner", "runtime", "debug", "viewport", "sim", "recording", "replay", "farm"),
@@ -66,21 +81,15 @@ def test_the_error_says_what_was_wrong(client: URLabClient, part: str, flavour: 
     unnamed: list[str] = []
     for method, signature in methods(tried):
         named = [parameter for parameter in signature.parameters.values() if parameter.name not in {"self", "timeout"}]
+        in_time = {"timeout": 2.0} if "timeout" in signature.parameters else {}  # also for pictures that never come
         needed = [parameter.name for parameter in named if parameter.default is parameter.empty]
         for parameter in named:
             for value in STRANGE:
-                given = dict.fromkeys(needed, "x") | {parameter.name: value}
+                given = dict.fromkeys(needed, "x") | {parameter.name: value} | in_time
                 shown = f"{part}.{method}({parameter.name}={value!r})"
-                try:
-                    call = partial(getattr(tried, method), **given)
+                call = partial(getattr(tried, method), **given)
+                with noting(unnamed, shown):
                     portal_of(client).call(call) if inspect.iscoroutinefunction(call.func) else call()
-                except (URLabError, ValueError, KeyError, OSError):
-                    pass
-                except TypeError as error:
-                    if PYTHONS_OWN.search(str(error)):
-                        unnamed.append(f"{shown}: {error}")
-                except Exception as error:  # noqa: BLE001
-                    unnamed.append(f"{shown}: {error!r}")
     assert not unnamed, "\n".join(unnamed)
 
 
@@ -97,13 +106,6 @@ def test_an_environment_says_what_was_wrong(fresh: URLabClient) -> None:
     for name in list(inspect.signature(URLabEnv).parameters)[1:]:
         for value in (*STRANGE, [1], [None], [[]], b"x", -1):
             drawn = {"render_mode": "rgb_array"} if name == "render_camera" else {}
-            try:
+            with noting(unnamed, f"{name}={value!r}"):
                 URLabEnv(fresh, **{**drawn, name: value}).reset(options=value if name == "task" else None)
-            except (URLabError, ValueError, KeyError, OSError):
-                pass
-            except TypeError as error:
-                if PYTHONS_OWN.search(str(error)):
-                    unnamed.append(f"{name}={value!r}: {error}")
-            except Exception as error:  # noqa: BLE001
-                unnamed.append(f"{name}={value!r}: {error!r}")
     assert not unnamed, "\n".join(unnamed)

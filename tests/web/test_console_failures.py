@@ -151,6 +151,7 @@ async def test_a_mode_that_changes_meanwhile_makes_no_step_of_set_points(tmp_pat
         assert errors(console) == {}
 
 
+@pytest.mark.opengl
 async def test_pictures_go_on_after_a_failure(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

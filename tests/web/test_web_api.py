@@ -19,6 +19,7 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from waiting import attempts
 
 from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
@@ -127,6 +128,7 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
 
 
+@pytest.mark.opengl
 def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) -> None:
     from jsonschema import Draft202012Validator
 
@@ -152,12 +154,14 @@ def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) ->
             check(said["type"], said)
             live.send_json(said)
         live.send_json({"type": "shout"})
-        while seen != {"you", "world", "state", "status", "log", "refused", "pong"}:
+        for _ in attempts("not all kinds of messages came"):
             message = live.receive_json()
             check(message["type"], message)
             seen.add(message["type"])
             if message["type"] == "refused":
                 assert "shout" in message["error"]["message"]
+            if seen == {"you", "world", "state", "status", "log", "refused", "pong"}:
+                break
     with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
         frame = camera.receive_bytes()
     head = json.loads(frame[4 : 4 + int.from_bytes(frame[:4], "little")])
@@ -212,13 +216,14 @@ def test_a_hand_moves_for_a_moment_and_episodes_are_judged(http: TestClient, tmp
         return np.array(state["articulations"]["arm"]["sensors"]["grip_position"])
 
     def at_rest(live: Any) -> np.ndarray:
-        while True:
+        for _ in attempts("the hand moves on"):
             state = heard(live, "state")
             then = state["time"] + 0.1
             later = heard(live, "state", lambda one, then=then: one["time"] > then)
             places = [np.array(one["articulations"]["arm"]["sensors"]["grip_position"]) for one in (state, later)]
             if np.abs(places[1] - places[0]).max() < 1e-4:
                 return places[1]
+        raise AssertionError
 
     with (
         http.websocket_connect("ws://localhost/api/live") as live,
@@ -232,8 +237,10 @@ def test_a_hand_moves_for_a_moment_and_episodes_are_judged(http: TestClient, tmp
         assert http.post("/api/recording", json={"cameras": False}, headers=me).status_code == 200
         before = at_rest(live)
         order = {"type": "hand", "articulation": "arm", "linear": [0.0, 0.0, -1.0], "gripper": 1.0}
-        while hand(live)[2] > before[2] - 0.05:
+        for _ in attempts("the hand does not move down"):
             live.send_json(order)
+            if hand(live)[2] <= before[2] - 0.05:
+                break
         other.send_json(order)
         assert heard(other, "refused")["error"]["code"] == "not_driving"
         last = at_rest(live)  # nobody says more: it stops by itself
@@ -261,12 +268,10 @@ def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestC
         http.websocket_connect("ws://localhost/api/live") as busy,
         http.websocket_connect("ws://localhost/api/live") as quick,
     ):
-        seen: list[int] = []
-        while len(seen) < 2:  # takes two, and says nothing of having shown them
-            message = busy.receive_json()
-            if message["type"] == "state":
-                seen.append(message["seq"])
-        ahead = heard(quick, "state", lambda state: state["seq"] > seen[-1] + 30)["seq"]
+        messages = (busy.receive_json() for _ in attempts("no state came"))
+        states = (message["seq"] for message in messages if message["type"] == "state")
+        _, last = next(states), next(states)  # takes two, and says nothing of having shown them
+        ahead = heard(quick, "state", lambda state: state["seq"] > last + 30)["seq"]
         busy.send_json({"type": "ack"})
         while (message := busy.receive_json())["type"] != "state":
             pass
@@ -278,9 +283,8 @@ def test_a_binary_frame_closes_its_socket_and_no_other(http: TestClient, path: s
     with http.websocket_connect("ws://localhost/api/live") as other:
         with http.websocket_connect(f"ws://localhost{path}") as socket:
             socket.send_bytes(b"\x00")
-            while (said := socket.receive())["type"] != "websocket.close":
-                pass
-            assert said["code"] == 1003
+            messages = (socket.receive() for _ in attempts("the socket was not closed"))
+            assert next(said for said in messages if said["type"] == "websocket.close")["code"] == 1003
         heard(other, "status")
 
 
@@ -311,6 +315,7 @@ def test_one_drives_and_the_others_wait(http: TestClient) -> None:
         assert http.post("/api/ops/reset", json={}, headers=second).status_code == 200
 
 
+@pytest.mark.opengl
 def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
     try:
         assert http.post("/api/ops/set_mode", json={"mode": "direct"}).json()["current_mode"] == "direct"
@@ -340,6 +345,13 @@ def picture_in(socket: Any) -> tuple[dict[str, Any], bytes]:
     return json.loads(data[4 : 4 + size]), data[4 + size :]
 
 
+def picture_of(socket: Any, time: float) -> tuple[dict[str, Any], bytes]:
+    """Return the next picture of a moment, in seconds."""
+    pictures = (picture_in(socket) for _ in attempts(f"no picture of {time} s came"))
+    return next(picture for picture in pictures if picture[0]["sim_time"] == pytest.approx(time, abs=1e-6))
+
+
+@pytest.mark.opengl
 def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
     server: SimulatedServer, http: TestClient, tmp_path: Path
 ) -> None:
@@ -396,9 +408,7 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
             for wanted in (pictures[4], pictures[0], pictures[-1]):
                 http.post("/api/replay", json={"time": wanted.time - table.time[0]})
-                head, shown = picture_in(watching)
-                while head["sim_time"] != pytest.approx(wanted.time - table.time[0]):
-                    head, shown = picture_in(watching)
+                head, shown = picture_of(watching, wanted.time - table.time[0])
                 assert head["recorded"]
                 assert np.array_equal(np.asarray(Image.open(io.BytesIO(shown))), wanted.pixels)
         refused = http.delete(f"/api/recordings/{name}")
@@ -425,9 +435,7 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         end = http.post("/api/replay", json={"name": "late.mcap", "playing": False}).json()["seconds"]
         with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
             http.post("/api/replay", json={"time": end})
-            head, _ = picture_in(watching)
-            while head["sim_time"] != pytest.approx(pictures[-1].time - table.time[0], abs=1e-6):
-                head, _ = picture_in(watching)
+            picture_of(watching, pictures[-1].time - table.time[0])
         http.delete("/api/replay")
         http.delete("/api/recordings/late.mcap")
 
@@ -492,6 +500,7 @@ def test_a_replay_that_is_at_its_end_plays_from_the_start(http: TestClient, tmp_
         http.delete("/api/recordings/odd.mcap")
 
 
+@pytest.mark.opengl
 def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
     def shown(kind: str) -> tuple[int, int]:
         answer = http.get(f"/api/cameras/arm/overview.{kind}")
@@ -703,6 +712,7 @@ def test_agents_give_way_to_people_and_not_to_each_other() -> None:
     assert lease.holder is two
 
 
+@pytest.mark.opengl
 def test_a_paused_beta_is_seen_and_driven() -> None:
     with (
         SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,

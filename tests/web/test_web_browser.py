@@ -58,6 +58,7 @@ def test_a_slider_moves_its_joint(page: Page) -> None:
     page.until("document.querySelector('#driver').dataset.who === 'me'")
 
 
+@pytest.mark.opengl
 def test_cameras_and_curves_are_drawn(page: Page) -> None:
     page.until("document.querySelectorAll('.camera').length === 4")
     page.until("[...document.querySelectorAll('.camera')].every(one => /fps/.test(one.innerText))")
@@ -218,6 +219,7 @@ def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(pa
         assert where(actor) is None
 
 
+@pytest.mark.opengl
 def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: Page, tmp_path: Path) -> None:
     page.until(RUNNING)
     page.slide(0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 from collections.abc import AsyncGenerator
@@ -13,6 +14,7 @@ from http_served import served
 from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
+from waiting import DEADLINE_S, attempts
 
 from urlab_client.aio import URLabClient
 from urlab_client.server import SimulatedServer
@@ -42,24 +44,27 @@ async def test_events_are_told_once_and_go_on_where_they_broke_off() -> None:
                     contextlib.aclosing(events(stream, "world")) as worlds,
                 ):
                     assert stream.headers["content-type"].startswith("text/event-stream")
-                    while not (await anext(worlds))[1]["articulations"]:
-                        pass
+                    async with asyncio.timeout(DEADLINE_S):
+                        while not (await anext(worlds))[1]["articulations"]:
+                            pass
                 await http.post("/api/ops/set_sim_speed", json={"percent": 50})
                 async with (
                     http.stream("GET", "/api/events") as stream,
                     contextlib.aclosing(events(stream, "log")) as log,
                 ):
                     first, entry = await anext(log)
-                    while entry["what"] != "set_sim_speed":
-                        _, entry = await anext(log)
+                    async with asyncio.timeout(DEADLINE_S):
+                        while entry["what"] != "set_sim_speed":
+                            _, entry = await anext(log)
                 await http.post("/api/ops/set_sim_speed", json={"percent": 60})
                 async with (
                     http.stream("GET", "/api/events", headers={"last-event-id": str(entry["n"])}) as stream,
                     contextlib.aclosing(events(stream, "log")) as log,
                 ):
                     later = [await anext(log)]
-                    while later[-1][1]["what"] != "set_sim_speed":  # the console may have something to say, too
-                        later.append(await anext(log))
+                    async with asyncio.timeout(DEADLINE_S):
+                        while later[-1][1]["what"] != "set_sim_speed":  # the console may have something to say, too
+                            later.append(await anext(log))
                 numbers = list(range(entry["n"] + 1, entry["n"] + 1 + len(later)))
                 assert [number for number, _ in later] == [after["n"] for _, after in later] == numbers
                 assert entry["n"] >= first
@@ -93,9 +98,10 @@ def test_each_server_has_a_console_and_one_key_opens_all() -> None:
             assert http.get("/right/api/openapi.json").json()["servers"] == [{"url": "/right"}]
             for name, robot in (("left", "arm"), ("right", "quadruped")):
                 with http.websocket_connect(f"ws://localhost/{name}/api/live") as live:
-                    while (message := live.receive_json())["type"] != "world" or not message["world"]["playing"]:
-                        pass
-                assert [art["key"] for art in message["world"]["articulations"]] == [robot]
+                    messages = (live.receive_json() for _ in attempts("it does not play"))
+                    worlds = (message["world"] for message in messages if message["type"] == "world")
+                    world = next(world for world in worlds if world["playing"])
+                assert [art["key"] for art in world["articulations"]] == [robot]
             # Each has its own controls.
             http.post("/left/api/lease")
             assert http.get("/left/api/status").json()["mine"]

@@ -25,6 +25,7 @@ __all__ = [
     "make_context",
     "need_backend",
     "search_backend",
+    "why_it_failed",
 ]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -183,5 +184,13 @@ def _probe(name: str) -> Backend | str:
         return str(error)
     if child.returncode == 0:
         return Backend(name, child.stdout.decode(errors="replace").strip())
+    return why_it_failed(child)
+
+
+def why_it_failed(child: subprocess.CompletedProcess[bytes]) -> str:
+    """Return the last line of what a Python program said before it exited with an error, or else its exit code.
+
+    What a crash leaves last on standard error, such as a line of Python's fault handler, is no reason.
+    """
     lines = child.stderr.decode(errors="replace").strip().splitlines()
-    return lines[-1].strip() if lines else f"the probe ended with code {child.returncode}"
+    return lines[-1].strip() if child.returncode == 1 and lines else f"it exited with code {child.returncode}"
