@@ -58,12 +58,6 @@ for line, code in {}:
 """
 
 
-FORKED: Any = {
-    "flags": ("-W", "error"),
-    "imported": ("urlab_client.aio.client", "urlab_client.sync.client", "urlab_client.server"),
-}
-
-
 def python_blocks(page: Path, directive: str = "") -> list[Block]:
     return [block for block in blocks(page) if block.language == "python" and block.directive == directive]
 
@@ -90,7 +84,6 @@ def run_python(page: Path, chosen: list[Block], folder: Path, **environment: str
     source = DRIVER.format([(block.line, block.code) for block in chosen], page=str(page))
     running = program(
         source,
-        **FORKED,
         cwd=folder,
         environment={**os.environ, **environment},
     )
@@ -149,7 +142,7 @@ def test_marked_tests_pass(page: Path, tmp_path: Path) -> None:
     (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_default_fixture_loop_scope = function\n", encoding="utf-8")
     imported = "ignore:Module already imported:pytest.PytestAssertRewriteWarning"
     arguments = ["-q", "-p", "pytest_urlab", "--strict-markers", "-W", "error", "-W", imported, str(tmp_path)]
-    running = program(f"import sys, pytest\nsys.exit(pytest.main({arguments}))", **FORKED, cwd=tmp_path)
+    running = program(f"import sys, pytest\nsys.exit(pytest.main({arguments}))", cwd=tmp_path)
     out, err = running.communicate(timeout=DEADLINE_S)
     assert running.returncode == 0, f"{shown(page)}\n{out}\n{err}"
 

@@ -24,12 +24,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
+IMPORTED = ("urlab_client.aio.client", "urlab_client.cli", "urlab_client.server", "urlab_client.sync.client")
+
 
 def program(
     source: str,
     *,
-    flags: tuple[str, ...] = (),
-    imported: tuple[str, ...],
+    flags: tuple[str, ...] = ("-W", "error"),
     cwd: Path | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> Program | subprocess.Popen[str]:
@@ -37,13 +38,12 @@ def program(
 
     Args:
         source: What `python -c` would be given.
-        flags: Of the interpreter.
-        imported: Modules that the interpreter from which it forks imports.
+        flags: Of the interpreter. Each set of them costs one interpreter more.
         cwd: Where it runs; default is here.
         environment: Default is that of this process.
     """
     if sys.platform == "linux":
-        return Program(_interpreter(flags, imported), source, cwd or Path.cwd(), environment or os.environ)
+        return Program(_interpreter(flags), source, cwd or Path.cwd(), environment or os.environ)
     streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     command = [sys.executable, *flags, "-c", source]
     return subprocess.Popen(command, text=True, cwd=cwd, env=environment, **streams)
@@ -82,14 +82,14 @@ def _rest(stream: IO[str]) -> str:
 
 
 class Interpreter:
-    """An interpreter that has imported modules and forks for each program, one at a time."""
+    """An interpreter that has imported the package and forks for each program, one at a time."""
 
-    def __init__(self, flags: tuple[str, ...], imported: tuple[str, ...]) -> None:
+    def __init__(self, flags: tuple[str, ...]) -> None:
         here, there = socket.socketpair()
         # Forks would lack the threads of linear algebra. The first test's mark would end it when that test fails.
         environment = {name: value for name, value in os.environ.items() if name != "URLAB_TEST_PROCESS"}
         self.process = subprocess.Popen(
-            [sys.executable, *flags, __file__, str(there.fileno()), *imported],
+            [sys.executable, *flags, __file__, str(there.fileno())],
             pass_fds=[there.fileno()],
             env=environment | {"OPENBLAS_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
@@ -128,8 +128,8 @@ class Interpreter:
 
 
 @functools.cache
-def _interpreter(flags: tuple[str, ...], imported: tuple[str, ...]) -> Interpreter:
-    return Interpreter(flags, imported)
+def _interpreter(flags: tuple[str, ...]) -> Interpreter:
+    return Interpreter(flags)
 
 
 def forks(control: socket.socket) -> str | None:
@@ -170,7 +170,7 @@ def _show(kind: type[BaseException], error: BaseException, trace: types.Tracebac
 
 
 if __name__ == "__main__":
-    for name in sys.argv[2:]:
+    for name in IMPORTED:
         import_module(name)
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as orders:

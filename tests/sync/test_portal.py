@@ -558,7 +558,7 @@ def child(script: str) -> Program | subprocess.Popen[str]:
     """
     source = textwrap.dedent(prelude) + textwrap.dedent(script)
     flags = ("-X", "dev", "-W", "error", "-W", "ignore:This process:DeprecationWarning")  # 3.12: a fork with threads
-    return program(source, flags=flags, imported=("urlab_client.sync._portal", "urlab_client.protocol.errors"))
+    return program(source, flags=flags)
 
 
 def outcome(process: Program | subprocess.Popen[str]) -> tuple[int, list[str], str]:
