@@ -50,7 +50,7 @@ def test_leaves_ctrl_c_to_the_program_that_holds_its_input_or_the_terminal(tmp_p
     options = [] if background else ["--until-eof"]
     with contextlib.ExitStack() as stack:
         with in_background() if background else contextlib.nullcontext():
-            server = stack.enter_context(served("ball", "--play", *options, cwd=tmp_path))
+            server = stack.enter_context(served("ball", "--play", *options, cwd=tmp_path, inherits=background))
         client = stack.enter_context(URLabClient(**server.client_options, step_mode="direct"))
         client.discover()
         server.process.send_signal(signal.SIGINT)

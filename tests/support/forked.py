@@ -22,44 +22,55 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Self
 
 IMPORTED = ("urlab_client.aio.client", "urlab_client.cli", "urlab_client.server", "urlab_client.sync.client")
 
 
 def program(
     source: str,
-    *,
+    *arguments: str | Path,
     flags: tuple[str, ...] = ("-W", "error"),
     cwd: Path | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> Program | subprocess.Popen[str]:
-    """Start a program, with pipes for its output and without input.
+    """Start a program with pipes.
 
     Args:
         source: What `python -c` would be given.
+        arguments: Of the program.
         flags: Of the interpreter. Each set of them costs one interpreter more.
         cwd: Where it runs; default is here.
         environment: Default is that of this process.
     """
     if sys.platform == "linux":
-        return Program(_interpreter(flags), source, cwd or Path.cwd(), environment or os.environ)
-    streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, *flags, "-c", source]
-    return subprocess.Popen(command, text=True, cwd=cwd, env=environment, **streams)
+        order = {
+            "source": source,
+            "arguments": [*map(str, arguments)],
+            "cwd": str(cwd or Path.cwd()),
+            "environment": dict(environment or os.environ),
+        }
+        return Program(_interpreter(flags), order)
+    command = [sys.executable, *flags, "-c", source, *map(str, arguments)]
+    return subprocess.Popen(command, text=True, cwd=cwd, env=environment, **_pipes())
+
+
+def _pipes() -> dict[str, Any]:
+    return dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
 
 
 class Program:
     """A running program, with what tests need of `subprocess.Popen`."""
 
-    def __init__(self, interpreter: Interpreter, source: str, cwd: Path, environment: Mapping[str, str]) -> None:
-        reading, writing = zip(os.pipe(), os.pipe(), strict=True)
-        self.stdout, self.stderr = map(os.fdopen, reading)
+    def __init__(self, interpreter: Interpreter, order: Mapping[str, Any]) -> None:
+        ins, outs, errs = os.pipe(), os.pipe(), os.pipe()
+        self.stdin: IO[str] | None = os.fdopen(ins[1], "w")
+        self.stdout, self.stderr = os.fdopen(outs[0]), os.fdopen(errs[0])
         self.returncode: int | None = None
         self._interpreter = interpreter
-        order = {"source": source, "cwd": str(cwd), "environment": dict(environment)}
-        self.pid = interpreter.start(order, list(writing))
-        for end in writing:
+        its = [ins[0], outs[1], errs[1]]
+        self.pid = interpreter.start(order, its)
+        for end in its:
             os.close(end)
 
     def send_signal(self, number: int) -> None:
@@ -67,7 +78,9 @@ class Program:
             os.kill(self.pid, number)
 
     def communicate(self, timeout: float) -> tuple[str, str]:
-        """Wait for the end, and return what was not read yet; what outlives the timeout is killed."""
+        """Close its input, wait for the end, and return what was not read yet; what outlives the timeout is killed."""
+        if self.stdin is not None:
+            self.stdin.close()
         watchdog = threading.Timer(timeout, self.send_signal, [signal.SIGKILL])
         watchdog.start()
         with self.stdout, self.stderr, ThreadPoolExecutor() as readers:
@@ -75,6 +88,14 @@ class Program:
         self.returncode = self._interpreter.ended()
         watchdog.cancel()
         return out, err
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.returncode is None:
+            self.send_signal(signal.SIGKILL)
+            self.communicate(60)
 
 
 def _rest(stream: IO[str]) -> str:
@@ -92,8 +113,8 @@ class Interpreter:
             [sys.executable, *flags, __file__, str(there.fileno())],
             pass_fds=[there.fileno()],
             env=environment | {"OPENBLAS_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL,
             start_new_session=True,
+            **_pipes(),  # whose kind its streams keep in forks
         )
         there.close()
         self._socket, self._answers = here, here.makefile("rb")
@@ -105,7 +126,9 @@ class Interpreter:
         self._end_program()
         socket.send_fds(self._socket, [b"\n"], streams)
         self._socket.sendall(json.dumps(order).encode() + b"\n")
-        self._running = int(self._answers.readline())
+        answer = self._answers.readline()
+        assert answer, self.process.communicate()
+        self._running = int(answer)
         return self._running
 
     def ended(self) -> int:
@@ -124,7 +147,7 @@ class Interpreter:
         self._end_program()
         self._answers.close()
         self._socket.close()
-        self.process.wait()
+        self.process.communicate()
 
 
 @functools.cache
@@ -132,16 +155,16 @@ def _interpreter(flags: tuple[str, ...]) -> Interpreter:
     return Interpreter(flags)
 
 
-def forks(control: socket.socket) -> str | None:
-    """Fork for each order until there are no more; return the program's source in a fork."""
+def forks(control: socket.socket) -> dict[str, Any] | None:
+    """Fork for each order until there are no more; return the order in a fork."""
     while True:
-        received, streams, _, _ = socket.recv_fds(control, 1, 2)
+        received, streams, _, _ = socket.recv_fds(control, 1, 3)
         if not received:
             return None
         with control.makefile("rb") as lines:
             order = json.loads(lines.readline())
         pid = os.fork()
-        for number, stream in enumerate(streams, 1):
+        for number, stream in enumerate(streams):
             if pid == 0:
                 os.dup2(stream, number)
             os.close(stream)
@@ -149,14 +172,14 @@ def forks(control: socket.socket) -> str | None:
             os.chdir(order["cwd"])
             os.environ.clear()
             os.environ.update(order["environment"])
-            return order["source"]
+            return order
         control.sendall(f"{pid}\n".encode())
         control.sendall(f"{os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])}\n".encode())
 
 
-def as_main() -> dict[str, Any]:
+def as_main(arguments: list[str]) -> dict[str, Any]:
     """Return the names of an empty program; its tracebacks begin with itself."""
-    sys.argv, sys.path[0] = ["-c"], ""
+    sys.argv, sys.path[0] = ["-c", *arguments], ""
     sys.modules["__main__"] = main = types.ModuleType("__main__")
     sys.excepthook = _show
     if "coverage" in sys.modules and (measuring := import_module("coverage").Coverage.current()) is not None:
@@ -174,6 +197,6 @@ if __name__ == "__main__":
         import_module(name)
     gc.freeze()
     with socket.socket(fileno=int(sys.argv[1])) as orders:
-        text = forks(orders)
-    if text is not None:
-        exec(compile(text, "<string>", "exec"), as_main())
+        order = forks(orders)
+    if order is not None:
+        exec(compile(order["source"], "<string>", "exec"), as_main(order["arguments"]))
