@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import json
 import math
 import shutil
@@ -14,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from commands import GYMNASIUM_MODELS, urlab
+from commands import GYMNASIUM_MODELS
 from PIL import Image
 
 from urlab_client import URLabClient
@@ -42,10 +44,14 @@ def tilt(quaternion: list[float]) -> float:
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("demo")
-    done = urlab("demo", cwd=folder)
-    assert done.returncode == 0, done
-    assert done.stderr == ""
-    return folder / "urlab-demo", done.stdout
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(io.StringIO()) as out,
+        contextlib.redirect_stderr(io.StringIO()) as err,
+    ):
+        assert main(["demo"]) == 0
+    assert err.getvalue() == ""
+    return folder / "urlab-demo", out.getvalue()
 
 
 @pytest.fixture(scope="module")
