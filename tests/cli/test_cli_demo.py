@@ -21,7 +21,7 @@ from PIL import Image
 
 from urlab_client import URLabClient
 from urlab_client._installation import install_command
-from urlab_client.cli import main
+from urlab_client.cli import _parser, main
 from urlab_client.cli.demo_controllers import SineController
 from urlab_client.cli.robot_file import read_robot
 from urlab_client.server import SimulatedServer
@@ -49,7 +49,7 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         contextlib.redirect_stdout(io.StringIO()) as out,
         contextlib.redirect_stderr(io.StringIO()) as err,
     ):
-        assert main(["demo"]) == 0
+        assert main(["demo", "--steps", "1200"]) == 0
     assert err.getvalue() == ""
     return folder / "urlab-demo", out.getvalue()
 
@@ -62,12 +62,16 @@ def record(demonstration: tuple[Path, str]) -> dict[str, Any]:
 
 def test_drives_one_robot_blocking_and_two_async(record: dict[str, Any]) -> None:
     one, two = record["runs"]
-    assert (one["client"], one["robots"], one["steps"]) == ("blocking", 1, 2000)
-    assert (two["client"], two["robots"], two["steps"]) == ("async", 2, 500)
+    assert (one["client"], one["robots"], one["steps"]) == ("blocking", 1, 1200)
+    assert (two["client"], two["robots"], two["steps"]) == ("async", 2, 300)
     for run in (one, two):
         assert run["sim_time"] == pytest.approx(0.002 * run["steps"])
         assert run["steps_per_second"] == pytest.approx(run["steps"] / run["wall_time"])
         assert run["real_time_factor"] == pytest.approx(run["sim_time"] / run["wall_time"])
+
+
+def test_walks_for_four_seconds_unless_told_otherwise() -> None:
+    assert _parser("demo").parse_args(["demo"]).steps == 2000
 
 
 def test_the_quadruped_walks_and_does_not_fall(record: dict[str, Any]) -> None:
@@ -83,8 +87,8 @@ def test_the_quadruped_walks_and_does_not_fall(record: dict[str, Any]) -> None:
 
 def test_prints_a_table_and_what_it_wrote(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
     _, text = demonstration
-    assert "2000/2000" in text
-    assert "500/500" in text
+    assert "1200/1200" in text
+    assert "300/300" in text
     for heading in ("robots", "steps", "sim (s)", "steps/s", "factor", "final base pose"):
         assert heading in text
     x = record["runs"][0]["final_base_poses"][0]["position"][0]
@@ -263,10 +267,10 @@ def test_a_model_goes_over_the_wire_to_a_server_that_runs_already(crab: Path, tm
     output = tmp_path / "output"
     with SimulatedServer("arm", play=True, dialect="beta") as server:
         assert demo_on(server, "arm", "--steps", "8", "--output", output) == 0  # the next empties its levels
-        assert demo_on(server, crab, "--steps", "200", "--output", output) == 0
+        assert demo_on(server, crab, "--steps", "60", "--output", output) == 0
         record = json.loads((output / "run.json").read_bytes())
         assert record["address"].startswith("tcp://")
-        assert [run["steps"] for run in record["runs"]] == [200, 50]
+        assert [run["steps"] for run in record["runs"]] == [60, 15]
         assert [len(run["final_base_poses"]) for run in record["runs"]] == [1, 2]
         for run in record["runs"]:
             assert all(0.08 < pose["position"][2] < 0.15 for pose in run["final_base_poses"]), "there is a floor"

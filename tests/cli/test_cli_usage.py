@@ -188,7 +188,7 @@ def test_a_reader_that_has_gone_ends_a_command_silently(command: str, unbuffered
 
 def test_so_does_the_reader_of_the_errors(tmp_path: Path) -> None:
     with unread() as stderr:
-        done = urlab("info", "nothing.mcap", cwd=tmp_path, stderr=stderr)
+        done = urlab("keys", "show", "nothing", cwd=tmp_path, stderr=stderr)
     assert (done.returncode, done.stdout) == (141, "")
 
 
