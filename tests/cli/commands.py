@@ -14,13 +14,10 @@ from typing import Any
 
 import gymnasium
 from children import DEADLINE_S, child
-from forked import Program, program
+from forked import COMMAND, Program, program
 
 FREE_PORTS = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
 GYMNASIUM_MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-
-
-COMMAND = "import sys; from urlab_client.cli import main; sys.exit(main())"
 
 
 def urlab(

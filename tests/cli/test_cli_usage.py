@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 from children import DEADLINE_S
-from commands import COMMAND, refusal, urlab
-from forked import program
+from commands import refusal, urlab
+from forked import COMMAND, program
 
 from urlab_client.cli import _parser, main
 from urlab_client.server import bundled_models

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 from children import DEADLINE_S, in_background
-from commands import COMMAND
-from forked import program
+from forked import COMMAND, program
 from relay import Relay
 from waiting import eventually, until
 

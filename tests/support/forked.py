@@ -26,6 +26,9 @@ from typing import IO, Any, Self
 
 IMPORTED = ("urlab_client.aio.client", "urlab_client.cli", "urlab_client.server", "urlab_client.sync.client")
 
+COMMAND = "import sys; from urlab_client.cli import main; sys.exit(main())"
+"""The program `urlab`."""
+
 
 def program(
     source: str,
