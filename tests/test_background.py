@@ -6,8 +6,11 @@ The files in `KILLED` end each of them with an error, and see who is told.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -113,10 +116,16 @@ def makers(tree: ast.AST, function: str = "") -> Iterator[tuple[str, ast.Call]]:
         yield from makers(node, name)
 
 
-def sources() -> Iterator[tuple[str, ast.Module]]:
-    for file in sorted((ROOT / "src").rglob("*.py")):
-        relative = file.relative_to(ROOT / "src").as_posix().removeprefix("urlab_client/")
-        yield relative, ast.parse(file.read_text(encoding="utf-8"))
+@pytest.fixture(scope="module")
+def sources() -> list[tuple[str, ast.Module]]:
+    """The modules of the package that have any of these words; parsing takes long."""
+    words = re.compile("|".join(sorted(HELPERS | PLAIN)))
+    texts = [(file, file.read_text(encoding="utf-8")) for file in sorted((ROOT / "src").rglob("*.py"))]
+    return [
+        (file.relative_to(ROOT / "src").as_posix().removeprefix("urlab_client/"), ast.parse(text))
+        for file, text in texts
+        if words.search(text)
+    ]
 
 
 def text(node: ast.expr) -> str:
@@ -126,21 +135,19 @@ def text(node: ast.expr) -> str:
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
 
 
-def test_what_runs_in_the_background_is_made_by_the_helpers() -> None:
-    plain = {
-        f"{file}:{function}" for file, tree in sources() for function, call in makers(tree) if called(call) in PLAIN
-    }
+def test_what_runs_in_the_background_is_made_by_the_helpers(sources: list[tuple[str, ast.Module]]) -> None:
+    plain = {f"{file}:{function}" for file, tree in sources for function, call in makers(tree) if called(call) in PLAIN}
     assert plain - set(AWAITED) == set(), "use Health.thread or aio/background.py, or say here who awaits it"
     assert set(AWAITED) - plain == set(), "no longer there"
-    for file, tree in sources():
+    for file, tree in sources:
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 assert "Thread" not in map(ast.unparse, node.bases), f"{file}: {node.name} is a thread of its own"
 
 
-def test_each_name_is_killed_by_a_test() -> None:
+def test_each_name_is_killed_by_a_test(sources: list[tuple[str, ast.Module]]) -> None:
     names: set[tuple[bool, str]] = set()
-    for file, tree in sources():
+    for file, tree in sources:
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and called(node) in HELPERS and node.args and (name := text(node.args[0])):
                 names.add((file.startswith("server/"), name))

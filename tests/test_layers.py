@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -185,6 +188,27 @@ def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, f"{start}{alias.name}") for alias in node.names)
 
 
+@dataclass
+class Facts:
+    """What the tests ask of a module."""
+
+    imports: list[tuple[int, str]]
+    private: set[str]
+    """Private functions and methods that it defines, and private attributes that it sets."""
+
+
+@cache
+def facts(file: Path) -> Facts:
+    tree = ast.parse(file.read_text(encoding="utf-8"), str(file))
+    names = {
+        node.attr if isinstance(node, ast.Attribute) else node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        or (isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store))
+    }
+    return Facts([*imports(tree)], {name for name in names if name.startswith("_")})
+
+
 def target_of(imported: str, package: Path) -> str | None:
     """Return the layer that an imported name belongs to, None for another distribution's."""
     name, *rest = imported.split(".")
@@ -210,7 +234,7 @@ def room_violations(package: Path) -> list[str]:
             if room not in order:
                 found.append(f"{where}: {room} is not a room of {layer}; say in {Path(__file__).name} where it belongs")
                 continue
-            for line, imported in imports(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+            for line, imported in facts(file).imports:
                 if not imported.startswith(f"{package.name}.{layer}."):
                     continue
                 target = room_of(imported, layer)
@@ -227,7 +251,7 @@ def violations(package: Path) -> list[str]:
         if layer not in ALLOWED:
             found.append(f"{where}: {layer} is not a layer; say in {Path(__file__).name} what it may import")
             continue
-        for line, imported in imports(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+        for line, imported in facts(file).imports:
             target = target_of(imported, package)
             if imported.startswith("."):
                 found.append(f"{where}:{line}: relative import of {imported}")
@@ -255,17 +279,8 @@ PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 
 def private_names(package: Path) -> set[str]:
     """Return the private attributes that the objects of both clients have."""
-    trees = (
-        ast.parse(file.read_text("utf-8")) for flavour in ("aio", "sync") for file in (package / flavour).rglob("*.py")
-    )
-    return {
-        node.attr if isinstance(node, ast.Attribute) else node.name
-        for tree in trees
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        or (isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store))
-        if (node.attr if isinstance(node, ast.Attribute) else node.name).startswith("_")
-    }
+    files = (file for flavour in ("aio", "sync") for file in (package / flavour).rglob("*.py"))
+    return set().union(*(facts(file).private for file in files))
 
 
 def private_uses(package: Path) -> list[str]:
@@ -273,7 +288,10 @@ def private_uses(package: Path) -> list[str]:
     private = private_names(package) - PUBLIC_ALL_THE_SAME
     found: list[str] = []
     for file in sorted(file for layer in ON_THE_CLIENT for file in (package / layer).rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+        text = file.read_text(encoding="utf-8")
+        if private.isdisjoint(re.findall(r"(?<!\bself)(?<!\bcls)\.\s*(\w+)", text)):
+            continue  # parsing takes long
+        for node in ast.walk(ast.parse(text, str(file))):
             if not isinstance(node, ast.Attribute) or node.attr not in private or node.attr.startswith("__"):
                 continue
             if not (isinstance(node.value, ast.Name) and node.value.id in {"self", "cls"}):

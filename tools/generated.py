@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import textwrap
 import tomllib
@@ -131,12 +133,13 @@ def tidied(files: Mapping[Path, str], root: Path, package: str) -> dict[Path, st
         return {path: copy.read_text(encoding="utf-8") for path, copy in copies.items()}
 
 
+@functools.cache
 def _ruff() -> list[str]:
     """Return the command of the ruff that the project pins: another one formats otherwise."""
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     pins = [line for lines in extras["optional-dependencies"].values() for line in lines if line.startswith("ruff==")]
     pin = pins[0].partition("==")[2]
-    for command in ([sys.executable, "-m", "ruff"], [shutil.which("ruff") or "ruff"]):
+    for command in ([str(Path(sysconfig.get_path("scripts"), "ruff"))], [shutil.which("ruff") or "ruff"]):
         try:
             answer = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)  # noqa: S603
         except OSError:

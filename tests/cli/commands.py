@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium
 from children import DEADLINE_S, child
+from forked import COMMAND, Program, program
 
 FREE_PORTS = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
 GYMNASIUM_MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -23,6 +24,10 @@ def urlab(
     *arguments: str | Path, cwd: Path, environment: Mapping[str, str] | None = None, **outputs: Any
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, with pipes where no other outputs are given."""
+    if environment is None and not outputs:
+        with program(COMMAND, *arguments, cwd=cwd) as process:
+            out, err = process.communicate(timeout=DEADLINE_S)
+        return subprocess.CompletedProcess(arguments, process.returncode or 0, out, err)
     return subprocess.run(
         [sys.executable, "-m", "urlab_client", *map(str, arguments)],
         cwd=cwd,
@@ -57,7 +62,7 @@ def signals_kept() -> Generator[None]:
 class Server:
     """A running `urlab serve`."""
 
-    def __init__(self, process: subprocess.Popen[str], first_line: str) -> None:
+    def __init__(self, process: Program | subprocess.Popen[str], first_line: str) -> None:
         self.process = process
         self.first_line = first_line
 
@@ -93,15 +98,16 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(*arguments: str | Path, cwd: Path, json: bool = True) -> Generator[Server]:
-    """Run `urlab serve` on free ports until the block ends."""
+def served(*arguments: str | Path, cwd: Path, json: bool = True, inherits: bool = False) -> Generator[Server]:
+    """Run `urlab serve` on free ports until the block ends; a fork does not inherit which signals are ignored."""
     options = [*FREE_PORTS, *(["--json"] if json else []), *(["--until-eof"] if sys.platform == "win32" else [])]
-    with child("-m", "urlab_client", "serve", *options, *arguments, cwd=cwd) as process:
+    command = ["serve", *options, *arguments]
+    with child("-m", "urlab_client", *command, cwd=cwd) if inherits else program(COMMAND, *command, cwd=cwd) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         line = process.stdout.readline()
         assert line, process.stderr.read()
         server = Server(process, line)
         yield server
-        if process.poll() is None:
+        if process.returncode is None:
             server.end(signal.SIGTERM)

@@ -10,20 +10,24 @@ from typing import Any
 
 import mujoco
 import pytest
-from commands import GYMNASIUM_MODELS, Server, served
+from commands import GYMNASIUM_MODELS
 from ports import free_port
 
 from urlab_client import SessionTakenOver, URLabClient
 from urlab_client.cli import main
-from urlab_client.server import SimulatedServer
+from urlab_client.server import ControllerConfig, SimulatedServer
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Generator[Server]:
+def server() -> Generator[SimulatedServer]:
     models = GYMNASIUM_MODELS / "ant.xml", "arm"
-    options = "--play", "--mjcf-options", "--controller", "arm=pd"
-    with served(*models, *options, cwd=tmp_path_factory.mktemp("served")) as server:
+    with SimulatedServer(*models, play=True, mjcf_options=True, controllers={"arm": ControllerConfig()}) as server:
         yield server
+
+
+def rpc(server: SimulatedServer) -> str:
+    """Return the address with the RPC port."""
+    return f"{server.address}:{server.step_port}"
 
 
 def ping_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
@@ -31,9 +35,9 @@ def ping_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, 
     return json.loads(capsys.readouterr().out)
 
 
-def test_reports_who_is_there(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    report = ping_json(capsys, server.rpc, "--count", "3")
-    assert (report["address"], report["ops"]) == (server.rpc, 62)
+def test_reports_who_is_there(server: SimulatedServer, capsys: pytest.CaptureFixture[str]) -> None:
+    report = ping_json(capsys, rpc(server), "--count", "3")
+    assert (report["address"], report["ops"]) == (rpc(server), 62)
     trips = report["round_trip_ms"]
     assert trips["count"] == 3
     assert 0 < trips["min"] <= trips["median"] <= trips["max"]
@@ -55,39 +59,38 @@ def test_reports_who_is_there(server: Server, capsys: pytest.CaptureFixture[str]
     assert (arm["key"], arm["actuators"], arm["controller"]) == ("arm", 7, "pd")
 
 
-def test_the_same_in_words(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    port = str(server.ready["step_port"])
-    assert main(["ping", server.ready["address"], "--step-port", port, "--timeout", "30"]) == 0
+def test_the_same_in_words(server: SimulatedServer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ping", server.address, "--step-port", str(server.step_port), "--timeout", "30"]) == 0
     text = capsys.readouterr().out
     for words in (mujoco.mj_versionString(), "9 joints, 8 actuators", "pd controller", "round trip", "--no-session"):
         assert words in text
 
 
-def test_opens_a_session_only_if_it_may(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    with URLabClient(**server.client_options) as client:
+def test_opens_a_session_only_if_it_may(server: SimulatedServer, capsys: pytest.CaptureFixture[str]) -> None:
+    with URLabClient(**server.client_options()) as client:
         client.discover()
-        assert ping_json(capsys, server.rpc, "--no-session")["server"] is None
+        assert ping_json(capsys, rpc(server), "--no-session")["server"] is None
         client.step()
-        ping_json(capsys, server.rpc)
+        ping_json(capsys, rpc(server))
         with pytest.raises(SessionTakenOver):
             client.step()
 
 
-def test_the_mode_of_a_server_that_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with served("ball", "--play", "--unpaused", cwd=tmp_path) as live:
-        play = ping_json(capsys, live.rpc)["server"]["play"]
+def test_the_mode_of_a_server_that_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("ball", play=True, unpaused=True) as live:
+        play = ping_json(capsys, rpc(live))["server"]["play"]
     assert (play["physics"], play["step_mode"], play["step_mode_pinned"]) == ("advancing", "live", False)
 
 
-def test_the_mode_of_a_pinned_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with served("ball", "--play", "--step-mode", "direct", cwd=tmp_path) as pinned:
-        play = ping_json(capsys, pinned.rpc)["server"]["play"]
+def test_the_mode_of_a_pinned_server(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("ball", play=True, step_mode="direct") as pinned:
+        play = ping_json(capsys, rpc(pinned))["server"]["play"]
     assert (play["physics"], play["step_mode"], play["step_mode_pinned"]) == ("standing still", "direct", True)
 
 
-def test_a_server_without_play(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with served("ball", cwd=tmp_path) as editor:
-        found = ping_json(capsys, editor.rpc)["server"]
+def test_a_server_without_play(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("ball") as editor:
+        found = ping_json(capsys, rpc(editor))["server"]
     assert (found["play"]["state"], found["play"]["physics"], found["articulations"]) == ("off", None, [])
 
 

@@ -9,8 +9,9 @@ import socket
 from pathlib import Path
 
 import pytest
-from children import DEADLINE_S, child, in_background
+from children import DEADLINE_S, in_background
 from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, signals_kept, urlab
+from forked import program
 from waiting import eventually
 
 from urlab_client import ModeLocked, URLabClient, URLabPDController
@@ -50,7 +51,7 @@ def test_leaves_ctrl_c_to_the_program_that_holds_its_input_or_the_terminal(tmp_p
     options = [] if background else ["--until-eof"]
     with contextlib.ExitStack() as stack:
         with in_background() if background else contextlib.nullcontext():
-            server = stack.enter_context(served("ball", "--play", *options, cwd=tmp_path))
+            server = stack.enter_context(served("ball", "--play", *options, cwd=tmp_path, inherits=background))
         client = stack.enter_context(URLabClient(**server.client_options, step_mode="direct"))
         client.discover()
         server.process.send_signal(signal.SIGINT)
@@ -77,10 +78,8 @@ def test_says_readably_where_it_serves(tmp_path: Path) -> None:
 
 
 def test_a_signal_during_a_start_that_takes_long(tmp_path: Path) -> None:
-    program = tmp_path / "slow.py"
-    program.write_text(
+    source = (
         "import sys, threading\n"
-        "from pathlib import Path\n"
         "from urlab_client.cli import main\n"
         "from urlab_client.server import SimulatedServer\n"
         "def start(self):\n"
@@ -89,7 +88,7 @@ def test_a_signal_during_a_start_that_takes_long(tmp_path: Path) -> None:
         "SimulatedServer.start = start\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
-    with child(program, "serve", "arm", *FREE_PORTS, cwd=tmp_path) as process:
+    with program(source, "serve", "arm", *FREE_PORTS, cwd=tmp_path) as process:
         assert process.stdout is not None
         scratch = Path(process.stdout.readline().strip())
         process.send_signal(signal.SIGTERM)
@@ -99,8 +98,7 @@ def test_a_signal_during_a_start_that_takes_long(tmp_path: Path) -> None:
 
 
 def test_ends_with_the_reason_when_a_thread_dies(tmp_path: Path) -> None:
-    program = tmp_path / "dying.py"
-    program.write_text(
+    source = (
         "import ctypes, sys, threading\n"
         "from urlab_client.cli import main\n"
         "def strike():\n"
@@ -110,10 +108,12 @@ def test_ends_with_the_reason_when_a_thread_dies(tmp_path: Path) -> None:
         "threading.Thread(target=strike, daemon=True).start()\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
-    with child(program, "serve", "arm", "--play", "--json", *FREE_PORTS, cwd=tmp_path) as process:
+    with program(source, "serve", "arm", "--play", "--json", *FREE_PORTS, cwd=tmp_path) as process:
+        assert process.stdin is not None
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["event"] == "ready"
-        out, err = process.communicate("now\n", timeout=DEADLINE_S)
+        process.stdin.write("now\n")
+        out, err = process.communicate(timeout=DEADLINE_S)
     assert (process.returncode, out) == (2, "")
     assert err.splitlines()[-1] == "urlab serve: the server's thread 'urlab-physics' died of SystemExit"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import refusal, urlab
+from commands import urlab
 from PIL import Image
 
 from urlab_client import URLabClient
@@ -164,8 +164,12 @@ def test_refusals(arguments: list[str], words: list[str], capsys: pytest.Capture
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_no_opengl_is_one_line(tmp_path: Path) -> None:
-    line = refusal(urlab("snapshot", "arm", cwd=tmp_path, environment={"MUJOCO_GL": "disable"}))
+def test_no_opengl_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert main(["snapshot", "arm"]) == 2
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert out == ""
     assert "MUJOCO_GL=disable" in line
 
 

@@ -15,8 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from children import DEADLINE_S, child
+from children import DEADLINE_S
 from commands import refusal, urlab
+from forked import COMMAND, program
 
 from urlab_client.cli import _parser, main
 from urlab_client.server import bundled_models
@@ -166,7 +167,7 @@ def test_ctrl_c_is_exit_code_130_without_a_traceback(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         silent.settimeout(DEADLINE_S)
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with child("-m", "urlab_client", "ping", address, "--timeout", "60", "--no-session", cwd=tmp_path) as ping:
+        with program(COMMAND, "ping", address, "--timeout", "60", "--no-session", cwd=tmp_path) as ping:
             connection, _ = silent.accept()  # from here on it waits for an answer that never comes
             with connection:
                 ping.send_signal(signal.SIGINT)
@@ -174,8 +175,11 @@ def test_ctrl_c_is_exit_code_130_without_a_traceback(tmp_path: Path) -> None:
     assert (ping.returncode, out, err) == (130, "", "")
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
-@pytest.mark.parametrize("command", ["ping sim://ball --no-session", ""])
+@pytest.mark.parametrize(
+    ("command", "unbuffered"),
+    [("ping sim://ball --no-session", ""), ("robots", "1"), ("", ""), ("", "1")],
+    ids=lambda value: {"": "-", "1": "unbuffered"}.get(value, value),
+)
 def test_a_reader_that_has_gone_ends_a_command_silently(command: str, unbuffered: str, tmp_path: Path) -> None:
     with unread() as stdout:
         done = urlab(*command.split(), cwd=tmp_path, stdout=stdout, environment={"PYTHONUNBUFFERED": unbuffered})
@@ -184,7 +188,7 @@ def test_a_reader_that_has_gone_ends_a_command_silently(command: str, unbuffered
 
 def test_so_does_the_reader_of_the_errors(tmp_path: Path) -> None:
     with unread() as stderr:
-        done = urlab("info", "nothing.mcap", cwd=tmp_path, stderr=stderr)
+        done = urlab("keys", "show", "nothing", cwd=tmp_path, stderr=stderr)
     assert (done.returncode, done.stdout) == (141, "")
 
 

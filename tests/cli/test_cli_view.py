@@ -1,4 +1,4 @@
-"""`urlab view` in child processes."""
+"""`urlab view`: what it writes, and what it refuses."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
-from commands import refusal, urlab
+from commands import urlab
 
 from urlab_client.cli import console, main
 from urlab_client.cli._page_options import PageArguments
-
-NO_DISPLAY = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
 
 
 @pytest.mark.view
@@ -38,16 +36,29 @@ def test_a_run_goes_into_a_file(tmp_path: Path) -> None:
     assert "/joints/quadruped/FL_hip" in paths
 
 
-def test_without_a_display_the_window_is_refused_and_others_are_named(tmp_path: Path) -> None:
-    line = refusal(urlab("view", "sim://quadruped", cwd=tmp_path, environment=NO_DISPLAY))
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Return the line with which the command ended."""
+    assert main(["view", *arguments]) == 2
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert out == ""
+    return line
+
+
+def test_without_a_display_the_window_is_refused_and_others_are_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    line = refused(capsys, "sim://quadruped")
     assert "no display" in line
     assert "--web, --rerun --page or --foxglove" in line
 
 
-def test_options_of_another_view_are_refused(tmp_path: Path) -> None:
-    assert "require --rerun" in refusal(urlab("view", "--foxglove", "--save", "a.rrd", cwd=tmp_path))
-    assert "give one of" in refusal(urlab("view", "--rerun", "--page", "--save", "a.rrd", cwd=tmp_path))
-    assert "do not apply to --web" in refusal(urlab("view", "--web", "--seconds", "1", cwd=tmp_path))
+def test_options_of_another_view_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "require --rerun" in refused(capsys, "--foxglove", "--save", "a.rrd")
+    assert "give one of" in refused(capsys, "--rerun", "--page", "--save", "a.rrd")
+    assert "do not apply to --web" in refused(capsys, "--web", "--seconds", "1")
 
 
 def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from children import DEADLINE_S, child, in_background
+from children import DEADLINE_S, in_background
+from forked import COMMAND, program
 from relay import Relay
 from waiting import eventually, until
 
@@ -104,7 +105,7 @@ async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.Mon
 def test_ctrl_c_ends_a_recording_early_and_whole(mode: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     command = ["record", "sim://ball", path, "--step-mode", mode, "--seconds", "1000"]
-    with child("-m", "urlab_client", *command, cwd=tmp_path) as recording:
+    with program(COMMAND, *command, cwd=tmp_path) as recording:
         eventually(lambda: path.exists() and path.stat().st_size > 2_000)
         recording.send_signal(signal.SIGINT)
         out, err = recording.communicate(timeout=DEADLINE_S)

@@ -7,8 +7,6 @@ import os
 import re
 import secrets
 import shlex
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
+from forked import program
 from pages import ROOT, Block, blocks, pages, shown
 from shell import DEADLINE_S, NOT_RUN, Shell, reason, same, steps
 
@@ -59,11 +58,8 @@ CANNOT_DRAW = re.compile(r"^camera images are left out: .*\n", re.MULTILINE)
 
 # Runs the blocks of a page as one program; a separator tells their outputs apart. Tracebacks name the page's lines.
 DRIVER = r"""
-import json, sys
-page, blocks = json.load(sys.stdin)
-namespace = {"__name__": "__main__"}
-for line, code in blocks:
-    exec(compile("\n" * (line - 1) + code, page, "exec"), namespace)
+for line, code in {}:
+    exec(compile("\n" * (line - 1) + code, {page!r}, "exec"))
     print("\x1e", end="", flush=True)
 """
 
@@ -91,20 +87,17 @@ def assert_output(block: Block, got: str) -> None:
 
 def run_python(page: Path, chosen: list[Block], folder: Path, **environment: str) -> str:
     """Run blocks as one program, compare what they print, and return what it says on standard error."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", DRIVER],
-        input=json.dumps([str(page), [(block.line, block.code) for block in chosen]]),
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
+    source = DRIVER.format([(block.line, block.code) for block in chosen], page=str(page))
+    running = program(
+        source,
         cwd=folder,
-        env={**os.environ, **environment},
+        environment={**os.environ, **environment},
     )
-    assert done.returncode == 0, f"{shown(page)}\n{done.stdout}\n{done.stderr}"
-    for block, got in zip(chosen, done.stdout.split("\x1e"), strict=False):
+    out, err = running.communicate(timeout=DEADLINE_S)
+    assert running.returncode == 0, f"{shown(page)}\n{out}\n{err}"
+    for block, got in zip(chosen, out.split("\x1e"), strict=False):
         assert_output(block, got)
-    return done.stderr
+    return err
 
 
 def page_param(page: Path) -> Any:
@@ -157,15 +150,11 @@ def test_marked_tests_pass(page: Path, tmp_path: Path) -> None:
             # So that a failure names the page's line.
             (tmp_path / f"test_line_{block.line}.py").write_text("\n" * (block.line - 1) + block.code, encoding="utf-8")
     (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_default_fixture_loop_scope = function\n", encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "pytest_urlab", "--strict-markers", "-W", "error", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, f"{shown(page)}\n{done.stdout}\n{done.stderr}"
+    imported = "ignore:Module already imported:pytest.PytestAssertRewriteWarning"
+    arguments = ["-q", "-p", "pytest_urlab", "--strict-markers", "-W", "error", "-W", imported, str(tmp_path)]
+    running = program(f"import sys, pytest\nsys.exit(pytest.main({arguments}))", cwd=tmp_path)
+    out, err = running.communicate(timeout=DEADLINE_S)
+    assert running.returncode == 0, f"{shown(page)}\n{out}\n{err}"
 
 
 def every_block() -> Iterator[Block]:

@@ -27,6 +27,8 @@ PLUGINS = (
     "error",
     *OURS,
 )
+ALONE = ("-p", "no:asyncio", "-p", "no:anyio", "-p", "no:benchmark")
+"""Without other plugins, which import what they like."""
 
 
 def run(pytester: pytest.Pytester, text: str, *options: str) -> pytest.RunResult:
@@ -258,7 +260,7 @@ def test_workers_have_servers_of_their_own(pytester: pytest.Pytester) -> None:
             urlab_client.step(5)
         """
     )
-    pytester.runpytest_subprocess(*PLUGINS, "-n", "2").assert_outcomes(passed=4)
+    pytester.runpytest_subprocess(*PLUGINS, *ALONE, "-n", "2").assert_outcomes(passed=4)
 
 
 def test_who_does_not_use_it_does_not_pay(pytester: pytest.Pytester) -> None:
@@ -271,9 +273,7 @@ def test_who_does_not_use_it_does_not_pay(pytester: pytest.Pytester) -> None:
             assert not {"urlab_client", "mujoco", "numpy", "zmq", "msgspec"} & set(sys.modules)
         """
     )
-    # Other plugins may import what they like.
-    alone = ("-p", "no:asyncio", "-p", "no:anyio", "-p", "no:benchmark")
-    pytester.runpytest_subprocess(*PLUGINS, *alone).assert_outcomes(passed=1)
+    pytester.runpytest_subprocess(*PLUGINS, *ALONE).assert_outcomes(passed=1)
 
 
 def test_the_plugin_is_announced() -> None:

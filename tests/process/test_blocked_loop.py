@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from forked import program
 
 BLOCKED = """
 import asyncio, time
@@ -30,5 +29,6 @@ print("well")
 
 
 def test_a_stream_goes_on_after_its_connection_was_given_up() -> None:
-    done = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, text=True, timeout=240, check=False)
-    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "well", "")
+    running = program(BLOCKED)
+    out, err = running.communicate(timeout=240)
+    assert (running.returncode, out.strip(), err) == (0, "well", "")

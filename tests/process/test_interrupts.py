@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
+from forked import program
 
 PROGRAM = """
 import collections, contextlib, gc, logging, os, random, signal, sys, threading, time, warnings
@@ -13,7 +13,6 @@ from urlab_client import SessionTakenOver, URLabClient
 from urlab_client.server import SimulatedServer
 from urlab_client.sync import _loop
 
-MOMENTS = int(sys.argv[1])
 _loop.GRACE = 60  # what waits for it, does so for a reason that is told
 
 class Struck(Exception):
@@ -52,6 +51,7 @@ sys.unraisablehook = lambda problem: is_ours(problem) and problems.append(repr(p
 threading.excepthook = lambda problem: problems.append(repr(problem))
 warnings.showwarning = lambda message, *_, **__: "unclosed" in str(message) or problems.append(str(message))
 logging.getLogger("urlab_client.sync").addFilter(lambda record: problems.append(record.getMessage()))
+warnings.simplefilter("always")
 signal.signal(signal.SIGALRM, strike)
 
 def make_use_and_close():
@@ -102,6 +102,6 @@ problems: Counter()
 @pytest.mark.skipif(sys.platform != "linux", reason="descriptors are counted in /proc")
 @pytest.mark.parametrize("moments", [60, pytest.param(3000, marks=[pytest.mark.long, pytest.mark.timeout(600)])])
 def test_at_random_moments(moments: int) -> None:
-    program = [sys.executable, "-W", "always", "-c", PROGRAM, str(moments)]
-    done = subprocess.run(program, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == (EXPECTED, "")
+    running = program(f"MOMENTS = {moments}\n{PROGRAM}")
+    out, err = running.communicate(timeout=600)
+    assert (out, err) == (EXPECTED, "")

@@ -17,7 +17,7 @@ from hammer import STRIDE
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import create, region_size
 
-SECONDS = os.environ.get("URLAB_HAMMER_S", "1")
+SECONDS = os.environ.get("URLAB_HAMMER_S", "0.3")
 HAMMER = Path(__file__).parents[1] / "support" / "hammer.py"
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import Region, attach
-from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 WORDS = (8, 40, 100)
 STRIDE = 1024
@@ -82,10 +81,14 @@ def wait_for_start() -> None:
 
 def run(role: str, path: Path, seconds: float) -> str:
     if role == "serve":
+        from urlab_client.server.transport.region_files import RegionFile  # what the client's side need not load
+
         region_file = RegionFile(path, STRIDE)
         wait_for_start()
         return publish(region_file.publish, seconds)
     if role == "answer":
+        from urlab_client.server.transport.region_files import RequestFile
+
         requests = RequestFile(path, STRIDE)
 
         def request(seen: int) -> tuple[int, bytes | None]:

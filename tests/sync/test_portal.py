@@ -22,6 +22,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from forked import Program, program
 from waiting import DEADLINE_S, eventually
 
 from urlab_client import URLabClient
@@ -537,7 +538,7 @@ class TestGarbageCollection:
         assert tasks[0].cancelled()
 
 
-def child(script: str, *flags: str) -> subprocess.Popen[str]:
+def child(script: str) -> Program | subprocess.Popen[str]:
     prelude = """
         import asyncio, logging, os, signal, sys, threading
         from urlab_client.protocol.errors import ClientClosed, ForkedError
@@ -556,20 +557,16 @@ def child(script: str, *flags: str) -> subprocess.Popen[str]:
             return 42
     """
     source = textwrap.dedent(prelude) + textwrap.dedent(script)
-    return subprocess.Popen(
-        [sys.executable, "-X", "dev", "-W", "error", *flags, "-c", source],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    flags = ("-X", "dev", "-W", "error", "-W", "ignore:This process:DeprecationWarning")  # 3.12: a fork with threads
+    return program(source, flags=flags)
 
 
-def outcome(process: subprocess.Popen[str]) -> tuple[int, list[str], str]:
+def outcome(process: Program | subprocess.Popen[str]) -> tuple[int, list[str], str]:
     out, err = process.communicate(timeout=60)
     return process.returncode, out.splitlines(), err
 
 
-def interrupt_when_ready(process: subprocess.Popen[str]) -> None:
+def interrupt_when_ready(process: Program | subprocess.Popen[str]) -> None:
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)
@@ -899,11 +896,8 @@ class TestInterrupt:
 
 
 class TestFork:
-    IGNORE_ADVICE = ("-W", "ignore:This process:DeprecationWarning")  # Python 3.12 warns at a fork with threads
-
     def test_a_child_gets_advice_and_the_parent_goes_on(self) -> None:
-        process = child(
-            """
+        process = child("""
             portal = Portal()
             portal.call(answer)
             pid = os.fork()
@@ -916,9 +910,7 @@ class TestFork:
                 sys.exit(7)
             say(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
             say(portal.call(answer))
-            """,
-            *self.IGNORE_ADVICE,
-        )
+        """)
         code, out, err = outcome(process)
         assert (code, err) == (0, "")
         assert "spawn" in out[0]
@@ -926,8 +918,7 @@ class TestFork:
         assert out[1:] == ["7", "42"]
 
     def test_a_child_forked_while_locks_are_held_does_not_hang(self) -> None:
-        process = child(
-            """
+        process = child("""
             class Twin(_facade.Facade, twin=object):
                 pass
 
@@ -958,14 +949,11 @@ class TestFork:
             release.set()
             holder.join()
             say(portal.call(answer))
-            """,
-            *self.IGNORE_ADVICE,
-        )
+        """)
         assert outcome(process) == (0, ["refused", "refused", "0", "42"], "")
 
     def test_a_child_leaving_a_with_block_keeps_its_exit_code(self) -> None:
-        process = child(
-            """
+        process = child("""
             class Twin:
                 async def close(self):
                     say("closed")
@@ -982,9 +970,7 @@ class TestFork:
                 if pid == 0:
                     sys.exit(5)
                 say(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
-            """,
-            *self.IGNORE_ADVICE,
-        )
+        """)
         # "closed" twice: by the last coroutine and, idempotently, by at_stop; both in the parent.
         assert outcome(process) == (0, ["5", "closed", "closed"], "")
 

@@ -130,17 +130,13 @@ class TestCommand:
 
     def test_output_depends_on_nothing_but_the_sources(self, plan: Any, tmp_path: Path) -> None:
         gen_sync.main([], plan)
-        script = (
-            "import sys; sys.path[:0] = sys.argv[1:3]\n"
-            "import pathlib, test_gen_sync as t\n"
-            "sys.exit(t.gen_sync.main(['--check'], t.plan_for(pathlib.Path(sys.argv[3]))))"
-        )
+        script = "import sys, gen_sync; from pathlib import *; from gen_sync import Plan; "
+        script += f"sys.exit(gen_sync.main(['--check'], {plan!r}))"
         for seed in "1", "2":
-            arguments = [str(TOOL.parent), str(Path(__file__).parent), str(tmp_path)]
             done = subprocess.run(
-                [sys.executable, "-c", script, *arguments],
+                [sys.executable, "-c", script],
                 check=False,
-                env={**os.environ, "PYTHONHASHSEED": seed},
+                env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(TOOL.parent)},
                 capture_output=True,
                 text=True,
                 cwd=tmp_path,

@@ -113,7 +113,7 @@ class Agent:
     async def _list_tools(
         self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
     ) -> types.ListToolsResult:
-        return types.ListToolsResult(tools=[one.described() for one in self._offered.values()])
+        return types.ListToolsResult(tools=[one.described for one in self._offered.values()])
 
     async def _call_tool(
         self, context: ServerRequestContext[Any], params: types.CallToolRequestParams

@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Awaitable, Callable
 from enum import Enum
+from functools import cached_property
 from types import ModuleType
 from typing import Any, get_type_hints
 
@@ -53,6 +54,7 @@ class Declared:
         self._hints = hints
         self._parameters = list(inspect.signature(function).parameters.values())[1:]
 
+    @cached_property
     def _arguments(self) -> type[Struct]:
         """Return the function's parameters as a struct."""
         types = get_type_hints(self.function, include_extras=True)
@@ -65,9 +67,10 @@ class Declared:
             self.name, fields, namespace={"__doc__": doc}, forbid_unknown_fields=True, kw_only=True
         )
 
+    @cached_property
     def described(self) -> Tool:
-        """Return the description for agents."""
-        arguments, result = self._arguments(), get_type_hints(self.function)["return"]
+        """The description for agents."""
+        arguments, result = self._arguments, get_type_hints(self.function)["return"]
         output, when = _schema(result.__args__[0] if hasattr(result, "__args__") else result), _schema(Moment)
         output["properties"] |= when["properties"]
         output["required"] = [*output.get("required", ()), *when["required"]]
@@ -88,7 +91,7 @@ class Declared:
         """
         plain = {name: _from_text(value) for name, value in given.items()}
         try:
-            made = msgspec.convert(plain, self._arguments(), strict=False)
+            made = msgspec.convert(plain, self._arguments, strict=False)
         except (ValueError, RecursionError) as error:
             taken = ", ".join(one.name for one in self._parameters)
             raise ValueError(f"{self.name}: {error}. It takes: {taken or 'no arguments'}.") from None
