@@ -112,6 +112,9 @@ class Servers:
         except BaseException:
             server.close()
             raise
+        running = server._running._core.play.current  # type: ignore[union-attr]
+        if running is not None:
+            running.engine.set_paused(True)  # or it steps in real time for as long as it is kept
         self._idle[wishes] = server
         if len(self._idle) > self.MOST:
             self._idle.pop(next(iter(self._idle))).close()
