@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from types import MappingProxyType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
-
-import msgspec
+from types import MappingProxyType
 
 from urlab_client.protocol import errors
 from urlab_client.protocol.base import DialectName, Op
@@ -62,22 +59,12 @@ def _check(op: Op) -> None:
     for struct in (op.request, op.reply):
         if "__doc__" not in struct.__dict__ or not struct.__doc__:
             raise TypeError(f"{struct.__name__}: no docstring")
-        for field in msgspec.structs.fields(struct):
-            if not _described(field.type):
-                raise TypeError(f"{struct.__name__}.{field.name}: no description")
     unknown = [code for code in op.errors if code not in errors.RPC_ERRORS]
     if unknown:
         raise TypeError(f"{op.name}: undeclared error codes {unknown}")
     wrong = [name for name in op.undeclared if name not in op.required]
     if wrong:
         raise TypeError(f"{op.name}: {wrong} are not required fields")
-
-
-def _described(annotation: Any) -> bool:
-    # Without msgspec.inspect, which would take a third of the package's import time.
-    if get_origin(annotation) is Annotated:
-        return any(isinstance(extra, msgspec.Meta) for extra in get_args(annotation)[1:])
-    return get_origin(annotation) in {Union, UnionType} and any(map(_described, get_args(annotation)))
 
 
 OPS: Mapping[str, Op] = registry(
