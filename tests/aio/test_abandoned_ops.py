@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from resting import rest
 from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import URLabTimeoutError
@@ -210,5 +211,4 @@ async def test_after_resync_the_client_mirrors_what_is_so(
             await client.runtime.set_mode("direct")
             await client.replay.stop()
             assert (await client.step(2)).step == client.step_count == found.step + 2
-    if name != "stop_pie":
-        server._running._core.play.running().engine.set_paused(True)  # type: ignore[union-attr]  # or it goes on live
+    rest(server)
