@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from resting import rest
 from waiting import DEADLINE_S, gives_up
 
 from urlab_client.aio import URLabClient
@@ -96,10 +97,10 @@ UNMIRRORED = {
 CASES = [
     (name, dialect, transport, fault)
     for i, name in enumerate(CALLS)
-    for dialect in OPS[name].dialects
+    for beta, dialect in enumerate(OPS[name].dialects)
     for j, transport in enumerate(("zmq", "shm"))
     for k, fault in enumerate(("cancelled", "timed out"))
-    if LONG or (i + j + k + (dialect == "beta")) % 2
+    if LONG or ((i + beta) % 2 == j and (i // 2 + beta) % 2 == k)
 ]
 
 
@@ -179,7 +180,7 @@ async def test_after_resync_the_client_mirrors_what_is_so(
     servers: dict[str, tuple[SimulatedServer, Faults]], name: str, dialect: str, transport: str, fault: str
 ) -> None:
     server, faults = servers[dialect]
-    options = server.client_options() | {"step_mode": "direct", "transport": transport}
+    options = server.client_options() | {"step_mode": "direct", "transport": transport, "live_pictures": False}
     call, prepare = CALLS[name]
     async with URLabClient(**options) as client:
         await client.discover()
@@ -202,3 +203,4 @@ async def test_after_resync_the_client_mirrors_what_is_so(
             await client.runtime.set_mode("direct")
             await client.replay.stop()
             assert (await client.step(2)).step == client.step_count == found.step + 2
+    rest(server)

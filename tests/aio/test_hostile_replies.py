@@ -256,8 +256,8 @@ def same(first: list[Any], second: list[Any]) -> bool:
     return repr(first) == repr(second)  # NaN is NaN here
 
 
-FUZZ = settings(max_examples=100 * FACTOR)
-FEW = settings(max_examples=40 * FACTOR)
+FUZZ = settings(max_examples=40 * FACTOR)
+FEW = settings(max_examples=20 * FACTOR)
 
 
 def test_a_good_handshake_and_reply_are_taken_over(direct: Session) -> None:

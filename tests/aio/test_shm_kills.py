@@ -19,7 +19,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import URLabError
 
 SUPPORT = Path(__file__).parents[1] / "support"
-KILLS = int(os.environ.get("URLAB_KILLS", "4"))
+KILLS = int(os.environ.get("URLAB_KILLS", "2"))
 STEP_S = 1.0
 
 CLIENT = """

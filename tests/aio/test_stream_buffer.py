@@ -116,7 +116,7 @@ class Buffers(RuleBasedStateMachine):
 
 
 TestBuffers = Buffers.TestCase
-TestBuffers.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestBuffers.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
 def test_a_topic_keeps_its_place_when_a_newer_message_takes_over() -> None:

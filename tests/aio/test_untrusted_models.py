@@ -54,10 +54,18 @@ async def test_it_is_compiled_with_the_files_that_came_with_it(told: Callable[..
         assert client.model_is_approximate
 
 
+async def test_it_reads_no_file_of_this_machine(told: Callable[..., URLabClient], tmp_path: Path) -> None:
+    secret = tmp_path / "secret.obj"
+    secret.write_text(MESH)
+    async with told(f'<mujoco><asset><mesh file="{secret}"/></asset></mujoco>') as client:
+        with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
+            await client.discover()
+        assert client.model is None
+
+
 @pytest.mark.parametrize(
     "xml",
     [
-        '<mujoco><asset><mesh file="{file}"/></asset></mujoco>',
         '<mujoco><compiler meshdir="{folder}"/><asset><mesh file="secret.obj"/></asset></mujoco>',
         '<mujoco><compiler strippath="true" meshdir="{folder}"/><asset><mesh file="x/secret.obj"/></asset></mujoco>',
         '<mujoco><include file="{file}"/></mujoco>',
@@ -65,14 +73,12 @@ async def test_it_is_compiled_with_the_files_that_came_with_it(told: Callable[..
         '<mujoco><asset><texture name="t" type="2d" file="/dev/zero"/></asset></mujoco>',
     ],
 )
-async def test_it_reads_no_file_of_this_machine(told: Callable[..., URLabClient], tmp_path: Path, xml: str) -> None:
+def test_however_it_names_a_file_of_this_machine_it_is_refused(tmp_path: Path, xml: str) -> None:
     secret = tmp_path / "secret.obj"
     secret.write_text(MESH)
     named = xml.format(file=secret, folder=tmp_path, escaped=str(secret).replace("/", "&#47;"))
-    async with told(named) as client:
-        with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
-            await client.discover()
-        assert client.model is None
+    with pytest.raises(ValueError, match="a file of this machine"):
+        compilation._refuse_local_files(named, {})
 
 
 INCLUDING = '<mujoco><include file="sub/part.xml"/></mujoco>'
@@ -132,10 +138,9 @@ def test_what_its_names_hide_from_the_client_cannot_be_opened(tmp_path: Path, xm
     assert done.stdout.startswith(b"-")
 
 
-async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient]) -> None:
-    async with told('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>') as client:
-        with pytest.raises(ProtocolError, match="document type"):
-            await client.discover()
+def test_it_may_not_hide_names_in_entities() -> None:
+    with pytest.raises(ValueError, match="document type"):
+        compilation._refuse_local_files('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>', {})
 
 
 @pytest.mark.parametrize("xml", [HUGE, ENDLESS], ids=["huge", "endless"])

@@ -18,7 +18,7 @@ MODELS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 
 @pytest.mark.parametrize("model", MODELS)
 async def test_physics_is_bitwise_what_mj_step_gives(connect: Any, serve: Any, asset: Any, model: str) -> None:
-    steps = 1000 if model == "humanoid.xml" else 200
+    steps = 300 if model == "humanoid.xml" else 100
     with serve(asset(model), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()

@@ -167,8 +167,7 @@ async def test_time_passes_without_a_local_model(connect: Any, server: Any) -> N
     assert client.sim_time == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("local_model", [True, False])
-@pytest.mark.parametrize("mode", ["direct", "live"])
+@pytest.mark.parametrize(("mode", "local_model"), [("direct", True), ("direct", False), ("live", True)])
 async def test_time_that_passed_before_a_client_came_does_not_count(
     connect: Any, server: Any, mode: str, local_model: bool
 ) -> None:

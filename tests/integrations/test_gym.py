@@ -69,8 +69,12 @@ def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, options: dict[str, 
     "task_id",
     [pytest.param(task, marks=[pytest.mark.long] if number else []) for number, task in enumerate(sorted(TASKS))],
 )
-def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str) -> None:
-    env = gymnasium.make(task_id, render_mode="rgb_array")
+def test_a_registered_task_passes_the_checker_and_closes_its_server(
+    task_id: str, serving: Callable[..., str], request: pytest.FixtureRequest
+) -> None:
+    # The checker makes the environment again and again, each time with a server; the other tasks' are programs.
+    at = {} if request.node.get_closest_marker("long") else {"address": serving("arm", step_mode="auto")}
+    env = gymnasium.make(task_id, render_mode="rgb_array", **at)
     with without_advice():
         check_env(env.unwrapped)
     env.close()
@@ -87,8 +91,9 @@ def test_a_registered_tasks_specification_can_be_stored_and_made_again(task_id: 
     assert callable(load_env_creator(str(stored.vector_entry_point)))
 
 
-def test_gymnasium_decides_how_long_the_episodes_of_a_registered_task_are() -> None:
-    for given, steps in (({}, 100), ({"max_episode_steps": 102}, 102)):
+def test_gymnasium_decides_how_long_the_episodes_of_a_registered_task_are(serving: Callable[..., str]) -> None:
+    at = serving("arm")
+    for given, steps in (({"address": at}, 100), ({"address": at, "max_episode_steps": 102}, 102)):
         with closing(gymnasium.make("urlab/Reach-v0", **given)) as env:
             env.reset(seed=0)
             ends = [env.step(np.zeros(7, dtype=np.float32))[2:4] for _ in range(steps)]

@@ -30,7 +30,7 @@ from urlab_client.integrations.policy import (
 from urlab_client.protocol.enums import StepMode
 from urlab_client.server import ControllerConfig, SimulatedServer
 
-QUADRUPED = "sim://quadruped?controller=quadruped=pd"
+PD = {"quadruped": ControllerConfig()}
 
 WALK = """
 robot = "quadruped"
@@ -90,15 +90,15 @@ def policy_of(text: str, outputs: Callable[[Any], Any] | None = None) -> Policy:
 
 
 @pytest.fixture(scope="module")
-def quadruped() -> Iterator[URLabClient]:
-    with URLabClient(QUADRUPED, step_mode="direct") as client:
+def quadruped(serving: Callable[..., str]) -> Iterator[URLabClient]:
+    with URLabClient(serving("quadruped", controllers=PD), step_mode="direct") as client:
         client.discover()
         yield client
 
 
 @pytest.fixture(scope="module")
-def arm() -> Iterator[URLabClient]:
-    with URLabClient("sim://arm", step_mode="direct") as client:
+def arm(serving: Callable[..., str]) -> Iterator[URLabClient]:
+    with URLabClient(serving("arm"), step_mode="direct") as client:
         client.discover()
         yield client
 
@@ -285,10 +285,12 @@ def test_stepping_by_hand_is_the_same(quadruped: URLabClient) -> None:
     assert ends[0][0] != 0.0
 
 
-def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(quadruped: URLabClient) -> None:
+def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(
+    quadruped: URLabClient, serving: Callable[..., str]
+) -> None:
     wave = [np.array([np.sin(n), np.cos(2 * n)]) for n in range(20)]
     ends = []
-    with URLabClient("sim://quadruped", step_mode="direct") as bare:
+    with URLabClient(serving("quadruped"), step_mode="direct") as bare:
         bare.discover()
         for client, text in (
             (quadruped, WALK),
@@ -452,7 +454,7 @@ def test_a_fall_is_counted_and_the_robot_starts_again(quadruped: URLabClient) ->
 @pytest.mark.long
 async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     times: list[float] = []
-    async with aio.URLabClient(QUADRUPED, step_mode="live") as client:
+    async with aio.URLabClient("sim://quadruped?controller=quadruped=pd", step_mode="live") as client:
         await client.discover()
         assert require(client, policy_of(WALK)) is client.articulations["quadruped"]
         policy = policy_of(WALK, lambda _: np.array([0.8, 0.8]))

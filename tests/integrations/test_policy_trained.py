@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,11 +16,12 @@ import pytest
 from urlab_client import URLabClient
 from urlab_client.cli import main as urlab
 from urlab_client.integrations.policy import OnnxNetwork, PolicyFileError, load, run_blocking
+from urlab_client.server import ControllerConfig
 
 ROOT = Path(__file__).parents[2]
 NETWORK = ROOT / "examples/policies/quadruped.onnx"
-QUADRUPED = "sim://quadruped?controller=quadruped=pd"
 SECONDS = 4.0
+PD = {"quadruped": ControllerConfig()}
 
 
 def run_policy(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
@@ -46,11 +48,11 @@ def test_the_trained_network_walks_where_zero_and_random_outputs_do_not(capsys: 
 
 
 @pytest.mark.parametrize(("yaw_rate", "vx"), [(0.4, 0.3), (-0.4, 0.3), (0.0, 0.0)])
-def test_the_trained_network_does_what_it_is_told(yaw_rate: float, vx: float) -> None:
+def test_the_trained_network_does_what_it_is_told(yaw_rate: float, vx: float, serving: Callable[..., str]) -> None:
     policy = load(NETWORK)
     policy.command = [vx, 0.0, yaw_rate]
     headings: list[float] = []
-    with URLabClient(QUADRUPED, step_mode="direct") as client:
+    with URLabClient(serving("quadruped", controllers=PD), step_mode="direct") as client:
         client.discover()
         robot = client.articulations["quadruped"]
 
@@ -81,12 +83,15 @@ def test_the_figures_beside_the_network_are_true(capsys: pytest.CaptureFixture[s
     assert curve[-1] > curve[0] + 0.3
 
 
-def test_another_robot_or_another_size_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert urlab(["run-policy", str(NETWORK), "sim://quadruped"]) == 2
+def test_another_robot_or_another_size_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, serving: Callable[..., str]
+) -> None:
+    assert urlab(["run-policy", str(NETWORK), serving("quadruped")]) == 2
     said = capsys.readouterr().err
     assert said.startswith("urlab run-policy: ")
     assert "requires a PD controller. Serve it with --controller quadruped=pd" in said
-    assert urlab(["run-policy", str(NETWORK), "--step-mode", "live", "--command", "9", "0", "0"]) == 2
+    live = ["--step-mode", "live", "--command", "9", "0", "0"]
+    assert urlab(["run-policy", str(NETWORK), serving("quadruped", controllers=PD, step_mode="auto"), *live]) == 2
     assert "--command: a command must be vx, vy, yaw rate from" in capsys.readouterr().err
 
     declaration = tmp_path / "smaller.toml"

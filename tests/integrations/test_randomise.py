@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -292,12 +293,14 @@ def test_an_episode_ends_with_what_was_seen_and_leaves_nothing_to_the_next(made:
             assert np.array_equal(final, last), "the last observation as the agent sees it, noise and delay included"
 
 
-def test_what_varied_is_recorded_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_varied_is_recorded_and_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], serving: Callable[..., str]
+) -> None:
     file = tmp_path / "arm.toml"
     file.write_text(
         '[[vary]]\nwhat = "mass"\non = "arm/hand"\nscale = [0.5, 2.0]\n[[noise]]\nfield = "qpos"\nbias = 1.0\n'
     )
-    env = URLabEnv.connect("sim://arm", task=Reach(), randomise=file)
+    env = URLabEnv.connect(serving("arm", randomise=file), task=Reach())
     drawn: list[Any] = []
     with record(env.client, tmp_path / "run.mcap"):
         for seed in (1, 2):

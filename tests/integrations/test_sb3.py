@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.machinery
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
 
@@ -49,11 +49,12 @@ def adapter(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     sys.modules.pop(NAME, None)
 
 
-def batch(**options: Any) -> URLabBatchEnv:
-    return URLabBatchEnv(Reach.scene_address, 3, task=Reach(), max_episode_steps=2, **options)
+@pytest.fixture
+def batch(serving: Callable[..., str]) -> Callable[..., URLabBatchEnv]:
+    return lambda **options: URLabBatchEnv(serving("arm"), 3, task=Reach(), max_episode_steps=2, **options)
 
 
-def test_episodes_end_as_the_library_expects_it(adapter: Any) -> None:
+def test_episodes_end_as_the_library_expects_it(adapter: Any, batch: Callable[..., URLabBatchEnv]) -> None:
     ours, plain = (batch(autoreset_mode=mode) for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
     envs = adapter.Sb3VecEnv(ours)
     envs.seed(4)
@@ -79,7 +80,7 @@ def test_episodes_end_as_the_library_expects_it(adapter: Any) -> None:
     plain.close()
 
 
-def test_what_the_adapter_cannot_do_is_said(adapter: Any) -> None:
+def test_what_the_adapter_cannot_do_is_said(adapter: Any, batch: Callable[..., URLabBatchEnv]) -> None:
     with pytest.raises(ValueError, match=r"autoreset_mode=AutoresetMode\.SAME_STEP, not NEXT_STEP"):
         adapter.Sb3VecEnv(batch())
     envs = adapter.Sb3VecEnv(batch(autoreset_mode=AutoresetMode.SAME_STEP))

@@ -16,17 +16,19 @@ from gymnasium.vector import AutoresetMode
 
 import urlab_client
 from urlab_client.aio.launch import LaunchedTransport
+from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
 from urlab_client.protocol.errors import BadValue
-from urlab_client.server import Cut, Drop, Faults, Refuse, SimulatedServer
+from urlab_client.server import ControllerConfig, Cut, Drop, Faults, Refuse, SimulatedServer
 
 Make = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
 def servers() -> Iterator[list[str]]:
-    """Addresses of two servers."""
-    with SimulatedServer("arm", play=True) as one, SimulatedServer("arm", play=True) as two:
+    """Addresses of two servers, which do not go on in live mode after their clients have closed."""
+    options: Any = {"play": True, "step_mode": "direct"}
+    with SimulatedServer("arm", **options) as one, SimulatedServer("arm", **options) as two:
         yield [f"{server.address}:{server.step_port}" for server in (one, two)]
 
 
@@ -42,7 +44,9 @@ def first_server(env: URLabVectorEnv) -> int:
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_servers_and_batch_agree_bit_for_bit(servers: list[str], made: list[Any], mode: AutoresetMode) -> None:
+def test_servers_and_batch_agree_bit_for_bit(
+    serving: Make, servers: list[str], made: list[Any], mode: AutoresetMode
+) -> None:
     def reward(before: Any, action: Any, after: Any, info: Any) -> Any:
         return after[..., 0] - before[..., 0]
 
@@ -54,7 +58,7 @@ def test_servers_and_batch_agree_bit_for_bit(servers: list[str], made: list[Any]
         "reward_fn": reward,
         "termination_fn": lambda after, info: after[..., 1] > 0.08,
     }
-    wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv("sim://arm", 2, **options)
+    wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv(serving("arm"), 2, **options)
     made += [wire, batch]
     assert np.array_equal(wire.reset(seed=11)[0], batch.reset(seed=11)[0])
     ends = 0
@@ -75,10 +79,10 @@ def test_servers_and_batch_agree_bit_for_bit(servers: list[str], made: list[Any]
     assert ends >= 2
 
 
-def test_a_reset_by_itself_and_one_by_hand_tell_the_same_episodes(made: list[Any]) -> None:
+def test_a_reset_by_itself_and_one_by_hand_tell_the_same_episodes(serving: Make, made: list[Any]) -> None:
     options: Any = {"n_substeps": 3, "reset_noise": 0.1, "max_episode_steps": 3}
     same, by_hand = (
-        URLabBatchEnv("sim://arm", 2, autoreset_mode=mode, **options)
+        URLabBatchEnv(serving("arm"), 2, autoreset_mode=mode, **options)
         for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
     )
     made += [same, by_hand]
@@ -113,8 +117,10 @@ def test_environment_i_equals_a_single_one_with_its_seed(servers: list[str], mad
     assert np.array_equal(observations[1], alone)
 
 
-def test_a_killed_server_is_reported_by_index_and_replaced_while_the_others_go_on(made: list[Any]) -> None:
-    env = URLabVectorEnv("sim://arm", 2, reset_noise=0.1)
+def test_a_killed_server_is_reported_by_index_and_replaced_while_the_others_go_on(
+    servers: list[str], made: list[Any]
+) -> None:
+    env = URLabVectorEnv(["sim://arm", servers[1]], reset_noise=0.1)
     made.append(env)
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape, dtype=np.float32)
@@ -253,10 +259,10 @@ def test_no_more_servers_start_at_once_than_there_are_processors(
 
     monkeypatch.setattr(LaunchedTransport, "_launch", counted)
     monkeypatch.setattr("urlab_client.integrations.gym.vector._processors", lambda: 1)
-    env = URLabVectorEnv("sim://ball", 3, start_timeout=120.0)
+    env = URLabVectorEnv("sim://ball", 2, start_timeout=120.0)
     made.append(env)
     assert most == 1
-    assert env.reset()[0].shape[0] == 3
+    assert env.reset()[0].shape[0] == 2
 
 
 @pytest.mark.parametrize("n", [pytest.param(16, marks=pytest.mark.long), pytest.param(64, marks=pytest.mark.matrix)])
@@ -273,9 +279,9 @@ def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:
         URLabVectorEnv([servers[0], "sim://no-such-robot"])
 
 
-def test_environments_with_other_spaces_are_refused(servers: list[str]) -> None:
+def test_environments_with_other_spaces_are_refused(servers: list[str], serving: Make) -> None:
     with pytest.raises(ValueError, match=r"environment 1 .* has different spaces"):
-        URLabVectorEnv([servers[0], "sim://quadruped"])
+        URLabVectorEnv([servers[0], serving("ball")])
 
 
 @pytest.mark.parametrize(
@@ -310,8 +316,8 @@ def test_older_releases_of_mujoco_step_a_batch_with_the_same_results(
             assert np.array_equal(ours, theirs)
 
 
-def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
-    env = URLabBatchEnv("sim://arm", 3)
+def test_resets_refuse_masks_and_seeds_that_do_not_fit(serving: Make, made: list[Any]) -> None:
+    env = URLabBatchEnv(serving("arm"), 3)
     made.append(env)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros((3, 7)))
@@ -331,11 +337,15 @@ def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["sim://quadruped?controller=quadruped=pd,kp=60,kv=2", "sim://arm?controller=arm=passthrough"]
+    ("robot", "config"),
+    [("quadruped", ControllerConfig(kp=60.0, kv=2.0)), ("arm", ControllerConfig(ControllerKind.PASSTHROUGH))],
 )
-def test_controllers_act_in_a_batch_as_on_a_server(address: str, made: list[Any]) -> None:
-    wire = URLabVectorEnv(address, 1, n_substeps=4)
+def test_controllers_act_in_a_batch_as_on_a_server(
+    robot: str, config: ControllerConfig, serving: Make, made: list[Any]
+) -> None:
+    address = serving(robot, controllers={robot: config})
     batch = URLabBatchEnv(address, 3, n_substeps=4)
+    wire = URLabVectorEnv([address], n_substeps=4)
     made += [wire, batch]
     expected, ours = wire.reset(seed=0)[0], batch.reset(seed=0)[0]
     for n in range(20):
@@ -346,7 +356,7 @@ def test_controllers_act_in_a_batch_as_on_a_server(address: str, made: list[Any]
     assert not np.array_equal(ours[0], ours[1])
 
 
-@pytest.mark.parametrize("task_id", ["urlab/Arm-v0", "urlab/Quadruped-v0"])
+@pytest.mark.parametrize("task_id", ["urlab/Quadruped-v0", pytest.param("urlab/Arm-v0", marks=pytest.mark.long)])
 def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made: list[Any]) -> None:
     wire = gymnasium.make_vec(task_id, num_envs=1)
     batch = gymnasium.make_vec(task_id, num_envs=1, backend="batch")

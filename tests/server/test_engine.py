@@ -231,7 +231,7 @@ def test_live_keeps_the_wanted_speed_whatever_sleep_and_step_take(costs: tuple[f
         sim = PacedSim(patch, FakeClock(overshoot=overshoot, step_cost=step_cost))
         sim.engine.set_sim_speed(speed)
         sim.run(1.0)
-        assert sim.run(8.0) == pytest.approx(speed / 100.0, rel=0.01)
+        assert sim.run(4.0) == pytest.approx(speed / 100.0, rel=0.01)
 
 
 @given(st.floats(0.03, 5.0))
@@ -342,7 +342,7 @@ def test_direct_is_bitwise_what_mj_step_gives(
         sim.engine.on_substep.append(lambda: None)
     local = fresh(sim.model)
     rng = np.random.default_rng(7)
-    for _ in range(1000 // n_steps):
+    for _ in range(300 // n_steps):
         ctrl = rng.uniform(-1.0, 1.0, sim.model.nu)
         sim.command("robot", n_steps, ctrl=ctrl.tolist())
         local.ctrl[:] = ctrl.astype(np.float32)

@@ -37,10 +37,10 @@ from urlab_client.server import ControllerConfig, Limits, SimulatedServer
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
 
-FRAMES = 5_000 * FACTOR
+FRAMES = 2_000 * FACTOR
 """For each direction of the codec."""
 
-LIVE_FRAMES = 1_000 * FACTOR
+LIVE_FRAMES = 400 * FACTOR
 
 # What a frame may do to a server is bounded, so that none takes seconds.
 LIMITS = Limits(n_steps=50, actors=60, grid_cells=20)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import importlib
 import logging
 import math
 import sys
@@ -405,3 +406,18 @@ def test_contexts_are_made_and_freed_one_at_a_time(monkeypatch: pytest.MonkeyPat
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         list(pool.map(one, range(2)))
     assert met == []
+
+
+def test_the_next_play_session_draws_with_the_context_of_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new one compiles its shaders, which takes ten times as long as a picture without a graphics card."""
+    backend = find_backend()
+    assert backend is not None
+    module = importlib.import_module(f"mujoco.{backend.name}")
+    made: list[Any] = []
+    monkeypatch.setattr(module, "GLContext", lambda *size, make=module.GLContext: made.append(make(*size)) or made[-1])
+    pictures: list[bytes] = []
+    for name in ("arm", "quadruped", "arm"):
+        with SimulatedServer(name, play=True) as server:
+            pictures.append(server.snapshot((64, 48)).tobytes())
+    assert pictures[0] == pictures[2] != pictures[1]
+    assert len(made) <= 1 if backend.name == "egl" else len(made) == 3

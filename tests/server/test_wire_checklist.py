@@ -1081,7 +1081,7 @@ def test_physics_is_bitwise_that_of_mujoco(serve: Serve, tmp_path: Path) -> None
     wire.ask("set_mode", mode="direct")
     assert bot_state(wire.ask("reset"), key) == (data.qpos.tolist(), data.qvel.tolist())
     mujoco.mj_forward(model, data)
-    controls = np.random.default_rng(7).uniform(-0.4, 0.4, (1000, model.nu))
+    controls = np.random.default_rng(7).uniform(-0.4, 0.4, (300, model.nu))
     for k, ctrl in enumerate(controls):
         reply = wire.ask("step", per_articulation={key: {"ctrl": ctrl.tolist()}})
         data.ctrl[:] = ctrl.astype(np.float32)

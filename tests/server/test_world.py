@@ -579,10 +579,6 @@ def test_a_grid_has_limits(ball: str, world: EditorWorld, counts: tuple[int, int
     assert refusal(world.spawn_grid, ball, "g", *counts).code == code
 
 
-def test_the_largest_grid_fits(ball: str, world: EditorWorld) -> None:
-    assert len(world.spawn_grid(ball, "g", 32, 32)) == 1024
-
-
 def test_lights_are_added_each_time(world: EditorWorld) -> None:
     first = world.spawn_light("SPOT", "lamp", location=(1, 2, 3), rotation_euler=(1, -30, 45), color=(0.1, 0.2, 0.3))
     second = world.spawn_light("spot", "lamp")

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from functools import cache
-from inspect import get_annotations
-from types import MappingProxyType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
-
-import msgspec
-from msgspec import Struct
+from types import MappingProxyType
 
 from urlab_client.protocol import errors
 from urlab_client.protocol.base import DialectName, Op
@@ -65,42 +59,12 @@ def _check(op: Op) -> None:
     for struct in (op.request, op.reply):
         if "__doc__" not in struct.__dict__ or not struct.__doc__:
             raise TypeError(f"{struct.__name__}: no docstring")
-        if name := next(filter(None, map(_undescribed, struct.__mro__)), ""):
-            raise TypeError(f"{struct.__name__}.{name}: no description")
     unknown = [code for code in op.errors if code not in errors.RPC_ERRORS]
     if unknown:
         raise TypeError(f"{op.name}: undeclared error codes {unknown}")
     wrong = [name for name in op.undeclared if name not in op.required]
     if wrong:
         raise TypeError(f"{op.name}: {wrong} are not required fields")
-
-
-@cache
-def _undescribed(declaring: type) -> str:
-    """Return a field that a class declares without a description, or nothing."""
-    if not issubclass(declaring, Struct):
-        return ""
-    # Only what the text does not tell: evaluating every annotation would take a tenth of the package's import time.
-    names = vars(sys.modules[declaring.__module__])
-    unclear = {
-        name
-        for name, annotation in get_annotations(declaring).items()
-        if not (
-            isinstance(annotation, str)
-            and (
-                (annotation.startswith("Annotated[") and "doc(" in annotation)
-                or any(_described(names.get(part)) for part in annotation.split(" | "))
-            )
-        )
-    }
-    fields = msgspec.structs.fields(declaring) if unclear else ()
-    return next((field.name for field in fields if field.name in unclear and not _described(field.type)), "")
-
-
-def _described(annotation: Any) -> bool:
-    if get_origin(annotation) is Annotated:
-        return any(isinstance(extra, msgspec.Meta) for extra in get_args(annotation)[1:])
-    return get_origin(annotation) in {Union, UnionType} and any(map(_described, get_args(annotation)))
 
 
 OPS: Mapping[str, Op] = registry(

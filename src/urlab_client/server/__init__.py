@@ -1,19 +1,57 @@
 """A URLab server without Unreal: the plugin's protocol in front of real MuJoCo.
 
-For tests, demonstrations and offline work; `urlab serve` runs the same server from the command line. Importing this
-package imports MuJoCo.
+For tests, demonstrations and offline work; `urlab serve` runs the same server from the command line. Names are
+loaded on first access, with MuJoCo.
 """
 
-from urlab_client.server.assets.bundled_robots import bundled_models
-from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
-from urlab_client.server.initial_level import ModelError
-from urlab_client.server.limits import Limits
-from urlab_client.server.physics.controllers import ControllerConfig
-from urlab_client.server.render.opengl import RenderingUnavailable
-from urlab_client.server.rpc.served_request import ServedRequest
-from urlab_client.server.simulated import SimulatedServer
-from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
-from urlab_client.server.transport.endpoint import PortInUse
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from urlab_client.server.assets.bundled_robots import bundled_models
+    from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
+    from urlab_client.server.initial_level import ModelError
+    from urlab_client.server.limits import Limits
+    from urlab_client.server.physics.controllers import ControllerConfig
+    from urlab_client.server.render.opengl import RenderingUnavailable
+    from urlab_client.server.rpc.served_request import ServedRequest
+    from urlab_client.server.simulated import SimulatedServer
+    from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
+    from urlab_client.server.transport.endpoint import PortInUse
+
+_HOMES = {
+    "bundled_models": "urlab_client.server.assets.bundled_robots",
+    "ActiveFault": "urlab_client.server.faults",
+    "Corrupt": "urlab_client.server.faults",
+    "Cut": "urlab_client.server.faults",
+    "Delay": "urlab_client.server.faults",
+    "Drop": "urlab_client.server.faults",
+    "Fault": "urlab_client.server.faults",
+    "Faults": "urlab_client.server.faults",
+    "Refuse": "urlab_client.server.faults",
+    "ModelError": "urlab_client.server.initial_level",
+    "Limits": "urlab_client.server.limits",
+    "ControllerConfig": "urlab_client.server.physics.controllers",
+    "RenderingUnavailable": "urlab_client.server.render.opengl",
+    "ServedRequest": "urlab_client.server.rpc.served_request",
+    "SimulatedServer": "urlab_client.server.simulated",
+    "CurveServer": "urlab_client.server.transport.curve_authentication",
+    "UnprotectedServer": "urlab_client.server.transport.curve_authentication",
+    "PortInUse": "urlab_client.server.transport.endpoint",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is asked for: a process that only compiles models starts sooner without the rest."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 __all__ = [
     "ActiveFault",

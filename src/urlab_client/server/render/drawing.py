@@ -91,7 +91,7 @@ class Stage:
     ) -> None:
         with contextlib.suppress(Exception):  # a driver that is in trouble is so here, too
             self._renderer.free()
-            free_context(self._gl)
+            free_context(self._gl, sound=kind is None)
 
     def prepare(self, data: mujoco.MjData) -> None:
         """Bring what is drawn up to the state: after a step it is that of the step's beginning."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import logging
 import os
@@ -115,24 +116,54 @@ def need_backend() -> Backend:
 
 
 def make_context(backend: Backend, width: int, height: int) -> Any:
-    """Return a new context of a size in pixels, current in this thread.
+    """Return a context of a size in pixels, current in this thread.
 
     GLFW, which makes them on Windows, has one state for all threads: two that make or free contexts at the same time
     crash.
     """
     with _contexts:
-        context = importlib.import_module(f"mujoco.{backend.name}").GLContext(width, height)
+        idle = _idle.get(os.getpid(), []) if backend.name == _REUSED else []
+        module = importlib.import_module(f"mujoco.{backend.name}")
+        context = idle.pop() if idle else module.GLContext(width, height)
         context.make_current()
     return context
 
 
-def free_context(context: Any) -> None:
-    """Free a context, in the thread that made it."""
-    with _contexts:
-        context.free()
+def free_context(context: Any, *, sound: bool = False) -> None:
+    """Free a context, in the thread that uses it.
 
+    Args:
+        context: The context.
+        sound: Whether the next one to make a context may have this one instead, in which the driver has compiled its
+            shaders: with software rendering that takes ten times as long as a picture.
+    """
+    with _contexts:
+        idle = _idle.setdefault(os.getpid(), [])  # those of a process are not its forks'
+        if sound and type(context).__module__ == f"mujoco.{_REUSED}" and len(idle) < _MOST_IDLE:
+            egl = importlib.import_module("OpenGL.EGL")
+            display = importlib.import_module(f"mujoco.{_REUSED}").EGL_DISPLAY
+            egl.eglMakeCurrent(display, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+            egl.eglReleaseThread()
+            idle.append(context)
+            atexit.unregister(_free_idle)
+            atexit.register(_free_idle)  # after the driver's own hook, so before it at the end
+        else:
+            context.free()
+
+
+def _free_idle() -> None:
+    with _contexts:
+        for context in _idle.pop(os.getpid(), ()):
+            context.free()
+
+
+_REUSED: Final = "egl"
+"""The backend whose contexts have no size and may change threads."""
+
+_MOST_IDLE: Final = 2
 
 _contexts = threading.Lock()
+_idle: dict[int, list[Any]] = {}
 
 
 def search_backend() -> Backend | str:
