@@ -29,6 +29,17 @@ HEADER = '''\
 """Methods of the namespaces that follow from the ops' declarations."""
 '''
 
+# Docstrings of the namespaces that have no method written by hand, and so need no module of their own.
+WHOLE = {
+    "debug": """Debug drawing in the editor and during play; during play it draws into the play world.
+
+    Positions are metres in MuJoCo's world frame, colours (r, g, b) in [0, 1]. `ttl` is in seconds: 0 shows a marker for
+    a single frame, a negative value until `clear_markers`.
+    """,
+    "farm": """Sharing servers among clients. Servers of the alpha do not support it.""",
+    "viewport": """The editor's perspective viewport. The play window has its own camera.""",
+}
+
 # Vector type of a message struct -> the function that makes it of any iterable of numbers.
 VECTORS = {
     **dict.fromkeys(("Vec3", "Location", "EulerDeg", "Color", "Point"), "as_vec3"),
@@ -193,11 +204,11 @@ def render() -> dict[Path, str]:
 
 
 def groups_text(groups: dict[str, list[str]]) -> list[str]:
-    names = [f"{ns.capitalize()}Ops" for ns in groups]
-    lines = [f"__all__ = {sorted(names)!r}\n"]
+    names = {ns: f"{ns.capitalize()}{'Namespace' if ns in WHOLE else 'Ops'}" for ns in groups}
+    lines = [f"__all__ = {sorted(names.values())!r}\n"]
     for ns, methods in groups.items():
-        lines.append(f"class {ns.capitalize()}Ops(Namespace):")
-        lines.append(f'    """Generated part of `client.{ns}`."""\n')
+        lines.append(f"class {names[ns]}(Namespace):")
+        lines.append(f'    """{WHOLE.get(ns, f"Generated part of `client.{ns}`.")}"""\n')
         lines += [textwrap.indent(text, "    ") + "\n" for text in methods]
     return lines
 

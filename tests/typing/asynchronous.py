@@ -40,13 +40,12 @@ from urlab_client.aio import (
     URLabEntity,
     URLabPDController,
 )
-from urlab_client.aio.namespaces.debug import DebugNamespace
+from urlab_client.aio.namespaces._ops import DebugNamespace, ViewportNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
 from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.streams import Stream
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk

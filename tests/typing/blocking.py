@@ -42,13 +42,12 @@ from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
 from urlab_client.protocol.names import NameMap
-from urlab_client.sync.namespaces.debug import DebugNamespace
+from urlab_client.sync.namespaces._ops import DebugNamespace, ViewportNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
 from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.sync.namespaces.runtime import RuntimeNamespace
 from urlab_client.sync.namespaces.scene import SceneNamespace
 from urlab_client.sync.namespaces.sim import SimNamespace
-from urlab_client.sync.namespaces.viewport import ViewportNamespace
 from urlab_client.sync.streams import Stream
 
 Floats = NDArray[np.float64]

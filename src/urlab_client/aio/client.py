@@ -21,14 +21,12 @@ from urlab_client.aio.explain import diagnose
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.motion import Motion
-from urlab_client.aio.namespaces.debug import DebugNamespace
-from urlab_client.aio.namespaces.farm import FarmNamespace
+from urlab_client.aio.namespaces._ops import DebugNamespace, FarmNamespace, ViewportNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
 from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.state.capturing import Capturing

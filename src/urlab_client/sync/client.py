@@ -21,14 +21,12 @@ from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, Ro
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
-from urlab_client.sync.namespaces.debug import DebugNamespace
-from urlab_client.sync.namespaces.farm import FarmNamespace
+from urlab_client.sync.namespaces._ops import DebugNamespace, FarmNamespace, ViewportNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
 from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.sync.namespaces.runtime import RuntimeNamespace
 from urlab_client.sync.namespaces.scene import SceneNamespace
 from urlab_client.sync.namespaces.sim import SimNamespace
-from urlab_client.sync.namespaces.viewport import ViewportNamespace
 from urlab_client.sync.streams import Stream
 
 __all__ = ["URLabClient"]

@@ -53,7 +53,7 @@ from urlab_client.protocol.messages.viewport import (
 from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
 from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
 
-__all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
+__all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportNamespace"]
 
 
 class RuntimeOps(Namespace):
@@ -424,8 +424,12 @@ class OutlinerOps(Namespace):
         await self._call(RemoveQuickConvert(target=target, target_by=target_by(by_name)), timeout)
 
 
-class DebugOps(Namespace):
-    """Generated part of `client.debug`."""
+class DebugNamespace(Namespace):
+    """Debug drawing in the editor and during play; during play it draws into the play world.
+
+    Positions are metres in MuJoCo's world frame, colours (r, g, b) in [0, 1]. `ttl` is in seconds: 0 shows a marker for
+    a single frame, a negative value until `clear_markers`.
+    """
 
     async def draw_marker(
         self,
@@ -640,8 +644,8 @@ class DebugOps(Namespace):
         await self._call(SetOverlayText(text=text, anchor=anchor), timeout)
 
 
-class ViewportOps(Namespace):
-    """Generated part of `client.viewport`."""
+class ViewportNamespace(Namespace):
+    """The editor's perspective viewport. The play window has its own camera."""
 
     async def set_camera(
         self,
@@ -761,8 +765,8 @@ class ViewportOps(Namespace):
         return (await self._call(Untrack(), timeout)).was_tracking
 
 
-class FarmOps(Namespace):
-    """Generated part of `client.farm`."""
+class FarmNamespace(Namespace):
+    """Sharing servers among clients. Servers of the alpha do not support it."""
 
     async def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
         """Acquire the server's only driver lease and return its id.

@@ -11,7 +11,7 @@ from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, B
 from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
 from urlab_client.sync._facade import Facade
 
-__all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
+__all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportNamespace"]
 
 
 class RuntimeOps(Facade, twin=aio.RuntimeOps):
@@ -379,11 +379,15 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
         self._portal.call(self._aio.remove_quick_convert, target, by_name=by_name, timeout=timeout)
 
 
-class DebugOps(Facade, twin=aio.DebugOps):
-    """Generated part of `client.debug`."""
+class DebugNamespace(Facade, twin=aio.DebugNamespace):
+    """Debug drawing in the editor and during play; during play it draws into the play world.
+
+    Positions are metres in MuJoCo's world frame, colours (r, g, b) in [0, 1]. `ttl` is in seconds: 0 shows a marker for
+    a single frame, a negative value until `clear_markers`.
+    """
 
     __slots__ = ()
-    _aio: aio.DebugOps
+    _aio: aio.DebugNamespace
 
     def draw_marker(
         self,
@@ -580,11 +584,11 @@ class DebugOps(Facade, twin=aio.DebugOps):
         self._portal.call(self._aio.set_overlay_text, text, anchor=anchor, timeout=timeout)
 
 
-class ViewportOps(Facade, twin=aio.ViewportOps):
-    """Generated part of `client.viewport`."""
+class ViewportNamespace(Facade, twin=aio.ViewportNamespace):
+    """The editor's perspective viewport. The play window has its own camera."""
 
     __slots__ = ()
-    _aio: aio.ViewportOps
+    _aio: aio.ViewportNamespace
 
     def set_camera(
         self,
@@ -695,11 +699,11 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
         return self._portal.call(self._aio.untrack, timeout=timeout)
 
 
-class FarmOps(Facade, twin=aio.FarmOps):
-    """Generated part of `client.farm`."""
+class FarmNamespace(Facade, twin=aio.FarmNamespace):
+    """Sharing servers among clients. Servers of the alpha do not support it."""
 
     __slots__ = ()
-    _aio: aio.FarmOps
+    _aio: aio.FarmNamespace
 
     def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
         """Acquire the server's only driver lease and return its id.
