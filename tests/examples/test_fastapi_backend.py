@@ -91,15 +91,18 @@ async def test_a_restart_of_the_server_is_told_and_survived(monkeypatch: pytest.
         async with served(program.app) as http:
             await program.client.runtime.set_paused(False)
             told: list[str] = []
+            answered = asyncio.Event()
 
             async def listen() -> None:
                 async with http.stream("GET", "/events") as stream:
+                    answered.set()
                     async for line in stream.aiter_lines():
                         told.extend(re.findall("event: (.*)", line))
 
             async with states(http) as browser:
                 before = json.loads(await browser.recv())["time"]
                 listening = asyncio.create_task(listen())
+                await answered.wait()
                 await server.kill()
                 await until(lambda: "lost" in told)
                 assert (await http.post("/robots/arm/move", json={"elbow": 0.4})).status_code in {409, 503}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import gc
 import json
 import os
@@ -121,41 +120,44 @@ class Interpreter:
         )
         there.close()
         self._socket, self._answers = here, here.makefile("rb")
-        self._running = 0
+        self.running = 0
         atexit.register(self.end)
 
     def start(self, order: Mapping[str, Any], streams: list[int]) -> int:
-        """Fork for a program and return its number; what a failed test has left there is ended."""
-        self._end_program()
+        """Fork for a program and return its number."""
         socket.send_fds(self._socket, [b"\n"], streams)
         self._socket.sendall(json.dumps(order).encode() + b"\n")
         answer = self._answers.readline()
         assert answer, self.process.communicate()
-        self._running = int(answer)
-        return self._running
+        self.running = int(answer)
+        return self.running
 
     def ended(self) -> int:
         """Wait for the end of the program and return its exit code."""
-        self._running = 0
+        self.running = 0
         return int(self._answers.readline())
 
-    def _end_program(self) -> None:
-        if self._running:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._running, signal.SIGKILL)
-            self.ended()
-
     def end(self) -> None:
-        """End it, and a program that is left."""
-        self._end_program()
+        """End it, and a program that a failed test has left."""
+        if self.running:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.running, signal.SIGKILL)
+            self.ended()
         self._answers.close()
         self._socket.close()
         self.process.communicate()
 
 
-@functools.cache
+_INTERPRETERS: dict[tuple[str, ...], list[Interpreter]] = {}
+
+
 def _interpreter(flags: tuple[str, ...]) -> Interpreter:
-    return Interpreter(flags)
+    """Return an interpreter that has nothing to wait for."""
+    known = _INTERPRETERS.setdefault(flags, [])
+    free = [one for one in known if not one.running]
+    if not free:
+        known.append(Interpreter(flags))
+    return free[0] if free else known[-1]
 
 
 def forks(control: socket.socket) -> dict[str, Any] | None:

@@ -7,10 +7,12 @@ import contextlib
 import json
 import os
 import signal
-import sys
+import subprocess
 from pathlib import Path
 from typing import Any, Self
 
+from children import DEADLINE_S
+from forked import COMMAND, Program, program
 from ports import free_port
 
 PORTS = ("step", "state", "ctrl", "info", "camera")
@@ -28,7 +30,7 @@ class Served:
         self.address = ""
         self.ports = {name: free_port() for name in PORTS}
         self._memory = ["--no-shm"] if shm_dir is None else [f"--shm-dir={shm_dir}"]
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: Program | subprocess.Popen[str] | None = None
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -39,13 +41,11 @@ class Served:
 
     async def start(self) -> None:
         """Start it, on the ports it had, and wait until it serves."""
-        command = [sys.executable, "-m", "urlab_client", "serve", "arm", "--json", "--until-eof", "--play"]
-        command += [f"--{name}-port={number}" for name, number in self.ports.items()]
-        pipe = asyncio.subprocess.PIPE
-        process = await asyncio.create_subprocess_exec(*command, *self._memory, stdin=pipe, stdout=pipe)
-        self._process = process
+        options = ["--json", "--until-eof", "--play", *self._memory]
+        options += [f"--{name}-port={number}" for name, number in self.ports.items()]
+        self._process = process = await asyncio.to_thread(program, COMMAND, "serve", "arm", *options)
         assert process.stdout is not None
-        ready = json.loads(await process.stdout.readline())
+        ready = json.loads(await asyncio.to_thread(process.stdout.readline))
         self.address = ready["address"]
 
     def send(self, number: signal.Signals) -> None:
@@ -61,11 +61,8 @@ class Served:
         process, self._process = self._process, None
         if process is not None:
             with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
-            assert process.stdin is not None
-            process.stdin.close()
-            process._transport.close()  # type: ignore[attr-defined]  # or its pipes stay until they are collected
+                process.send_signal(signal.SIGKILL)
+            await asyncio.to_thread(lambda: process.communicate(timeout=DEADLINE_S))
 
     def options(self) -> dict[str, Any]:
         """Options of a client of it."""
