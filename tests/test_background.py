@@ -55,7 +55,6 @@ AWAITED = {
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
     "integrations/gym/threaded_batch.py:__init__": "a pool, whose results the caller reads",
     "cli/mcp.py:_serve_stdio": "waits for the task and raises its error",
-    "cli/demo_runs.py:drive_two": "a task group, which raises their errors",
 }
 """Functions that make tasks or threads without the helpers, and who sees their end."""
 

@@ -408,6 +408,7 @@ def test_contexts_are_made_and_freed_one_at_a_time(monkeypatch: pytest.MonkeyPat
     assert met == []
 
 
+@pytest.mark.opengl
 def test_the_next_play_session_draws_with_the_context_of_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """A new one compiles its shaders, which takes ten times as long as a picture without a graphics card."""
     backend = find_backend()
