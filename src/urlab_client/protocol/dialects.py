@@ -1,8 +1,8 @@
-"""What the generations of the plugin say differently, for a server that speaks one of them. No I/O.
+"""The differences between the wire dialects of the plugin, for a server that speaks one of them. No I/O.
 
-Requests, replies and names have one form inside the server, that of `messages`. A `Dialect` is the table of everything
-in which a generation differs from another; whoever needs a difference asks the table by its name, nobody asks for the
-generation itself. Clients do not choose a dialect: they go by `features`.
+Requests, replies and names have one form inside the server, that of `messages`. A `Dialect` is a table of flags and
+functions; code tests the individual flag, never the dialect's name. Clients do not choose a dialect: they follow
+`features`.
 """
 
 from __future__ import annotations

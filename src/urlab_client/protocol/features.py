@@ -1,7 +1,7 @@
-"""What a server can do, as far as its answers show. No I/O.
+"""What a server can do, according to its replies. No I/O.
 
-Generations of the plugin took their features one by one, and version strings lie. So nothing compares versions: what
-`meta`, the handshake and the shape of replies say is turned into `Features` here, and everything else asks those.
+Versions of the plugin gained features gradually, and their version strings are unreliable. So nothing compares
+versions: `Features` is derived from `meta`, the handshake and the shape of replies, and all other code tests its flags.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
     """What a server can do.
 
     Attributes:
-        ops: Ops that it lists; None when it was not asked or has no list, in which case it is taken for an alpha.
-        capabilities: What its instance says it can do; a missing word proves nothing.
+        ops: Ops that it lists; None if it was not asked or has no list, which is treated as an alpha.
+        capabilities: Capabilities that its instance reports; the absence of one proves nothing.
         arts: Whether replies name the robots' states `arts`, as the beta does; None before the first reply.
-        reads_owner: Whether it reads `control_owner`; None before the first claim. Else the session is the owner.
+        reads_owner: Whether it reads `control_owner`, instead of taking the session as the owner; None before the first
+            claim.
     """
 
     ops: frozenset[str] | None = None
@@ -35,30 +36,29 @@ class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
     arts: bool | None = None
     reads_owner: bool | None = None
 
-    # How evidence is taken in. A session that is opened anew keeps what is known: the server is the same until it
-    # says otherwise.
+    # Updates from replies. A new session keeps the features: it is the same server until its replies differ.
 
     def with_ops(self, names: Iterable[str] | None) -> Features:
-        """Return what is known after `meta`, or after a server that does not know it (None)."""
+        """Return the features after a reply to `meta`; None for a server without that op."""
         return replace(self, ops=None if names is None else frozenset(names))
 
     def with_hello(self, hello: HelloOk) -> Features:
-        """Return what is known after a handshake."""
-        # Before play there is no instance, which says nothing.
+        """Return the features after a handshake."""
+        # Before play there is no instance, so nothing follows from that.
         if hello.instance is None:
             return self
         return replace(self, capabilities=frozenset(hello.instance.capabilities))
 
     def with_reply(self, reply: StateReply) -> Features:
-        """Return what is known after a reply that carries state."""
+        """Return the features after a reply that contains state."""
         arts = reply.arts is not None
         return self if arts is self.arts else replace(self, arts=arts)
 
     def with_claim(self, sent: str, reply: ClaimControlOk) -> Features:
-        """Return what is known after a claim in the name of `sent`."""
+        """Return the features after a claim with `sent` as the owner."""
         return replace(self, reads_owner=reply.owner == sent)
 
-    # What the rest of the client asks, some of it for every step: worked out once.
+    # Derived flags. Cached, because some are read in every step.
 
     def offers(self, op: str) -> bool:
         """Whether the server lists an op; a server without a list may have any."""
@@ -79,7 +79,7 @@ class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def remove_op(self) -> Literal["destroy_actor", "remove_actor"]:
-        """What removing an actor is called."""
+        """Name of the op that removes an actor."""
         return "remove_actor" if self._lists("remove_actor") else "destroy_actor"
 
     @cached_property
@@ -88,13 +88,8 @@ class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
         return self._lists("set_camera_streaming")
 
     @cached_property
-    def camera_delay(self) -> bool:
-        """Cameras can be given a latency."""
-        return self._lists("set_camera_delay")
-
-    @cached_property
     def uploads(self) -> bool:
-        """Models can be brought over the wire."""
+        """Models can be uploaded."""
         return self._lists("upload_model_manifest")
 
     @cached_property

@@ -1,7 +1,7 @@
-"""The memory barrier of this processor, for both ends of shared memory.
+"""The processor's memory barrier, for both ends of shared memory.
 
-x86 keeps loads in order and stores in order, which is all that a region needs. On arm64 nothing is promised, and
-CPython has no barrier of its own.
+x86 keeps loads in order and stores in order, which is enough for a region. arm64 guarantees neither, and CPython has no
+barrier of its own.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def processor_fence() -> Fence:
 
 
 def _mutex_fence() -> Fence:
-    """Take and release a mutex nobody else has. Not a formal barrier, as accesses may move inside; good in practice."""
+    """Lock and unlock a private mutex. Not a formal barrier, as accesses may move inside; sufficient in practice."""
     libc = ctypes.CDLL(None)
     mutex = ctypes.create_string_buffer(64)  # zeros are a valid mutex
 

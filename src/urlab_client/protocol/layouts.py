@@ -19,7 +19,7 @@ T = TypeVar("T", bound=np.generic)
 
 
 def damaged(what: str, where: object, problem: str, payload: BytesLike) -> ProtocolError:
-    """Make the error for a message that is not of its layout."""
+    """Return the error for a message that does not match its layout."""
     at = f" on {str(where)!r}" if where else ""
     return ProtocolError(f"{what}{at}: {problem}.", raw=bytes(payload[:256]))
 
@@ -34,14 +34,14 @@ INT32 = Layout("<i")
 
 
 def floats32(values: ArrayLike) -> NDArray[np.float32]:
-    """Return values as they travel."""
-    # A state that blew up beyond float32 travels as infinity, as the plugin's cast does; it must not stop the stream.
+    """Return the values as float32, the wire's type."""
+    # Values beyond float32 become infinite, as with the plugin's cast; they must not stop the stream.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(values, dtype="<f4")
 
 
 def vector(what: str, values: NDArray[T], size: int) -> NDArray[T]:
-    """Return an array that has the shape (size,); raise `ValueError` for any other."""
+    """Return the array if its shape is (size,); otherwise raise `ValueError`."""
     if values.shape != (size,):
         raise ValueError(f"{what} has shape {values.shape}, expected ({size},)")
     return values

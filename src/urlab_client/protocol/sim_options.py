@@ -1,6 +1,6 @@
-"""Which numbers of `mjOption` make sense. For the client, in what it sends and in what it is told, and for the server.
+"""Validation of `mjOption` values, for requests, replies and the server. No I/O.
 
-MuJoCo checks none of them: a timestep of 0 stops time, and one that is not a number spoils the state for good. No I/O.
+MuJoCo checks none of them: a timestep of 0 stops time, and NaN spoils the state for good.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ ITERATIONS: Final = (
     "sdf_iterations",
     "sdf_initpoints",
 )
-"""Options that count how often a solver tries."""
+"""Maximum numbers of a solver's iterations."""
 
 RANGED_OPTIONS: Final = (*_POSITIVE, *_NOT_NEGATIVE, *_VECTORS, *ITERATIONS)
-"""Options that may not have any value of their type."""
+"""Options that are limited to a range."""
 
 _FLOATS: Final = (*_POSITIVE, *_NOT_NEGATIVE, *_VECTORS)
 _INT32: Final = np.iinfo(np.int32)
 
 
 def option_problem(name: str, value: Any) -> str:
-    """Return what is wrong with the value of an option, or nothing; options without a range may have any.
+    """Return what is wrong with the value of an option, or an empty string.
 
     Args:
         name: As in `mjOption`.
@@ -62,16 +62,16 @@ def option_problem(name: str, value: Any) -> str:
 
 
 def in_small_letters(options: SimOptions) -> SimOptions:
-    """Return options with their keywords as the reference and the alpha spell them; the beta replies `RK4` and `CG`."""
+    """Return options with lower-case keywords, as in the reference and the alpha; the beta replies `RK4` and `CG`."""
     words = {name: getattr(options, name) for name in ("integrator", "cone", "solver")}
     return replace(options, **{name: word.lower() for name, word in words.items() if word is not None})
 
 
 def check_sim_options(options: SimOptions) -> None:
-    """Refuse options with which a simulation cannot go on.
+    """Check that a simulation can continue with these options.
 
     Raises:
-        ValueError: Names the option, its value and what it can be.
+        ValueError: A value is out of its range; the message names the option, the value and the range.
     """
     for name in SimOptions.__struct_fields__:
         value = getattr(options, name)
