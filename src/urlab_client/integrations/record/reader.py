@@ -161,14 +161,15 @@ class Run:
         states = [found for one in index.having(_STATES) if (found := index.newest(one.id)) is not None]
         gaps = self._contents(index, GapMessage, _gap)
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
-        began, ended = index.wall_span()
+        ends_of = [(index.first(one), index.newest(one)) for one in index.channels]
+        walls = [end.publish_time for pair in ends_of for end in pair if end is not None]
         return Summary(
             path=self.path,
             complete=index.complete and not self.damage,
             damage=self.damage,
             about=dict(index.metadata.get("urlab", {})),
             duration_s=int(max(ends) - min(ends)) / _NS if ends else 0.0,
-            wall_s=(ended - began) / _NS,
+            wall_s=(max(walls) - min(walls)) / _NS if walls else 0.0,
             episodes=max((_decoded(index, message, _state).episode for message in states), default=-1) + 1,
             dropped_states=sum(gap.states for gap in gaps),
             dropped_frames=sum(gap.frames for gap in gaps),
