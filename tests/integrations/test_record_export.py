@@ -34,7 +34,7 @@ from urlab_client.integrations.record import (
     lerobot_writer,
     read_run,
     record,
-    table_builder,
+    tables,
 )
 from urlab_client.integrations.record.lerobot_process import LeRobot
 from urlab_client.integrations.record.lerobot_writer import _rate
@@ -130,7 +130,7 @@ def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
 @pytest.fixture
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording of a hundred states is read in about fifteen pieces, as one of a night is."""
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 500)
     monkeypatch.setattr(lerobot_writer, "_TOGETHER", 3)
 
 

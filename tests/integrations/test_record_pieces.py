@@ -18,7 +18,7 @@ from made_recordings import Robot, write_recording
 
 from urlab_client._whole_files import replaced
 from urlab_client.cli import main
-from urlab_client.integrations.record import Run, export, read_run, table_builder
+from urlab_client.integrations.record import Run, export, read_run, tables
 from urlab_client.integrations.record.transitions import transition_pieces, transitions_of
 
 
@@ -45,18 +45,21 @@ def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_m
     for end in (size, *range(messages_end - 50, messages_end - 1000, -200)):
         os.truncate(file, end)
         run = read_run(file)
+        monkeypatch.setattr(tables, "PIECE_VALUES", 1 << 21)
         whole, pairs = run.table(), transitions_of(run)
         partial.add(len(whole) < run.summary().topics["/state/arm"].messages)
         assert {"arm/sensors", "late/qpos", "box/pose"} <= whole.columns.keys()
         for values in (1, 150):
-            monkeypatch.setattr(table_builder, "PIECE_VALUES", values)
+            monkeypatch.setattr(tables, "PIECE_VALUES", values)
             with run.stored_table(tmp_path) as stored:
                 assert len(stored) == len(whole)
                 pieces = [*stored.pieces()]
                 assert len(pieces) > 5
                 found = [*transition_pieces(pieces, (), "kept")]
+                joined = run.table().arrays()
                 for name, expected in whole.arrays().items():
                     assert np.concatenate([*stored.parts(name)]).tobytes() == expected.tobytes()
+                    assert joined[name].tobytes() == expected.tobytes()
                 for name, expected in pairs.flat().items():
                     assert np.concatenate([piece.flat()[name] for piece in found]).tobytes() == expected.tobytes()
                 assert [(one.names, one.quantities) for one in stored.last.columns.values()] == [
@@ -70,7 +73,7 @@ def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_m
 def test_a_long_recording_is_converted_in_the_memory_of_a_short_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 2000)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 2000)
     file, write = tmp_path / "run.mcap", getattr(export, f"write_{kind}")
     peaks: list[int] = []
     for count in (200, 200, 1600):  # the first time imports what the conversion needs
@@ -90,7 +93,7 @@ def test_a_long_recording_is_converted_in_the_memory_of_a_short_one(
 def test_a_conversion_that_breaks_off_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 500)
     source, folder = tmp_path / "run.mcap", tmp_path / "made"
     folder.mkdir()
     write_recording(source, steady(100), chunk_size=5000)

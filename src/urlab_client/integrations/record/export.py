@@ -27,7 +27,7 @@ from urlab_client.integrations.record.lerobot_writer import write_lerobot
 from urlab_client.integrations.record.phases import Progress, phases
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.stored_table import StoredTable
+from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.transitions import Episodes, check_episodes, transition_pieces
 from urlab_client.integrations.record.writer import RecordingError
 

@@ -25,7 +25,7 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.reader import RecordedPicture, Run
-from urlab_client.integrations.record.stored_table import StoredTable
+from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.server.physics.recording import Frame, decode_json

@@ -41,8 +41,7 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, RecordedMessage, RecordingIndex
-from urlab_client.integrations.record.stored_table import StoredTable
-from urlab_client.integrations.record.table_builder import Number, SampleTimes, TableBuilder
+from urlab_client.integrations.record.tables import Number, SampleTimes, StoredTable, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.pixels import Pixels
@@ -188,9 +187,9 @@ class Run:
         Raises:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        builder = TableBuilder(fields, most=self._most_values())
-        self._read_states(builder, progress)
-        return builder.build(broken_off=bool(self.damage))
+        stored = StoredTable(None)
+        self._read_states(stored, fields, progress)
+        return stored.join()
 
     @contextlib.contextmanager
     def stored_table(
@@ -208,10 +207,7 @@ class Run:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
         with StoredTable(folder) as stored:
-            builder = TableBuilder(fields, take=stored.keep, most=self._most_values())
-            self._read_states(builder, progress)
-            stored.last = builder.build(broken_off=bool(self.damage))
-            del builder
+            self._read_states(stored, fields, progress)
             yield stored
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
@@ -401,11 +397,12 @@ class Run:
             found.append(_decoded(index, message, decode))
         return found
 
-    def _most_values(self) -> int:
-        return max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
-
-    def _read_states(self, builder: TableBuilder, progress: Callable[[int], None] | None) -> None:
+    def _read_states(
+        self, stored: StoredTable, fields: Collection[str] | None, progress: Callable[[int], None] | None
+    ) -> None:
         index = self._index(progress)
+        most = max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
+        builder = TableBuilder(stored, fields, most=most)
         channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
             take = self._take_state if message.channel.schema == _STATES else _take_entity
@@ -413,6 +410,7 @@ class Run:
                 take(builder, index, message)
             except ValueError as error:  # it does not fit those before it
                 raise index.unreadable(message, error) from None
+        builder.finish(broken_off=bool(self.damage))
 
     def _take_state(self, builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
         state, key = _decoded(index, message, _state), message.channel.topic.removeprefix(_ARTICULATION)
