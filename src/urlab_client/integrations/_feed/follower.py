@@ -15,9 +15,9 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
-from urlab_client.integrations._varied import OVER_WIRE
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
@@ -225,10 +225,9 @@ class Follower(ClientObserver):
         set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
         restarts = isinstance(reply, ResetOk)
         seed = client.reset_seed if restarts else None
-        over_wire = OVER_WIRE.get(client) if restarts else None
-        draws = (
-            None if over_wire is None or over_wire.draws is None or over_wire.draws.seed != seed else over_wire.draws
-        )
+        varied = varied_by_ops(client) if restarts else None
+        # A reset of somebody else has another seed, or none.
+        draws = varied.draws if varied is not None and varied.draws is not None and varied.draws.seed == seed else None
         put(State(scene, reply, set_points, nanoseconds, restarts, wall_ns, not self._live, seed, draws))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)

@@ -25,7 +25,7 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
-from urlab_client.integrations._varied import variation_of
+from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
