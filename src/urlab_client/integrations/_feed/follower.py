@@ -7,7 +7,8 @@ import copy
 import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
-from typing import Literal, TypeVar
+from types import TracebackType
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -24,8 +25,9 @@ from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import did_you_mean
 from urlab_client.protocol.observer import ClientObserver
+from urlab_client.sync._portal import Portal
 
-__all__ = ["Follower"]
+__all__ = ["BlockingFlavour", "Follower", "Following"]
 
 log = logging.getLogger("urlab_client.feed")
 
@@ -301,6 +303,48 @@ class Follower(ClientObserver):
                 nanoseconds = round((self._client.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+
+
+class Following(Protocol):
+    """Follows a client for the duration of an `async with` block."""
+
+    async def __aenter__(self) -> Any: ...
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None: ...
+
+    def finish(self) -> None:
+        """End if the client's loop has already ended. Blocks."""
+        ...
+
+
+F = TypeVar("F", bound=Following)
+
+
+class BlockingFlavour(Generic[F]):
+    """Runs its async counterpart for the duration of a `with` block, on the loop of the followed client."""
+
+    def __init__(self, aio: F, portal: Portal) -> None:
+        self._aio = aio
+        self._portal = portal
+
+    @property
+    def aio(self) -> F:
+        """The async counterpart."""
+        return self._aio
+
+    def __enter__(self) -> Self:
+        self._portal.call(self._aio.__aenter__)
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self._portal.call(self._aio.__aexit__, exc_type, exc, traceback)
+        except ClientClosed:
+            self._aio.finish()
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:

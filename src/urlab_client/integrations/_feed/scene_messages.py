@@ -16,6 +16,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -25,7 +26,6 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
-from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState

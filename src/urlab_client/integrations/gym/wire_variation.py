@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.integrations._episode_variation import VariedByOps, controlled_actuators
+from urlab_client.integrations._episode_variation import VariedByOps, controlled_actuators, varied_by_ops
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Randomisation, UnsupportedRandomisation, Vary
 from urlab_client.randomise.quantities import START, elements_of
@@ -69,9 +69,9 @@ class WireVariation:
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
+        if (before := varied_by_ops(client)) is not None:
+            client.remove_observer(before)
         self._varied = VariedByOps(declared)
-        if earlier is not None:
-            client.remove_observer(earlier._varied)
         client.add_observer(self._varied)
         self._model_fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields

@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from urlab_client._extras import need
 from urlab_client._whole_files import replaced
 from urlab_client.integrations.record.contents import Table
-from urlab_client.integrations.record.lerobot_writer import write_lerobot
-from urlab_client.integrations.record.phases import Progress, phases
-from urlab_client.integrations.record.pixels import even, farthest, visible
-from urlab_client.integrations.record.reader import Run
+from urlab_client.integrations.record.lerobot import write_lerobot
+from urlab_client.integrations.record.pictures import even, farthest, visible
+from urlab_client.integrations.record.reader import Progress, Run, phases
 from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.transitions import Episodes, check_episodes, transition_pieces
 from urlab_client.integrations.record.writer import RecordingError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,8 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.reader import RecordedPicture, Run
+from urlab_client.integrations.record.pictures import RecordedPicture
+from urlab_client.integrations.record.reader import Progress, Run
 from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
@@ -55,7 +56,7 @@ def is_joint_states(path: Path) -> bool:
 class JointStatesRun(Run):
     """A recording of joint states alone: no set-points, sensors or pictures."""
 
-    def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
+    def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
         """Say what is in it. Reading the file verifies it."""
         del progress, verify
         table = self.table()
@@ -76,7 +77,7 @@ class JointStatesRun(Run):
             topics={topic: describe_topic(topic, "joint states", stamps)} if len(stamps) else {},
         )
 
-    def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
+    def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
         """Return all states, with the columns `joints/qpos` and `joints/qvel`; values are named as compiled joints are.
 
         Raises:
@@ -126,7 +127,7 @@ class JointStatesRun(Run):
 
     @contextlib.contextmanager
     def stored_table(
-        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
+        self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
     ) -> Generator[StoredTable]:
         """Yield all states as one piece: a JSON file is read whole.
 
@@ -188,15 +189,15 @@ class JointStatesRun(Run):
         """Return nothing: the file holds no pictures."""
         return []
 
-    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
+    def picture_times(self, camera: str, progress: Progress | None = None) -> Floats:
         """Raise `KeyError`: the file holds no pictures."""
         raise self._no_pictures(camera)
 
-    def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
+    def frames(self, camera: str, progress: Progress | None = None) -> Iterator[Camera]:
         """Raise `KeyError`: the file holds no pictures."""
         raise self._no_pictures(camera)
 
-    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
+    def encoded_pictures(self, camera: str, progress: Progress | None = None) -> Iterator[RecordedPicture]:
         """Raise `KeyError`: the file holds no pictures."""
         raise self._no_pictures(camera)
 

@@ -6,7 +6,6 @@ Opening a recording and seeking read only the file's index and a few blocks, so 
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import threading
@@ -18,7 +17,6 @@ from typing import Annotated, TypeVar
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
@@ -40,13 +38,13 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, RecordedMessage, RecordingIndex
+from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
+from urlab_client.integrations.record.pictures import RecordedPicture
 from urlab_client.integrations.record.tables import Number, SampleTimes, StoredTable, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.pixels import Pixels
 
-__all__ = ["RecordedPicture", "Run", "read_run"]
+__all__ = ["Progress", "Run", "phases", "read_run"]
 
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -58,7 +56,6 @@ _KEPT_BYTES = 32 << 20
 _MOST_VALUES = 8 << 20
 _VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
 _NAMES_CHARS = 32 << 20
-_MOST_PIXELS = 8192 * 8192
 _T = TypeVar("_T")
 
 
@@ -96,34 +93,6 @@ _compressed = msgspec.json.Decoder(CompressedImage).decode
 _raw = msgspec.json.Decoder(RawImage).decode
 
 
-class RecordedPicture(msgspec.Struct, frozen=True):
-    """One encoded picture of the file.
-
-    Attributes:
-        time: Time on the recording's clock, seconds.
-        mode: Mode of the camera: `real`, `depth` and so on.
-        message: The encoded picture.
-        unreadable: Makes the error for a picture that is not what it says.
-    """
-
-    time: float
-    mode: str
-    message: CompressedImage | RawImage
-    unreadable: Callable[[object], RecordingError]
-
-    def pixels(self) -> Pixels:
-        """Return it as an array like `Camera.pixels`.
-
-        Raises:
-            RecordingError: It is damaged, too large, or not what the message says.
-        """
-        message = self.message
-        try:
-            return _depths(message) if isinstance(message, RawImage) else _colours(message.data)
-        except Exception as error:  # Pillow raises errors of many types
-            raise self.unreadable(error) from error
-
-
 class Run:
     """A recording on disk. Opening it reads only its index. Several threads may read.
 
@@ -138,7 +107,7 @@ class Run:
         self._indexed: tuple[tuple[int, int], RecordingIndex] | None = None
         self._lock = threading.Lock()
 
-    def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
+    def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
         """Return a summary of the contents.
 
         Args:
@@ -177,7 +146,7 @@ class Run:
             outcomes=self.outcomes(),
         )
 
-    def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
+    def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
         """Return all states. They must fit into memory, at 8 bytes for each value of each state.
 
         Args:
@@ -193,7 +162,7 @@ class Run:
 
     @contextlib.contextmanager
     def stored_table(
-        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
+        self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
     ) -> Generator[StoredTable]:
         """Yield all states in pieces: memory holds one piece, a temporary file the others.
 
@@ -292,7 +261,7 @@ class Run:
         cameras = [channel for channel in pictures if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
-    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
+    def picture_times(self, camera: str, progress: Progress | None = None) -> Floats:
         """Return the times of the pictures of `frames`, in its order, seconds on the recording's clock.
 
         Raises:
@@ -303,7 +272,7 @@ class Run:
         times = array("q", (one.log_time for one in self._messages(self._index(progress), channels, progress)))
         return np.array(times, dtype=np.int64) / _NS
 
-    def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
+    def frames(self, camera: str, progress: Progress | None = None) -> Iterator[Camera]:
         """Iterate over the pictures of a camera, `ARTICULATION/CAMERA` or a scene-level name.
 
         Raises:
@@ -313,7 +282,7 @@ class Run:
         for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
 
-    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
+    def encoded_pictures(self, camera: str, progress: Progress | None = None) -> Iterator[RecordedPicture]:
         """Iterate over the encoded pictures of a camera.
 
         Raises:
@@ -367,7 +336,7 @@ class Run:
             raise KeyError(f"no pictures of {name!r} in {self.path}; there are: {', '.join(self.cameras()) or 'none'}")
         return channels
 
-    def _index(self, progress: Callable[[int], None] | None = None) -> RecordingIndex:
+    def _index(self, progress: Progress | None = None) -> RecordingIndex:
         """Return the file's index, which is read again if the file has changed, for example while it is being
         written."""
         status = self.path.stat()
@@ -380,7 +349,7 @@ class Run:
         return index
 
     def _messages(
-        self, index: RecordingIndex, channels: Collection[int], progress: Callable[[int], None] | None = None
+        self, index: RecordingIndex, channels: Collection[int], progress: Progress | None = None
     ) -> Iterator[RecordedMessage]:
         """Iterate over the messages of channels, up to the first damage, which is then stored in `damage`."""
         yield from index.messages(channels, progress)
@@ -397,9 +366,7 @@ class Run:
             found.append(_decoded(index, message, decode))
         return found
 
-    def _read_states(
-        self, stored: StoredTable, fields: Collection[str] | None, progress: Callable[[int], None] | None
-    ) -> None:
+    def _read_states(self, stored: StoredTable, fields: Collection[str] | None, progress: Progress | None) -> None:
         index = self._index(progress)
         most = max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
         builder = TableBuilder(stored, fields, most=most)
@@ -439,6 +406,25 @@ class Run:
                 for name, reading in state.sensors.items()
                 for i in range(len(reading))
             ]
+
+
+def phases(size: int, progress: Progress | None, count: int) -> list[Progress]:
+    """Return a progress callback for each phase, which report the total to `progress`.
+
+    Args:
+        size: Size of the recording, bytes, which is the end of each phase and of the total.
+        progress: Callback for the total; None for none.
+        count: Number of phases.
+    """
+
+    def phase(number: int) -> Progress:
+        def tell(done: int) -> None:
+            if progress is not None:
+                progress((number * size + min(done, size)) // count)
+
+        return tell
+
+    return [phase(number) for number in range(count)]
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
@@ -492,28 +478,6 @@ def _picture(index: RecordingIndex, message: RecordedMessage) -> RecordedPicture
         found,
         lambda reason: index.unreadable(place, reason),
     )
-
-
-def _depths(message: RawImage) -> Pixels:
-    height, width = message.height, message.width
-    if message.encoding != "32FC1" or message.step != 4 * width or len(message.data) != 4 * height * width:
-        raise ValueError(
-            f"{len(message.data)} bytes of {message.encoding[:20]!r} in rows of {message.step} bytes "
-            f"are not {width}x{height} depths"
-        )
-    _check_size(width, height)
-    return np.frombuffer(message.data, "<f4").astype(np.float32).reshape(height, width)
-
-
-def _colours(data: bytes) -> Pixels:
-    with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
-        _check_size(*image.size)
-        return np.array(image if image.mode in {"RGB", "RGBA"} else image.convert("RGB"))
-
-
-def _check_size(width: int, height: int) -> None:
-    if width < 1 or height < 1 or width * height > _MOST_PIXELS:
-        raise ValueError(f"a picture of {width}x{height} pixels; it can have 1 to {_MOST_PIXELS}")
 
 
 def _times(message: RecordedMessage, state: _State | _Entity) -> SampleTimes:

@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.numbers import finite_array
 from urlab_client.integrations._episode_variation import varied_by_ops
-from urlab_client.integrations._feed.blocking import BlockingTwin
-from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
@@ -151,7 +150,7 @@ class AsyncRecorder:
             self._writer.close()
 
 
-class Recorder(BlockingTwin[AsyncRecorder]):
+class Recorder(BlockingFlavour[AsyncRecorder]):
     """A recording in progress, for the duration of a `with` block. Created by `record`."""
 
     @property

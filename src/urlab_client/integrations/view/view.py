@@ -17,8 +17,7 @@ from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._feed.blocking import BlockingTwin
-from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
 from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
 from urlab_client.protocol.base import Floats
@@ -295,7 +294,7 @@ class AsyncView:
         self._counts["states"] += 1
 
 
-class View(BlockingTwin[AsyncView]):
+class View(BlockingFlavour[AsyncView]):
     """A view that is open for the duration of a `with` block. Created by `rerun_view` and similar functions."""
 
     @property
