@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Collection, Generator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,6 @@ from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations._feed.quantities import quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.record.contents import (
-    Camera,
     Column,
     RecordedArticulation,
     RecordedState,
@@ -24,11 +23,10 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.pictures import RecordedPicture
+from urlab_client.integrations.record.index import IndexedChannel
 from urlab_client.integrations.record.reader import Progress, Run
 from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.protocol.base import Floats
 from urlab_client.server.physics.recording import Frame, decode_json
 
 __all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
@@ -189,28 +187,8 @@ class JointStatesRun(Run):
         """Return nothing: the file holds no pictures."""
         return []
 
-    def picture_times(self, camera: str, progress: Progress | None = None) -> Floats:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def frames(self, camera: str, progress: Progress | None = None) -> Iterator[Camera]:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def encoded_pictures(self, camera: str, progress: Progress | None = None) -> Iterator[RecordedPicture]:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def picture_at(self, camera: str, time: float) -> Camera | None:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def encoded_picture_at(self, camera: str, time: float) -> RecordedPicture:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def _no_pictures(self, camera: str) -> KeyError:
-        return KeyError(f"no pictures of {camera!r} in {self.path}: a recording of the server holds joint states alone")
+    def _camera(self, name: str) -> list[IndexedChannel]:
+        raise KeyError(f"no pictures of {name!r} in {self.path}: a recording of the server holds joint states alone")
 
 
 def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:

@@ -306,8 +306,8 @@ class Run:
             RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
-        index = self._index()
-        found = _newest(index, self._camera(camera), time)
+        channels, index = self._camera(camera), self._index()
+        found = _newest(index, channels, time)
         if found is None:
             return None
         picture = _picture(index, found)
@@ -321,7 +321,7 @@ class Run:
             RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
-        index, channels = self._index(), self._camera(camera)
+        channels, index = self._camera(camera), self._index()
         found = _newest(index, channels, time)
         if found is None:
             firsts = [first for channel in channels if (first := index.first(channel.id)) is not None]

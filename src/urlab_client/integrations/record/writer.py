@@ -21,7 +21,6 @@ from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
 from urlab_client.integrations._feed.messages import (
-    ArticulationMessage,
     ContactsMessage,
     EntityMessage,
     EpisodeMessage,
@@ -42,6 +41,7 @@ from urlab_client.integrations._feed.samples import (
     SampleClock,
     Schedule,
     State,
+    articulation_message,
     picture_message,
 )
 from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
@@ -374,24 +374,11 @@ class _Sink:
         if item.scene is not self._scene:
             self._use(item.scene)
         now = self._clock.advance(item.nanoseconds, item.restarts)
-        stamp, wall, clock = Time.of(now), Time.of(item.wall_ns), self._clock
+        stamp, clock = Time.of(now), self._clock
         self._write_episode(item, now)
-        for key, state in reply.per_articulation.items():
+        for key in reply.per_articulation:
             names = item.scene.names.get(key)
-            message = ArticulationMessage(
-                timestamp=stamp,
-                sim_time=reply.time,
-                sample=self.states,
-                step=reply.step,
-                episode=clock.episode,
-                wall_time=wall,
-                qpos=state.qpos.tolist(),
-                qvel=state.qvel.tolist(),
-                set_points=item.set_points.get(key, []),
-                ctrl=values(state.ctrl),
-                act=values(state.act),
-                sensors=state.sensors or {},
-            )
+            message = articulation_message(item, key, stamp, sample=self.states, episode=clock.episode)
             self._add(f"/state/{key}", message, now, item.wall_ns, to_metadata(names) if names else {})
         entities: Mapping[str, EntityState] = {}
         if isinstance(reply, StepOk | StateSnapshot):

@@ -14,7 +14,6 @@ from msgspec import Struct
 from urlab_client._extras import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import (
-    ArticulationMessage,
     ContactsMessage,
     FrameTransforms,
     JointStates,
@@ -22,9 +21,8 @@ from urlab_client.integrations._feed.messages import (
     encode,
     schema_name,
     schema_of,
-    values,
 )
-from urlab_client.integrations._feed.samples import CameraPicture, State, picture_message
+from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
 from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
@@ -165,26 +163,16 @@ class _Foxglove:
     def _send_states(self, moment: Moment, item: State) -> None:
         for key in item.reply.per_articulation:
             names = moment.scene.names.get(key)
-            message = functools.partial(self._state_message, moment, item, key)
-            self._send(f"/state/{key}", message, moment.ns, to_metadata(names) if names else {})
-
-    def _state_message(self, moment: Moment, item: State, key: str) -> ArticulationMessage:
-        reply = item.reply
-        state = reply.per_articulation[key]
-        return ArticulationMessage(
-            timestamp=Time.of(moment.ns),
-            sim_time=reply.time,
-            sample=reply.step,
-            step=reply.step,
-            episode=moment.episode,
-            wall_time=Time.of(moment.wall_ns),
-            qpos=state.qpos.tolist(),
-            qvel=state.qvel.tolist(),
-            set_points=item.set_points.get(key, []),
-            ctrl=values(state.ctrl),
-            act=values(state.act),
-            sensors=(state.sensors or {}) if self._sensors else {},
-        )
+            make = functools.partial(
+                articulation_message,
+                item,
+                key,
+                Time.of(moment.ns),
+                sample=item.reply.step,
+                episode=moment.episode,
+                sensors=self._sensors,
+            )
+            self._send(f"/state/{key}", make, moment.ns, to_metadata(names) if names else {})
 
     def _send_geometry(self, ns: int) -> None:
         from foxglove import messages as fox  # noqa: PLC0415
