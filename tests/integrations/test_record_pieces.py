@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from children import in_background
 from made_recordings import Robot, write_recording
@@ -19,7 +19,7 @@ from made_recordings import Robot, write_recording
 from urlab_client._whole_files import replaced
 from urlab_client.cli import main
 from urlab_client.integrations.record import Run, export, read_run, tables
-from urlab_client.integrations.record.transitions import transition_pieces, transitions_of
+from urlab_client.integrations.record.transitions import transitions_of
 
 
 def changing(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
@@ -37,7 +37,8 @@ def steady(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]
 def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "run.mcap"
+    file, made = tmp_path / "run.mcap", tmp_path / "made" / "run.parquet"
+    made.parent.mkdir()
     write_recording(file, changing(70), episode_length=20, chunk_size=350)
     partial = set[bool]()
     size = file.stat().st_size
@@ -52,21 +53,21 @@ def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_m
         for values in (1, 150):
             monkeypatch.setattr(tables, "PIECE_VALUES", values)
             with run.stored_table(tmp_path) as stored:
-                assert len(stored) == len(whole)
-                pieces = [*stored.pieces()]
-                assert len(pieces) > 5
-                found = [*transition_pieces(pieces, (), "kept")]
-                joined = run.table().arrays()
-                for name, expected in whole.arrays().items():
-                    assert np.concatenate([*stored.parts(name)]).tobytes() == expected.tobytes()
-                    assert joined[name].tobytes() == expected.tobytes()
-                for name, expected in pairs.flat().items():
-                    assert np.concatenate([piece.flat()[name] for piece in found]).tobytes() == expected.tobytes()
-                assert [(one.names, one.quantities) for one in stored.last.columns.values()] == [
-                    (one.names, one.quantities) for one in whole.columns.values()
-                ]
+                for found in (stored, run.table()):
+                    assert found.columns.keys() == whole.columns.keys()
+                    for name, expected in whole.arrays().items():
+                        assert found.arrays()[name].tobytes() == expected.tobytes()
+                    assert [(one.names, one.quantities) for one in found.columns.values()] == [
+                        (one.names, one.quantities) for one in whole.columns.values()
+                    ]
+            assert export.write_parquet(run, made) == len(pairs)
+            read = parquet.read_table(made)
+            assert parquet.ParquetFile(made).num_row_groups > 5
+            for name, expected in pairs.flat().items():
+                assert read[name].to_numpy().tobytes() == expected.tobytes()
     assert partial == {False, True}, "some of the files end in the middle of a state"
-    assert os.listdir(tmp_path) == [file.name]
+    assert sorted(os.listdir(tmp_path)) == ["made", file.name]
+    assert os.listdir(made.parent) == [made.name]
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])

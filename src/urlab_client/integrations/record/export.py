@@ -1,7 +1,7 @@
 """Conversion of recordings to tables, arrays, videos and LeRobot datasets. Output files appear only when complete.
 
 Tables contain pairs of an observation and the action taken at it, see `transitions`; arrays contain the states as
-recorded. Memory holds only a piece of the recording; a temporary file beside the output holds the others, with 8 bytes
+recorded. Memory holds only a part of the recording; a temporary file beside the output holds the whole, with 8 bytes
 for each value of each state. An exception from `progress` aborts a conversion.
 """
 
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from urlab_client._extras import need
 from urlab_client._whole_files import replaced
+from urlab_client.integrations.record import tables
 from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.lerobot import write_lerobot
 from urlab_client.integrations.record.pictures import even, farthest, visible
 from urlab_client.integrations.record.reader import Progress, Run, phases
-from urlab_client.integrations.record.tables import StoredTable
-from urlab_client.integrations.record.transitions import Episodes, check_episodes, transition_pieces
+from urlab_client.integrations.record.transitions import Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
@@ -80,11 +80,11 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
     times = {name: run.picture_times(name, next(steps)) for name in cameras}
     with (
         replaced(path) as temporary,
-        run.stored_table(path.parent, next(steps)) as stored,
+        run.stored_table(path.parent, next(steps)) as table,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
         writing = next(steps)
-        _save_table(run, archive, stored, lambda share: writing(int(share * size)))
+        _save_table(run, archive, table, lambda share: writing(int(share * size)))
         for name, when in times.items():
             pictures = (picture.pixels[None] for picture in islice(run.frames(name, next(steps)), len(when)))
             try:
@@ -92,7 +92,7 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
             except ValueError as error:
                 raise RecordingError(f"{run.path}: the pictures of {name} do not fit one array: {error}.") from None
             _save(archive, f"camera/{name}.time", [when], len(when))
-    return len(stored)
+        return len(table)
 
 
 def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
@@ -179,21 +179,25 @@ def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress 
     check_episodes(episodes)
     size = run.path.stat().st_size
     reading, writing = phases(size, progress, 2)
-    with run.stored_table(folder, reading) as stored:
-        rows = max(1, len(stored))
-        pieces = transition_pieces(stored.pieces(), run.outcomes(), episodes)
+    with run.stored_table(folder, reading) as table:
+        outcomes = run.outcomes()
+        rows = pair_rows(table, outcomes, episodes)
+        width = sum(column.values.shape[1] for column in table.columns.values()) + 1
+        parts = np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES)
+        pieces = (with_goals(pairs_at(table, part), outcomes) for part in parts)
 
         def told(count: int) -> None:
-            writing(size * count // rows)
+            writing(size * count // max(1, len(rows)))
 
         yield _Transitions(pieces, told)
 
 
-def _save_table(run: Run, archive: zipfile.ZipFile, stored: StoredTable, told: Callable[[float], None]) -> None:
-    arrays = stored.last.arrays()
-    for number, name in enumerate(arrays):
-        _save(archive, name, stored.parts(name), len(stored), lambda: told(number / len(arrays)))  # noqa: B023
-        column = stored.last.columns.get(name)
+def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, told: Callable[[float], None]) -> None:
+    arrays = table.arrays()
+    for number, (name, values) in enumerate(arrays.items()):
+        parts = np.array_split(values, 1 + values.size // tables.PIECE_VALUES)
+        _save(archive, name, parts, len(table), lambda: told(number / len(arrays)))  # noqa: B023
+        column = table.columns.get(name)
         if column is not None:
             if len(column.names) * max(map(len, column.names)) > _NAMES_CHARS:  # each takes the space of the longest
                 raise RecordingError(f"{run.path}: the names of the values of {name} are too long for an array.")

@@ -25,7 +25,6 @@ from urlab_client.integrations.record.contents import (
 )
 from urlab_client.integrations.record.index import IndexedChannel
 from urlab_client.integrations.record.reader import Progress, Run
-from urlab_client.integrations.record.tables import StoredTable
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.server.physics.recording import Frame, decode_json
 
@@ -126,15 +125,14 @@ class JointStatesRun(Run):
     @contextlib.contextmanager
     def stored_table(
         self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
-    ) -> Generator[StoredTable]:
-        """Yield all states as one piece: a JSON file is read whole.
+    ) -> Generator[Table]:
+        """Yield all states, in memory: a JSON file is read whole.
 
         Raises:
             RecordingError: The file is not a recording.
         """
-        with StoredTable(folder) as stored:
-            stored.last = self.table(progress, fields=fields)
-            yield stored
+        del folder
+        yield self.table(progress, fields=fields)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
         """Return nothing: a server marks no episodes."""

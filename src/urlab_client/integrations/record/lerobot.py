@@ -26,7 +26,7 @@ from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.pictures import even, farthest, visible
 from urlab_client.integrations.record.reader import Progress, Run, phases
-from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, transition_pieces, with_goals
+from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
@@ -94,15 +94,14 @@ def write_lerobot(
     steps = iter(phases(run.path.stat().st_size, progress, 1 + 2 * len(names)))
     times = {name: run.picture_times(name, next(steps)) for name in names}
     with (
-        run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as stored,
+        run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as table,
         # Beside the dataset, which may be too large for the system's temporary folder.
         tempfile.TemporaryDirectory(prefix=".urlab-", dir=folder.parent, ignore_cleanup_errors=True) as temporary,
     ):
         work, outcomes = Path(temporary), run.outcomes()
-        everything = _timeline(stored.pieces())
-        table = _timeline(transition_pieces(stored.pieces(), outcomes, episodes))
-        rate = _rate(run, [*times.values()] or [everything.time]) if fps is None else fps
-        rows = _resampled(run, table, rate, [*times.values()], _episode_starts(everything))
+        pairs = pair_rows(table, outcomes, episodes)
+        rate = _rate(run, [*times.values()] or [table.time]) if fps is None else fps
+        rows = _resampled(run, table, pairs, rate, [*times.values()])
         if not len(rows):
             raise RecordingError(f"{run.path}: there is nothing to make a dataset of.")
         episode, when = table.episode[rows], table.time[rows]
@@ -110,7 +109,7 @@ def write_lerobot(
         chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
         if not np.isfinite(_goals_of(np.unique(episode), outcomes)).all():
             raise RecordingError(f"{run.path}: it is not known what some of its episodes were about.")
-        first = next(transition_pieces(stored.pieces(), outcomes, episodes))
+        first = with_goals(pairs_at(table, rows[:1]), outcomes)
         robots = [key.removesuffix("/action") for key in first.columns if key.endswith("/action")]
         plan = {
             "folder": str((work / "dataset").absolute()),
@@ -126,9 +125,8 @@ def write_lerobot(
         }
         (work / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
         pictures = [_Pictures(run, name, video, next(steps)) for name in names]
-        pieces = transition_pieces(stored.pieces(), outcomes, episodes)
         with LeRobot(python, work) as writer:
-            for frames in _frames(pieces, rows, episode):
+            for frames in _frames(table, rows, outcomes):
                 wanted = [
                     one.take(which[frames.start : frames.stop]) for one, which in zip(pictures, chosen, strict=True)
                 ]
@@ -136,13 +134,6 @@ def write_lerobot(
             writer.finish()
         (work / "dataset").rename(folder)
     return len(rows)
-
-
-class _Timeline(NamedTuple):
-    """Time, seconds, and episode of states, each of shape (n,)."""
-
-    time: Floats
-    episode: NDArray[np.int64]
 
 
 class _Frames(NamedTuple):
@@ -154,25 +145,17 @@ class _Frames(NamedTuple):
     ends_episode: bool
 
 
-def _timeline(pieces: Iterable[Table]) -> _Timeline:
-    parts = [(piece.time, piece.episode) for piece in pieces]
-    return _Timeline(np.concatenate([time for time, _ in parts]), np.concatenate([episode for _, episode in parts]))
-
-
-def _frames(pieces: Iterable[Table], rows: NDArray[np.intp], episode: NDArray[np.int64]) -> Iterator[_Frames]:
+def _frames(table: Table, rows: NDArray[np.intp], outcomes: Sequence[OutcomeMessage]) -> Iterator[_Frames]:
     """Yield the frames at some rows of a table, in batches that fit into memory with their pictures."""
-    ends = {*(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(rows)}
-    first = start = 0
-    for piece in pieces:
-        after = int(np.searchsorted(rows, first + len(piece)))
-        values = {"state": _joined(piece, "qpos")[1], "action": _joined(piece, "action")[1], "goal": _goal(piece)[1]}
-        while start < after:
-            stop = next(i for i in range(start + 1, after + 1) if i in ends or i in {after, start + _TOGETHER})
-            own = rows[start:stop] - first
-            arrays = {name: given[own].astype(np.float32) for name, given in values.items()}
-            yield _Frames(start, stop, arrays, ends_episode=stop in ends)
+    start = 0
+    for end in (*(np.flatnonzero(np.diff(table.episode[rows])) + 1).tolist(), len(rows)):
+        while start < end:
+            stop = min(start + _TOGETHER, end)
+            part = with_goals(pairs_at(table, rows[start:stop]), outcomes)
+            values = {"state": _joined(part, "qpos")[1], "action": _joined(part, "action")[1], "goal": _goal(part)[1]}
+            arrays = {name: given.astype(np.float32) for name, given in values.items()}
+            yield _Frames(start, stop, arrays, ends_episode=stop == end)
             start = stop
-        first += len(piece)
 
 
 class _Pictures:
@@ -252,19 +235,21 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
     return round(rate)
 
 
-def _episode_starts(table: _Timeline) -> dict[int, float]:
+def _starts(table: Table) -> dict[int, float]:
+    """Return the time of the first state of each episode."""
     episodes, first = np.unique(table.episode, return_index=True)
     return dict(zip(episodes.tolist(), table.time[first].tolist(), strict=True))
 
 
 def _resampled(
-    run: Run, table: _Timeline, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
+    run: Run, table: Table, pairs: NDArray[np.intp], fps: int, pictures: list[NDArray[np.float64]]
 ) -> NDArray[np.intp]:
     """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
     rows: list[NDArray[np.intp]] = []
-    for episode in np.unique(table.episode).tolist():
-        own = np.flatnonzero(table.episode == episode)
-        first, last = float(table.time[own[0]]), float(table.time[own[-1]])
+    time, episodes, starts = table.time[pairs], table.episode[pairs], _starts(table)
+    for episode in np.unique(episodes).tolist():
+        own = np.flatnonzero(episodes == episode)
+        first, last = float(time[own[0]]), float(time[own[-1]])
         for times in pictures:
             later = times[times >= starts[episode] - _SLACK_S]
             first = max(first, float(later[0]) if len(later) else np.inf)
@@ -274,8 +259,8 @@ def _resampled(
                     f"{run.path}: episode {episode} of {last - first:.0f} s has more than {_MOST_FRAMES} frames."
                 )
             grid = first + np.arange(int((last - first) * fps + _SLACK_S) + 1) / fps
-            found = np.searchsorted(table.time[own], grid + _SLACK_S, side="right") - 1
-            rows.append(own[np.maximum(found, 0)])
+            found = np.searchsorted(time[own], grid + _SLACK_S, side="right") - 1
+            rows.append(pairs[own[np.maximum(found, 0)]])
     return np.sort(np.concatenate(rows)) if rows else np.zeros(0, dtype=np.intp)
 
 

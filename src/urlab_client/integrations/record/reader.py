@@ -40,7 +40,7 @@ from urlab_client.integrations.record.contents import (
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
 from urlab_client.integrations.record.pictures import RecordedPicture
-from urlab_client.integrations.record.tables import Number, SampleTimes, StoredTable, TableBuilder
+from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 
@@ -156,15 +156,13 @@ class Run:
         Raises:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        stored = StoredTable(None)
-        self._read_states(stored, fields, progress)
-        return stored.join()
+        return self._read_states(self._builder(None, fields), progress)
 
     @contextlib.contextmanager
     def stored_table(
         self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
-    ) -> Generator[StoredTable]:
-        """Yield all states in pieces: memory holds one piece, a temporary file the others.
+    ) -> Generator[Table]:
+        """Yield all states as a table that may be larger than memory: its arrays are maps of a temporary file.
 
         Args:
             folder: Folder of the temporary file, which has 8 bytes for each value of each state.
@@ -175,9 +173,8 @@ class Run:
             OSError: The temporary file cannot be written.
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        with StoredTable(folder) as stored:
-            self._read_states(stored, fields, progress)
-            yield stored
+        with contextlib.closing(self._builder(folder, fields)) as builder:
+            yield self._read_states(builder, progress)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
         """Return the marked outcomes of episodes; if an episode has several marks, the last one.
@@ -366,10 +363,12 @@ class Run:
             found.append(_decoded(index, message, decode))
         return found
 
-    def _read_states(self, stored: StoredTable, fields: Collection[str] | None, progress: Progress | None) -> None:
-        index = self._index(progress)
+    def _builder(self, folder: Path | None, fields: Collection[str] | None) -> TableBuilder:
         most = max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
-        builder = TableBuilder(stored, fields, most=most)
+        return TableBuilder(folder, fields, most=most)
+
+    def _read_states(self, builder: TableBuilder, progress: Progress | None) -> Table:
+        index = self._index(progress)
         channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
             take = self._take_state if message.channel.schema == _STATES else _take_entity
@@ -377,7 +376,7 @@ class Run:
                 take(builder, index, message)
             except ValueError as error:  # it does not fit those before it
                 raise index.unreadable(message, error) from None
-        builder.finish(broken_off=bool(self.damage))
+        return builder.finish(broken_off=bool(self.damage))
 
     def _take_state(self, builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
         state, key = _decoded(index, message, _state), message.channel.topic.removeprefix(_ARTICULATION)

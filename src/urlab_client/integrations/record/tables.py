@@ -1,30 +1,29 @@
-"""Tables of states, of which an overnight recording has millions: built and stored in pieces."""
+"""Building a table from successive states, of which an overnight recording has millions: in memory, or in a file."""
 
 from __future__ import annotations
 
+import io
 import tempfile
 from array import array
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Literal, NamedTuple, Self, TypeAlias
+from typing import IO, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
 
-__all__ = ["PIECE_VALUES", "Number", "SampleTimes", "StoredTable", "TableBuilder"]
+__all__ = ["PIECE_VALUES", "Number", "SampleTimes", "TableBuilder"]
 
-PIECE_VALUES = 1 << 21
-"""Approximate number of values in a piece of a table: 16 MiB."""
+PIECE_VALUES = 1 << 20
+"""Approximate number of values that are handled at once: 8 MiB."""
 
 _MOST_COLUMNS = 1_000_000
+_NS = 1e9
 
 Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
 """A number as decoded; numbers that JSON cannot represent are text."""
@@ -40,114 +39,68 @@ class SampleTimes(NamedTuple):
     episode: int
 
 
-class StoredTable:
-    """The states of a recording in pieces, whose columns may appear late or get wider from piece to piece.
+class _Rows:
+    """Rows of numbers, in memory or in a temporary file.
 
-    Not a memory map, because the number and the width of the columns are known only at the end.
-
-    Attributes:
-        last: The last piece, which stays in memory. Its columns are those of the table.
-
-    Args:
-        folder: Folder of a temporary file for the other pieces; None keeps them in memory. If the system supports it,
-            the file has no name, so a crash leaves nothing behind.
-
-    Raises:
-        OSError: The file cannot be created.
+    If the system supports it, the file has no name, so a crash leaves nothing behind.
     """
 
-    def __init__(self, folder: Path | None) -> None:
-        none, nothing = np.zeros(0), np.zeros(0, np.int64)
-        self.last = Table(none, none, nothing, nothing, nothing, {})
-        self._file: IO[bytes] | None = None
-        if folder is not None:
-            self._file = tempfile.TemporaryFile(dir=folder, prefix=".urlab-")  # noqa: SIM115  # see __exit__
-        self._lengths: list[int] = []
-        self._pieces: list[dict[str, Callable[[], NDArray[Any]]]] = []  # what loads each array
+    def __init__(self, folder: Path | None, width: int) -> None:
+        self._folder = folder
+        self._file = self._opened()
+        self._count, self._width = 0, width
 
-    def __enter__(self) -> Self:
-        return self
+    def append(self, rows: Floats) -> None:
+        """Add rows, which are as wide as `spread` says."""
+        self._file.write(rows.data)
+        self._count += len(rows)
 
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._file is not None:
+    def spread(self, places: list[int], width: int) -> None:
+        """Move each column to its place among more columns; new ones are NaN."""
+        before = self.values()
+        self.close()
+        self._file, self._width = self._opened(), width
+        for rows in np.array_split(before, 1 + before.size // PIECE_VALUES):
+            wider = np.full((len(rows), width), np.nan)
+            wider[:, places] = rows
+            self._file.write(wider.data)
+
+    def values(self) -> Floats:
+        """Return all rows, shape (n, width), without a copy in memory."""
+        if not self._count:
+            return np.zeros((0, self._width))
+        if isinstance(self._file, io.BytesIO):
+            flat = np.frombuffer(self._file.getbuffer(), np.float64)
+        else:
+            self._file.flush()
+            flat = np.asarray(np.memmap(self._file, np.float64, "r"))
+        return flat.reshape(self._count, self._width)
+
+    def close(self) -> None:
+        """Close the file; arrays that are in use stay valid."""
+        if self._folder is not None:
             self._file.close()
 
-    def __len__(self) -> int:
-        return sum(self._lengths) + len(self.last)
-
-    def keep(self, piece: Table) -> None:
-        """Store the next piece.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
-        self._lengths.append(len(piece))
-        self._pieces.append({name: self._stored(values) for name, values in piece.arrays().items()})
-
-    def pieces(self) -> Iterator[Table]:
-        """Iterate over the pieces, all with the same columns; missing values are NaN."""
-        for number in range(len(self._pieces)):
-            arrays = {name: self._read(number, name, values) for name, values in self.last.arrays().items()}
-            yield self.last.with_arrays(arrays)
-        yield self.last
-
-    def parts(self, name: str) -> Iterator[NDArray[Any]]:
-        """Iterate over the pieces of one array of the table."""
-        values = self.last.arrays()[name]
-        for number in range(len(self._pieces)):
-            yield self._read(number, name, values)
-        yield values
-
-    def join(self) -> Table:
-        """Return the whole table, and forget the pieces."""
-        arrays: dict[str, NDArray[Any]] = {}
-        for name in self.last.arrays():
-            arrays[name] = np.concatenate([*self.parts(name)])
-            for piece in self._pieces:  # so that memory holds only one array twice
-                piece.pop(name, None)
-        return self.last.with_arrays(arrays)
-
-    def _stored(self, values: NDArray[Any]) -> Callable[[], NDArray[Any]]:
-        file = self._file
-        if file is None:
-            return lambda: values
-        offset = file.tell()
-        np.save(file, values, allow_pickle=False)
-        return partial(_loaded, file, offset)
-
-    def _read(self, number: int, name: str, like: NDArray[Any]) -> NDArray[Any]:
-        """Return an array of a piece, with as many columns as the last one."""
-        load = self._pieces[number].get(name)
-        found = np.zeros((0, 0)) if load is None else load()
-        if found.shape[1:] == like.shape[1:]:
-            return found
-        wider = np.full((self._lengths[number], *like.shape[1:]), np.nan)
-        wider[: len(found), : found.shape[1]] = found
-        return wider
-
-
-def _loaded(file: IO[bytes], offset: int) -> NDArray[Any]:
-    file.seek(offset)
-    return np.load(file, allow_pickle=False)
+    def _opened(self) -> IO[bytes]:
+        if self._folder is None:
+            return io.BytesIO()
+        return tempfile.TemporaryFile(dir=self._folder, prefix=".urlab-")
 
 
 @dataclass(slots=True)
 class _Field:
-    """Rows of one field of an articulation or entity in the current piece, and their places in it."""
+    """Rows of one field of an articulation or entity that are not stored yet, and their places among those samples."""
 
     width: int = 0
     places: list[int] = field(default_factory=list[int])
     rows: list[array[float]] = field(default_factory=list["array[float]"])
 
-    def values(self, count: int) -> Floats:
-        """Return the first rows of the piece as an array; missing values are NaN."""
-        values = np.full((count, self.width), np.nan)
+    def move_into(self, values: Floats) -> None:
+        """Write the rows into an array, except those beyond its end, and forget them."""
         for place, row in zip(self.places, self.rows, strict=True):
-            if place < count:
+            if place < len(values):
                 values[place, : len(row)] = row
-        return values
+        self.places, self.rows = [], []
 
 
 @dataclass(slots=True)
@@ -164,13 +117,16 @@ class TableBuilder:
     """Builds one table. Samples arrive in order, with one part for each articulation and entity.
 
     Args:
-        table: Receives the pieces of the table.
+        folder: Folder of a temporary file for the values, which the table then maps; None keeps them in memory.
         only: Fields to keep, such as `qpos`; None keeps all.
         most: Largest number of values of the whole table, missing ones included.
+
+    Raises:
+        OSError: The file cannot be created.
     """
 
-    def __init__(self, table: StoredTable, only: Collection[str] | None = None, *, most: int) -> None:
-        self._table = table
+    def __init__(self, folder: Path | None, only: Collection[str] | None = None, *, most: int) -> None:
+        self._rows = _Rows(folder, len(SampleTimes._fields))
         self._only = only
         self._most = most
         self._count = 0
@@ -179,12 +135,8 @@ class TableBuilder:
         self._sample = -1
         self._present = set[str]()
         self._present_before = set[str]()
-        self._begin()
-
-    def _begin(self) -> None:
-        self._times: tuple[array[float], ...] = tuple(array(kind) for kind in ("q", "d", "q", "q", "q"))
-        for source in self._sources.values():
-            source.fields = {name: _Field(one.width) for name, one in source.fields.items()}
+        self._times: list[SampleTimes] = []
+        self._layout: dict[str, range] = {}
 
     def source(self, key: str, layout: SceneLayout) -> _Source:
         """Return the samples of an articulation or entity so far."""
@@ -206,39 +158,60 @@ class TableBuilder:
         if self._width > _MOST_COLUMNS or self._count * self._width > self._most:
             raise ValueError(f"{self._count} samples of {self._width} values are too many for the size of the file")
         if new:
-            if len(self._times[0]) * self._width >= PIECE_VALUES:
-                self._table.keep(self._piece(len(self._times[0])))
-                self._begin()
+            if len(self._times) * self._width >= PIECE_VALUES:
+                self._store(len(self._times))
             self._sample, self._present_before, self._present = sample, self._present, set[str]()
-            for column, value in zip(self._times, times, strict=True):
-                column.append(value)
+            self._times.append(times)
         self._present.add(source.key)
         for name, values in kept.items():
             into = source.fields.setdefault(name, _Field())
             into.width = max(into.width, len(values))
-            into.places.append(len(self._times[0]) - 1)
+            into.places.append(len(self._times) - 1)
             into.rows.append(array("d", map(float, values)))
 
-    def finish(self, *, broken_off: bool) -> None:
-        """Pass on the last piece; if the recording broke off, without the last sample if an articulation or entity of
-        the previous one is missing in it."""
+    def finish(self, *, broken_off: bool) -> Table:
+        """Return the table. If the recording broke off, and an articulation or entity of the sample before the last one
+        is missing in that, the last sample is left out."""
         partial = broken_off and not self._present_before <= self._present
-        self._table.last = self._piece(len(self._times[0]) - partial)
-
-    def _piece(self, count: int) -> Table:
-        log_ns, sim_time, wall_ns, step, episode = (np.array(column[:count]) for column in self._times)
+        self._store(len(self._times) - partial)
+        rows = self._rows.values()
+        whole = rows.view(np.int64)
         return Table(
-            time=log_ns.astype(np.int64) / 1e9,
-            sim_time=sim_time.astype(np.float64),
-            wall_ns=wall_ns.astype(np.int64),
-            step=step.astype(np.int64),
-            episode=episode.astype(np.int64),
+            time=rows[:, 0],
+            sim_time=rows[:, 1],
+            wall_ns=whole[:, 2],
+            step=whole[:, 3],
+            episode=whole[:, 4],
             columns={
-                f"{source.key}/{name}": _column(source, name, one.values(count))
-                for source in self._sources.values()
-                for name, one in source.fields.items()
+                key: _column(self._sources[key.rpartition("/")[0]], key.rpartition("/")[2], rows[:, at.start : at.stop])
+                for key, at in self._layout.items()
             },
         )
+
+    def close(self) -> None:
+        """Close the temporary file; the table stays valid."""
+        self._rows.close()
+
+    def _store(self, count: int) -> None:
+        """Store the first of the samples that have come since the last time, and forget them."""
+        width, layout = len(SampleTimes._fields), dict[str, range]()
+        sources = self._sources.values()
+        fields = [(f"{source.key}/{name}", one) for source in sources for name, one in source.fields.items()]
+        for key, one in fields:
+            layout[key] = range(width, width + one.width)
+            width += one.width
+        if layout != self._layout:
+            kept = [place for key, before in self._layout.items() for place in layout[key][: len(before)]]
+            self._rows.spread([*range(len(SampleTimes._fields)), *kept], width)
+            self._layout = layout
+        rows = np.full((count, width), np.nan)
+        for row, times in zip(rows, self._times, strict=False):
+            row[:2] = times.log_ns / _NS, times.sim_time
+            row.view(np.int64)[2:5] = times.wall_ns, times.step, times.episode
+        for key, one in fields:
+            one.move_into(rows[:, layout[key].start : layout[key].stop])
+        self._rows.append(rows)
+        self._times = []
 
 
 def _column(source: _Source, name: str, values: Floats) -> Column:
