@@ -24,7 +24,7 @@ import urlab_client
 from urlab_client.cli import main
 from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
-from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import (
     RecordingError,

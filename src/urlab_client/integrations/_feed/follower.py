@@ -18,7 +18,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
-from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
+from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
@@ -75,14 +75,14 @@ class Follower(ClientObserver):
         self._room: Callable[[], Awaitable[None]] | None = None
         self._lost: Callable[[int], None] | None = None
         self._failed: Callable[[URLabError], None] = lambda _: None
-        self._scene: SceneMessages | None = None
+        self._scene: FollowedScene | None = None
         self._described: object = None
         self._due_at: int | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
-    def check(self) -> SceneMessages:
+    def check(self) -> FollowedScene:
         """Describe the scene.
 
         Raises:
@@ -90,9 +90,7 @@ class Follower(ClientObserver):
             KeyError: A camera is unknown.
         """
         if not self._client.urlab_version:
-            raise URLabError(
-                f"{self._name}: what there is to see is not known yet.", hint="Call discover() first, during play."
-            )
+            raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:
             raise URLabError(
                 f"{self._name}: poses are computed with the local model, which this client does not have.",
@@ -154,7 +152,7 @@ class Follower(ClientObserver):
             else:
                 self._ignore()
         if not live:
-            self._hand_on(_detached(state))
+            self._pass_on(_detached(state))
 
     def step_cameras(self, n_steps: int) -> Mapping[str, str]:
         """See the base class; requests the cameras whose next picture is due."""
@@ -176,14 +174,14 @@ class Follower(ClientObserver):
 
     # Inside
 
-    def _current(self) -> SceneMessages:
+    def _current(self) -> FollowedScene:
         """Return the scene, described again after another handshake."""
         described = self._client.articulations  # a new map with each handshake
         if self._scene is None or described is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: the new scene has %s", self._name, unknown)
             self._described = described
-            self._scene = SceneMessages.of(self._client, self._views())
+            self._scene = FollowedScene.of(self._client, self._views())
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
@@ -216,7 +214,7 @@ class Follower(ClientObserver):
         wanted = {id(self._camera(name)) for name in self._wanted_cameras}
         return [(name, view) for name, view in every.items() if id(view) in wanted]
 
-    def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
+    def _pass_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
         if put is None:
             return
@@ -250,7 +248,7 @@ class Follower(ClientObserver):
         self._begin(self._follow_states)
         self._follow_cameras(scene)
 
-    def _follow_cameras(self, scene: SceneMessages) -> None:
+    def _follow_cameras(self, scene: FollowedScene) -> None:
         """Follow this scene's cameras instead of the previous ones."""
         for task in self._camera_tasks:
             task.cancel()
@@ -290,7 +288,7 @@ class Follower(ClientObserver):
                 fresh = self._client.step_mode is StepMode.LIVE and snapshot.time != last
                 if fresh and self._client.matches(snapshot):
                     last = snapshot.time
-                    self._hand_on(snapshot)
+                    self._pass_on(snapshot)
 
     async def _follow_camera(self, camera: CameraLayout) -> None:
         schedule = Schedule(self._camera_ns)

@@ -15,7 +15,7 @@ from urlab_client.integrations._feed.messages import (
     Time,
     values,
 )
-from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
+from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -49,7 +49,7 @@ class State:
     over the wire; a server's draws follow from `scene` and `seed`.
     """
 
-    scene: SceneMessages
+    scene: FollowedScene
     reply: StateReply | StateSnapshot
     set_points: dict[str, list[float]]
     nanoseconds: int

@@ -46,7 +46,7 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        _transitions(run, path.parent, episodes, progress) as (pieces, report),
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
@@ -59,7 +59,7 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
             for start in range(0, len(piece), _ROWS):
                 rows = slice(start, start + _ROWS)
                 writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
-                told(count + start)
+                report(count + start)
             count += len(piece)
     return count
 
@@ -110,7 +110,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        _transitions(run, path.parent, episodes, progress) as (pieces, report),
         contextlib.ExitStack() as stack,
     ):
         writer: Any = None
@@ -123,7 +123,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
             if len(piece):
                 writer.write_table(group)
             count += len(piece)
-            told(count)
+            report(count)
     return count
 
 
@@ -171,7 +171,7 @@ class _Transitions(NamedTuple):
     """The pairs of a recording in pieces, and a callback for the number of written rows."""
 
     pieces: Iterator[Table]
-    told: Progress
+    report: Progress
 
 
 @contextlib.contextmanager
@@ -186,17 +186,17 @@ def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress 
         parts = np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES)
         pieces = (with_goals(pairs_at(table, part), outcomes) for part in parts)
 
-        def told(count: int) -> None:
+        def report(count: int) -> None:
             writing(size * count // max(1, len(rows)))
 
-        yield _Transitions(pieces, told)
+        yield _Transitions(pieces, report)
 
 
-def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, told: Callable[[float], None]) -> None:
+def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, report: Callable[[float], None]) -> None:
     arrays = table.arrays()
     for number, (name, values) in enumerate(arrays.items()):
         parts = np.array_split(values, 1 + values.size // tables.PIECE_VALUES)
-        _save(archive, name, parts, len(table), lambda: told(number / len(arrays)))  # noqa: B023
+        _save(archive, name, parts, len(table), lambda: report(number / len(arrays)))  # noqa: B023
         column = table.columns.get(name)
         if column is not None:
             if len(column.names) * max(map(len, column.names)) > _NAMES_CHARS:  # each takes the space of the longest
@@ -209,7 +209,7 @@ def _save(
     name: str,
     parts: Iterable[NDArray[Any]],
     count: int,
-    told: Callable[[], None] = lambda: None,
+    report: Callable[[], None] = lambda: None,
 ) -> None:
     """Add an array of `count` rows to an archive like `numpy.savez`, with only a part of it in memory.
 
@@ -219,7 +219,7 @@ def _save(
     rows, form = 0, None
     with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
         for part in parts:
-            told()
+            report()
             if form is None:
                 form = part.shape[1:], part.dtype
                 descr = np.lib.format.dtype_to_descr(part.dtype)

@@ -33,7 +33,7 @@ from mcap.records import Channel, Chunk, Footer, Metadata, MetadataIndex, Schema
 from numpy.typing import NDArray
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
-from urlab_client.integrations._feed.scene_messages import SceneLayout, from_metadata
+from urlab_client.integrations._feed.scene import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["IndexedChannel", "Progress", "RecordedMessage", "RecordingIndex"]
@@ -51,7 +51,7 @@ _LISTED = struct.Struct("<HQ")
 _INDEX = struct.Struct("<HI")
 _FOOTER_SIZE = _RECORD.size + 20
 _NO_CHANNELS: frozenset[int] = frozenset()
-_KEPT = 8  # blocks in memory: the one that is played, and those with the newest pictures of some cameras
+_KEPT = 8  # blocks in memory: the current one, and those with the newest pictures of some cameras
 _KEPT_BYTES = 64 << 20
 _TOLD_EVERY = 16
 _BROKEN = (McapError, ZstdError, struct.error, ValueError, OverflowError, MemoryError, RuntimeError)  # the last by LZ4
@@ -71,11 +71,11 @@ _MOST_WALKED = 10_000_000
 _NAME_CHARS = 4096
 
 Positions: TypeAlias = dict[int, NDArray[np.uint64]]
-"""By channel: time, nanoseconds, and offset in the block of each message, shape (n, 2)."""
+"""Time, nanoseconds, and offset in its block of each message, shape (n, 2), by channel."""
 
 
 class IndexedChannel(NamedTuple):
-    """One channel: its topic, the name of its messages' schema, its metadata, and the layout in that."""
+    """One channel: its topic, the name of its messages' schema, its metadata, and the layout in the metadata."""
 
     id: int
     topic: str
@@ -85,7 +85,7 @@ class IndexedChannel(NamedTuple):
 
 
 class RecordedMessage(NamedTuple):
-    """One message: times in nanoseconds, of the recording's clock and of the server's UTC clock, and where it is."""
+    """One message: its position, and its times on the recording's clock and the server's UTC clock, nanoseconds."""
 
     channel: IndexedChannel
     log_time: int
@@ -168,7 +168,7 @@ class RecordingIndex:
     def __post_init__(self) -> None:
         self._earliest: NDArray[np.uint64] = np.zeros(0, np.uint64)
 
-    def having(self, *schemas: str) -> list[IndexedChannel]:
+    def channels_of(self, *schemas: str) -> list[IndexedChannel]:
         """Return the channels whose messages have one of these schemas, by topic."""
         return sorted((one for one in self.channels.values() if one.schema in schemas), key=lambda one: one.topic)
 
@@ -229,7 +229,7 @@ class RecordingIndex:
                     progress(block.start)
 
     def first(self, channel: int) -> RecordedMessage | None:
-        """Return the first message of a channel in the file, None without any.
+        """Return the first message of a channel in the file, or None.
 
         Raises:
             RecordingError: The file is damaged there.
@@ -240,11 +240,11 @@ class RecordingIndex:
         return None
 
     def newest(self, channel: int, at: int | None = None) -> RecordedMessage | None:
-        """Return the last message of a channel that is not after a time in nanoseconds, None without any.
+        """Return the last message of a channel at or before a time, or None.
 
         Args:
-            channel: Its id.
-            at: The time; None for the end of the file.
+            channel: Id of the channel.
+            at: The time, nanoseconds; None for the end of the file.
 
         Raises:
             RecordingError: The file is damaged there.
@@ -328,7 +328,7 @@ class RecordingIndex:
     # Opening
 
     def _read_summary(self, file: BinaryIO, size: int) -> bool:
-        """Read the index at the end; return whether there is one that says where every message is."""
+        """Read the index at the end; return whether there is one that covers all messages."""
         end = size - len(_MAGIC) - _FOOTER_SIZE
         file.seek(max(0, end))
         tail = file.read()
@@ -371,7 +371,7 @@ class RecordingIndex:
         return indexed and apart and bool(self._blocks or not messages)
 
     def _scan(self, file: BinaryIO, size: int, progress: Progress | None) -> None:
-        """Find the messages by the heads of the records, up to where the file breaks off."""
+        """Find the messages by the headers of the records, up to the point where the file breaks off."""
         self.damage = CUT_OFF
         try:
             for number, (at, head) in enumerate(_heads(file, size)):
@@ -390,7 +390,7 @@ class RecordingIndex:
         self._learn_channels(file)
 
     def _note(self, kind: int, at: int, size: int, head: bytes) -> None:
-        """Note where a record with messages, or with their positions, is."""
+        """Add a record with messages, or with their positions, to the blocks."""
         if len(self._blocks) > _MOST_BLOCKS:
             raise ValueError(f"it has more than {_MOST_BLOCKS} chunks")
         last = self._blocks[-1] if self._blocks else None
@@ -416,7 +416,7 @@ class RecordingIndex:
                 pass
 
     def _learn_channels(self, file: BinaryIO) -> None:
-        """Read the blocks that declare channels; the index of the last one may not be whole, so it is read, too."""
+        """Read the blocks that declare channels, and the last one, whose index may be incomplete."""
         for number, block in enumerate(self._blocks):
             last = number == len(self._blocks) - 1 or not block.index_size
             if not last and block.channels <= self.channels.keys():

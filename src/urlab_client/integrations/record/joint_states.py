@@ -1,4 +1,4 @@
-"""Recordings that the server made: the plugin's JSON files of joint states, read as a recording of our own is."""
+"""Recordings of the server: the plugin's JSON files of joint states, with the interface of our own recordings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations._feed.quantities import quantities
-from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import (
     Column,
     RecordedArticulation,
@@ -31,7 +31,7 @@ from urlab_client.server.physics.recording import Frame, decode_json
 __all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
 
 OWNER: Final = "joints"
-"""What takes the place of an articulation's key: the file names compiled joints, of whatever robot."""
+"""Key of the only articulation, because the file names compiled joints and no robots."""
 
 _NS = 1e9
 _HEAD = 64
@@ -44,17 +44,17 @@ _VELOCITIES = {1: ("",), 3: (".wx", ".wy", ".wz"), 6: (".vx", ".vy", ".vz", ".wx
 
 
 def is_joint_states(path: Path) -> bool:
-    """Return whether a file begins as the plugin's recordings do: an object with the list `Frames`."""
+    """Return whether a file begins like the plugin's recordings: an object with the list `Frames`."""
     with path.open("rb") as file:
         text = file.read(_HEAD).replace(b"\0", b"").lstrip(b"\xff\xfe\xef\xbb\xbf \t\r\n")
     return text[:1] == b"{" and text[1:].lstrip()[:8].lower() == b'"frames"'
 
 
 class JointStatesRun(Run):
-    """A recording of joint states alone: no set-points, sensors or pictures."""
+    """A recording of joint states only, without set-points, sensors and pictures."""
 
     def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
-        """Say what is in it. Reading the file verifies it."""
+        """Return a summary of the contents. Reading the file verifies it."""
         del progress, verify
         table = self.table()
         stamps = (table.time * _NS).astype(np.int64)
@@ -75,7 +75,7 @@ class JointStatesRun(Run):
         )
 
     def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
-        """Return all states, with the columns `joints/qpos` and `joints/qvel`; values are named as compiled joints are.
+        """Return all states as `joints/qpos` and `joints/qvel`; values have the names of compiled joints.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -135,7 +135,7 @@ class JointStatesRun(Run):
         yield self.table(progress, fields=fields)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
-        """Return nothing: a server marks no episodes."""
+        """Return no outcomes, because a server marks no episodes."""
         return ()
 
     @cached_property
@@ -149,7 +149,7 @@ class JointStatesRun(Run):
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
     def state_at(self, time: float) -> RecordedState | None:
-        """Return the newest state that is not after a time, None without any; all joints are one articulation.
+        """Return the newest state at or before a time, or None; all joints are one articulation.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -182,11 +182,11 @@ class JointStatesRun(Run):
         return {} if column is None else {OWNER: column.names}
 
     def cameras(self) -> list[str]:
-        """Return nothing: the file holds no pictures."""
+        """Return no cameras, because the file contains no pictures."""
         return []
 
     def _camera(self, name: str) -> list[IndexedChannel]:
-        raise KeyError(f"no pictures of {name!r} in {self.path}: a recording of the server holds joint states alone")
+        raise KeyError(f"no pictures of {name!r} in {self.path}: a recording of the server contains only joint states")
 
 
 def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ _DEADLINE_S = 600.0
 _FRAME_S = 2.0  # which may pass for each frame of an episode besides, while that is encoded
 _LOOK_S = 0.5  # on Windows nothing interrupts a thread that waits
 _ENDING_S = 10.0
-_AHEAD = 2  # files that wait to be taken
+_AHEAD = 2  # pending files
 _PROBE_S = 120.0
 _TOGETHER = 64  # frames per batch
 _MOST_FRAMES = 10_000_000  # of an episode
@@ -103,12 +103,12 @@ def write_lerobot(
         rate = _rate(run, [*times.values()] or [table.time]) if fps is None else fps
         rows = _resampled(run, table, pairs, rate, [*times.values()])
         if not len(rows):
-            raise RecordingError(f"{run.path}: there is nothing to make a dataset of.")
+            raise RecordingError(f"{run.path}: it contains nothing for a dataset.")
         episode, when = table.episode[rows], table.time[rows]
         limit = 1 / rate if max_picture_age is None else max_picture_age
         chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
         if not np.isfinite(_goals_of(np.unique(episode), outcomes)).all():
-            raise RecordingError(f"{run.path}: it is not known what some of its episodes were about.")
+            raise RecordingError(f"{run.path}: the goals of some of its episodes are unknown.")
         first = with_goals(pairs_at(table, rows[:1]), outcomes)
         robots = [key.removesuffix("/action") for key in first.columns if key.endswith("/action")]
         plan = {
@@ -172,7 +172,7 @@ class _Pictures:
         """Return pictures, shape (k, H, W, 3), and which of them each of some frames shows.
 
         Raises:
-            RecordingError: They are not all of one size, or are other ones than before.
+            RecordingError: They are not all of one size, or some that were there before are missing.
         """
         wanted, places = np.unique(numbers, return_inverse=True)
         found = [self._picture(number) for number in wanted.tolist()]
@@ -191,7 +191,7 @@ class _Pictures:
                 shown = visible(pixels, self._far)
                 self._pixels = even(shown) if self._video else shown
         if self._number != number:
-            raise RecordingError(f"{self._run.path}: the pictures of {self._camera} are other ones than before.")
+            raise RecordingError(f"{self._run.path}: some pictures of {self._camera} have disappeared.")
         return self._pixels
 
 
@@ -229,7 +229,7 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
     rate = 1 / float(np.median(distances)) if len(distances) else 0.0
     if round(rate) < 1 or abs(rate - round(rate)) > 0.01 * rate:
         raise RecordingError(
-            f"{run.path}: LeRobot wants whole frames per second, and the recording has {rate:.3g}.",
+            f"{run.path}: LeRobot needs a whole number of frames per second, but the recording has {rate:.3g}.",
             hint="Name the rate with --fps.",
         )
     return round(rate)
@@ -311,7 +311,7 @@ class LeRobot:
         self._work = work
         self._frames = self._files = 0
         self._waiting: deque[float] = deque()
-        """Until when each file must be taken, seconds from when it is waited for."""
+        """Seconds within which LeRobot must read each file, from the start of the wait for it."""
         self._replies: queue.SimpleQueue[str] = queue.SimpleQueue()
         with (work / "errors.txt").open("wb") as errors:
             self._process = subprocess.Popen(  # noqa: S603  # the user's own interpreter
@@ -334,11 +334,11 @@ class LeRobot:
     ) -> None:
         self._kill()
         if self._process.stdin is not None:
-            with contextlib.suppress(OSError):  # what it did not read any more
+            with contextlib.suppress(OSError):  # if LeRobot has stopped reading
                 self._process.stdin.close()
 
     def add(self, arrays: Mapping[str, NDArray[Any]], *, ends_episode: bool) -> None:
-        """Hand frames over, and wait while too many do.
+        """Pass on frames, and wait while too many are pending.
 
         Raises:
             RecordingError: LeRobot failed, or takes too long.
@@ -358,7 +358,7 @@ class LeRobot:
             raise self._broken_off() from None
 
     def finish(self) -> None:
-        """Wait until the dataset is whole.
+        """Wait until the dataset is complete.
 
         Raises:
             RecordingError: LeRobot failed, or takes too long.
@@ -393,7 +393,9 @@ class LeRobot:
     def _listen(self) -> None:
         output = self._process.stdout
         if output is not None:
-            with output:  # closed here and not by who waits: what encodes videos may outlive LeRobot and hold it open
+            with (
+                output
+            ):  # closed here and not by the waiting thread, because encoders may outlive LeRobot and keep it open
                 for line in output:
                     self._replies.put(line)
         self._replies.put("")
@@ -407,7 +409,7 @@ class LeRobot:
             if sys.platform == "win32":
                 self._process.kill()
             else:
-                os.killpg(self._process.pid, signal.SIGKILL)  # with those that encode videos for it
+                os.killpg(self._process.pid, signal.SIGKILL)  # with the encoders of its videos
             self._process.wait()
 
     def _broken_off(self) -> RecordingError:
@@ -416,13 +418,13 @@ class LeRobot:
             failed.__cause__ = self._failure.__cause__
             return failed
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_ENDING_S)  # it says why when it ends
+            self._process.wait(_ENDING_S)  # its reason is complete when it has ended
         self._kill()
         said = (self._work / "errors.txt").read_text(encoding="utf-8", errors="replace")
         return RecordingError(f"LeRobot failed: {_last_line(said)}.")
 
 
 def _last_line(text: str) -> str:
-    """Return the last line of what a program said."""
+    """Return the last line of the output of a program."""
     lines = text.strip().splitlines()
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "it printed nothing"

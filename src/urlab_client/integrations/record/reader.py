@@ -126,7 +126,7 @@ class Run:
             times.setdefault(index.channels[channel].topic, []).append(stamps)
         stamps_of = {topic: np.concatenate(parts) for topic, parts in sorted(times.items())}
         schemas = {channel.topic: channel.schema for channel in index.channels.values()}
-        states = [found for one in index.having(_STATES) if (found := index.newest(one.id)) is not None]
+        states = [found for one in index.channels_of(_STATES) if (found := index.newest(one.id)) is not None]
         gaps = self._contents(index, GapMessage, _gap)
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
         ends_of = [(index.first(one), index.newest(one)) for one in index.channels]
@@ -192,7 +192,7 @@ class Run:
             RecordingError: The file is not a recording.
         """
         index = self._index()
-        channels = index.having(_STATES, _ENTITIES)
+        channels = index.channels_of(_STATES, _ENTITIES)
         ends = [end for channel in channels for end in (index.first(channel.id), index.newest(channel.id))]
         times = [end.log_time for end in ends if end is not None]
         return min(times, default=0) / _NS, max(times, default=0) / _NS
@@ -208,7 +208,7 @@ class Run:
             ValueError: The time is NaN.
         """
         index = self._index()
-        found = [_newest(index, [channel], time) for channel in index.having(_STATES, _ENTITIES)]
+        found = [_newest(index, [channel], time) for channel in index.channels_of(_STATES, _ENTITIES)]
         states: dict[str, tuple[RecordedMessage, _State]] = {}
         entities: dict[str, tuple[RecordedMessage, _Entity]] = {}
         for message in found:
@@ -243,7 +243,7 @@ class Run:
         """
         index = self._index()
         found: dict[str, list[str]] = {}
-        for channel in index.having(_STATES):
+        for channel in index.channels_of(_STATES):
             first = index.first(channel.id)
             if first is not None:
                 count, names = len(_decoded(index, first, _state).qpos), channel.layout.qpos
@@ -254,7 +254,7 @@ class Run:
     def cameras(self) -> list[str]:
         """Return the names of the cameras with pictures in the file."""
         index = self._index()
-        pictures = [channel for channel in index.having(*_PICTURES) if channel.topic.startswith(_CAMERA)]
+        pictures = [channel for channel in index.channels_of(*_PICTURES) if channel.topic.startswith(_CAMERA)]
         cameras = [channel for channel in pictures if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
@@ -327,7 +327,7 @@ class Run:
 
     def _camera(self, name: str) -> list[IndexedChannel]:
         index = self._index()
-        channels = [one for one in index.having(*_PICTURES) if one.topic == _CAMERA + name]
+        channels = [one for one in index.channels_of(*_PICTURES) if one.topic == _CAMERA + name]
         channels = [one for one in channels if index.first(one.id) is not None]
         if not channels:
             raise KeyError(f"no pictures of {name!r} in {self.path}; there are: {', '.join(self.cameras()) or 'none'}")
@@ -353,10 +353,10 @@ class Run:
         self.damage = index.damage
 
     def _contents(self, index: RecordingIndex, kind: type[msgspec.Struct], decode: Callable[[bytes], _T]) -> list[_T]:
-        """Return all messages of a kind of which a recording has few."""
+        """Return all messages of a kind that is rare in recordings."""
         found: list[_T] = []
         left = max(_KEPT_BYTES, 4 * self.path.stat().st_size)
-        for message in self._messages(index, [channel.id for channel in index.having(schema_name(kind))]):
+        for message in self._messages(index, [channel.id for channel in index.channels_of(schema_name(kind))]):
             left -= len(message.data)
             if left < 0:
                 raise index.unreadable(message, "with those before it, it is larger than the file can be")
@@ -369,7 +369,7 @@ class Run:
 
     def _read_states(self, builder: TableBuilder, progress: Progress | None) -> Table:
         index = self._index(progress)
-        channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
+        channels = [channel.id for channel in index.channels_of(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
             take = self._take_state if message.channel.schema == _STATES else _take_entity
             try:

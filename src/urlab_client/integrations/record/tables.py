@@ -13,7 +13,7 @@ from typing import IO, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from urlab_client.integrations._feed.quantities import component_name, quantities
-from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
 

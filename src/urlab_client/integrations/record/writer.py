@@ -44,7 +44,7 @@ from urlab_client.integrations._feed.samples import (
     articulation_message,
     picture_message,
 )
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -323,7 +323,7 @@ class _Sink:
     _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
-    _scene: SceneMessages | None = None
+    _scene: FollowedScene | None = None
     _simulation: Simulation | None = None
     _reported: tuple[int, int] = (0, 0)
     _dirty_since: float | None = None
@@ -436,7 +436,7 @@ class _Sink:
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
 
-    def _use(self, scene: SceneMessages) -> None:
+    def _use(self, scene: FollowedScene) -> None:
         self._scene = scene
         wanted = scene.model is not None and self.options.pose_ns > 0
         self._simulation = Simulation(scene, scene.model) if wanted and scene.model is not None else None

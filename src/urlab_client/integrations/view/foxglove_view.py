@@ -23,7 +23,7 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
 )
 from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
@@ -97,7 +97,7 @@ class _Foxglove:
                 hint="Another program may hold it; port=0 (--port 0) takes any free one.",
             ) from None
 
-    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
         self._shapes = shapes_of(simulation.model, simulation.bodies)
         del scene
@@ -129,8 +129,7 @@ class _Foxglove:
     def idle(self) -> bool:
         """See `ViewBackend`."""
         # So that clients that join while time stands still see something. Repeated, because a subscription may be
-        # reported
-        # before it takes effect.
+        # reported before it takes effect.
         now = time.monotonic()
         if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
             self._shown = now

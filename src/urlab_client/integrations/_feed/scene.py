@@ -1,4 +1,4 @@
-"""Names, addresses and cameras of a recording from one handshake, and poses from its model."""
+"""The scene of a client after a handshake: names, addresses and cameras, and poses computed with its model."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CameraLayout",
+    "FollowedScene",
     "SceneLayout",
-    "SceneMessages",
     "Simulation",
     "calibration",
     "from_metadata",
@@ -85,7 +85,7 @@ class CameraLayout:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneMessages:
+class FollowedScene:
     """The parts of a handshake that a recording needs. Immutable, because the writing thread uses it.
 
     Attributes:
@@ -107,7 +107,7 @@ class SceneMessages:
     variation: Variation | None
 
     @classmethod
-    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
+    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
         """Build the description of a client's scene."""
         model, arts = client.model, client.articulations
         prefixes = {key: art.compiled_prefix for key, art in arts.items()}
@@ -146,7 +146,7 @@ class Simulation:
         scene: The scene, with a model.
     """
 
-    def __init__(self, scene: SceneMessages, model: mujoco.MjModel) -> None:
+    def __init__(self, scene: FollowedScene, model: mujoco.MjModel) -> None:
         import mujoco  # noqa: PLC0415
 
         self._scene = scene
@@ -254,7 +254,7 @@ class Simulation:
         return found
 
     def _owner(self, geom: int) -> str:
-        """Return the body of a geom; None for a flex."""
+        """Return the body of a geom; empty for a flex."""
         return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
 
     def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
