@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from urlab_client.randomise.declaration import Randomisation
     from urlab_client.randomise.variation import EpisodeDraws, Variation
 
-__all__ = ["VariedByOps", "controlled_actuators", "variation_of", "varied_by_ops"]
-
 
 class VariedByOps(ClientObserver):
     """What an environment varies by ops, on a server that varies nothing itself.

@@ -27,8 +27,6 @@ from urlab_client.protocol.names import did_you_mean
 from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._portal import Portal
 
-__all__ = ["BlockingFlavour", "Follower", "Following"]
-
 log = logging.getLogger("urlab_client.feed")
 
 _NS = 1_000_000_000

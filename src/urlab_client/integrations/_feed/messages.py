@@ -13,31 +13,6 @@ from msgspec import Meta, Struct
 
 from urlab_client.protocol.base import Floats
 
-__all__ = [
-    "ArticulationMessage",
-    "CameraCalibration",
-    "CompressedImage",
-    "ContactMessage",
-    "ContactsMessage",
-    "Count",
-    "EntityMessage",
-    "EpisodeOutcome",
-    "FrameTransform",
-    "FrameTransforms",
-    "GapMessage",
-    "JointState",
-    "JointStates",
-    "OutcomeMessage",
-    "Quaternion",
-    "RawImage",
-    "Time",
-    "Vector3",
-    "encode",
-    "schema_name",
-    "schema_of",
-    "values",
-]
-
 _NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as in protobuf's JSON
 
 

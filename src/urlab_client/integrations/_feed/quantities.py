@@ -6,8 +6,6 @@ from typing import Final
 
 from urlab_client.integrations._feed.scene import SceneLayout
 
-__all__ = ["component_name", "quantities"]
-
 _UNKNOWN = "reading"
 
 _SENSORS: Final[dict[str, str]] = {

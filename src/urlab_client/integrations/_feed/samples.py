@@ -26,17 +26,6 @@ from urlab_client.protocol.pixels import Pixels, decode_camera
 if TYPE_CHECKING:
     from urlab_client.randomise.variation import EpisodeDraws
 
-__all__ = [
-    "CameraPicture",
-    "EpisodeMark",
-    "SampleClock",
-    "Schedule",
-    "State",
-    "articulation_message",
-    "compressed",
-    "picture_message",
-]
-
 _FALLBACK_NS = 1_000_000
 
 

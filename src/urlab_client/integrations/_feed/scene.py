@@ -35,17 +35,6 @@ if TYPE_CHECKING:
 
     from urlab_client.randomise.variation import Variation
 
-__all__ = [
-    "CameraLayout",
-    "FollowedScene",
-    "SceneLayout",
-    "Simulation",
-    "calibration",
-    "from_metadata",
-    "joint_columns",
-    "to_metadata",
-]
-
 _BALL, _SLIDE = 1, 2  # mjJNT_BALL, mjJNT_SLIDE
 # From MuJoCo's camera axes (x right, y up, looking along -z) to an image's (x right, y down, looking along z).
 _OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])

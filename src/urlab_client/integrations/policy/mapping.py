@@ -38,8 +38,6 @@ from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.pixels import observed_pixels
 from urlab_client.sync.articulation import URLabArticulation
 
-__all__ = ["Input", "PolicyMapping", "PolicyMismatch", "PolicyRobot", "RobotState"]
-
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 
 PolicyRobot: TypeAlias = AsyncArticulation | URLabArticulation

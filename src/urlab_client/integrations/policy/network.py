@@ -14,8 +14,6 @@ from urlab_client._extras import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Network", "OnnxDictNetwork", "OnnxInputs", "OnnxNetwork", "PicturesNetwork"]
-
 _BYTES: Final = "tensor(uint8)"
 
 

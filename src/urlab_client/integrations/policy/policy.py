@@ -15,8 +15,6 @@ from urlab_client.integrations.policy.network import Network, OnnxInputs, OnnxNe
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Policy", "load"]
-
 
 class Policy:
     """A policy that controls one robot at a time.

@@ -22,8 +22,6 @@ from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["PolicyRun", "require", "run", "run_blocking"]
-
 _STANDSTILL_S: Final = 5.0
 _SMOOTHING_S: Final = 0.5
 _TIMESTEP_TOLERANCE: Final = 1e-9

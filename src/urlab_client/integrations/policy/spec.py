@@ -20,8 +20,6 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["PolicyFileError", "PolicySpec", "parse_spec", "read_spec"]
-
 
 class PolicyFileError(URLabError, ValueError):
     """The files of a policy cannot be used. The message names the file, the place in it and the valid choices."""

@@ -24,9 +24,10 @@ from urlab_client._extras import need
 from urlab_client._whole_files import replaced
 from urlab_client.integrations.record import tables
 from urlab_client.integrations.record.contents import Table
+from urlab_client.integrations.record.index import Progress
 from urlab_client.integrations.record.lerobot import write_lerobot
 from urlab_client.integrations.record.pictures import even, farthest, visible
-from urlab_client.integrations.record.reader import Progress, Run, phases
+from urlab_client.integrations.record.reader import Run, phases
 from urlab_client.integrations.record.transitions import Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 

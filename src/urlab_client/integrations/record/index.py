@@ -36,8 +36,6 @@ from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 from urlab_client.integrations._feed.scene import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 
-__all__ = ["IndexedChannel", "Progress", "RecordedMessage", "RecordingIndex"]
-
 Progress: TypeAlias = Callable[[int], None]
 
 UNKNOWN = "neither an MCAP file nor a recording of the server."

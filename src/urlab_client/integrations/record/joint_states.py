@@ -23,12 +23,10 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.index import IndexedChannel
-from urlab_client.integrations.record.reader import Progress, Run
+from urlab_client.integrations.record.index import IndexedChannel, Progress
+from urlab_client.integrations.record.reader import Run
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.server.physics.recording import Frame, decode_json
-
-__all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
 
 OWNER: Final = "joints"
 """Key of the only articulation, because the file names compiled joints and no robots."""

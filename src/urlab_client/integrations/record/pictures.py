@@ -14,8 +14,6 @@ from urlab_client.integrations._feed.messages import CompressedImage, RawImage
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.pixels import Pixels, without_alpha
 
-__all__ = ["RecordedPicture", "even", "farthest", "visible"]
-
 _MOST_PIXELS = 8192 * 8192
 
 

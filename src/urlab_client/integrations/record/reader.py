@@ -44,8 +44,6 @@ from urlab_client.integrations.record.tables import Number, SampleTimes, TableBu
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Progress", "Run", "phases", "read_run"]
-
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _STATES, _ENTITIES = schema_name(ArticulationMessage), schema_name(EntityMessage)

@@ -27,8 +27,6 @@ from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["AsyncRecorder", "Recorder", "record"]
-
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20

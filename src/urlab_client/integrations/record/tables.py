@@ -17,8 +17,6 @@ from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
 
-__all__ = ["PIECE_VALUES", "Number", "SampleTimes", "TableBuilder"]
-
 PIECE_VALUES = 1 << 20
 """Approximate number of values that are handled at once: 8 MiB."""
 

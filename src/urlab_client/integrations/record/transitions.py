@@ -13,17 +13,6 @@ from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.integrations.record.reader import Run
 
-__all__ = [
-    "GOAL",
-    "Episodes",
-    "check_episodes",
-    "pair_rows",
-    "pairs_at",
-    "transitions",
-    "transitions_of",
-    "with_goals",
-]
-
 Episodes = Literal["kept", "success", "all"]
 """Selection of episodes: those not discarded, only successes, or all."""
 

@@ -51,8 +51,6 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
-
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
 FORMAT = "1"

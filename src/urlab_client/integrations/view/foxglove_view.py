@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from foxglove.channels import SceneUpdateChannel
     from foxglove.websocket import ChannelView, Client, WebSocketServer
 
-__all__ = ["foxglove_view"]
-
 _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 _BACKLOG = 64  # queue length per browser; older messages are dropped

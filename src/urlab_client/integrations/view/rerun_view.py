@@ -23,8 +23,6 @@ from urlab_client.sync.client import URLabClient
 if TYPE_CHECKING:
     import rerun
 
-__all__ = ["rerun_view"]
-
 _NS = 1_000_000_000
 _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton

@@ -28,8 +28,6 @@ from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]
-
 log: logging.Logger = logging.getLogger("urlab_client.view")
 
 _NS = 1_000_000_000

@@ -17,8 +17,6 @@ from urlab_client.sync.client import URLabClient
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["missing_for_window", "window_view"]
-
 
 def missing_for_window() -> str:
     """Return why no window can be opened here; empty if it can."""
