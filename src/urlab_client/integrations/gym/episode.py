@@ -205,7 +205,7 @@ class EnvEpisode:
 
     async def close(self) -> None:
         """Undo the variation by ops. If the server is gone, do nothing."""
-        if self.over_wire is not None and self._draws is not None:
+        if self.over_wire is not None:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 

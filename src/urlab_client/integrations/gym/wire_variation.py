@@ -105,8 +105,11 @@ class WireVariation:
         self.variation.start(draws, qpos)
 
     async def undo(self) -> None:
-        """Restore gravity and gains."""
+        """Restore gravity and gains if an episode has varied them."""
         self._client.remove_observer(self._varied)
+        if self._varied.draws is None:
+            return
+        self._varied.draws = None
         if self._model_fields:
             self.variation.restore(self._model_fields.__getitem__)
             await self._set_gravity()
