@@ -23,9 +23,9 @@ from urlab_client.integrations.record.transitions import transitions_of
 
 
 def changing(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
-    """States of a scene in which a robot and an entity come later, and a sensor gets wider."""
+    """States of a scene in which a robot and an entity come later, and a sensor gets wider in between."""
     for i in range(count):
-        readings = {"touch": [0.5] if i < 23 else [0.5, float(i)]}
+        readings = {"touch": [0.5] if i < 37 else [0.5, float(i)]}
         late = {"late": Robot([i / 3, 1.0])} if i > 31 and i % 7 else {}
         yield {"arm": Robot([i / 7], readings), **late}, {"box": [float(i), 0.0, 0.0]} if i > 41 else {}
 
