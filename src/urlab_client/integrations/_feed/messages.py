@@ -31,11 +31,6 @@ class Time(Struct, frozen=True):
         """Split nanoseconds."""
         return cls(*divmod(nanoseconds, 1_000_000_000))
 
-    @property
-    def nanoseconds(self) -> int:
-        """Both parts as one number of nanoseconds."""
-        return self.sec * 1_000_000_000 + self.nsec
-
 
 class Vector3(Struct, frozen=True):
     """Metres, or newtons."""

@@ -173,7 +173,7 @@ class TableBuilder:
         partial = broken_off and not self._present_before <= self._present
         self._store(len(self._times) - partial)
         rows = self._rows.values()
-        whole = rows.view(np.int64)
+        whole = rows.view(np.int64)  # their columns hold the bits of integers
         return Table(
             time=rows[:, 0],
             sim_time=rows[:, 1],
