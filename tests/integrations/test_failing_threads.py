@@ -16,9 +16,9 @@ from urlab_client.aio import URLabClient
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.gym import pictures as drawing
 from urlab_client.integrations.gym import vector
-from urlab_client.integrations.record import RecordingError, lerobot_process, read_run, record
+from urlab_client.integrations.record import RecordingError, lerobot, read_run, record
 from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.record.lerobot_process import LeRobot
+from urlab_client.integrations.record.lerobot import LeRobot
 from urlab_client.integrations.view.view import AsyncView, ViewOptions
 from urlab_client.protocol.errors import ConnectionLost, URLabError
 from urlab_client.server import SimulatedServer
@@ -148,7 +148,7 @@ def test_the_thread_that_listens_to_lerobot(
 ) -> None:
     script = tmp_path / "script.py"
     script.write_text("import sys\nsys.stdout.buffer.write(b'\\xff\\n')\nsys.stdout.flush()\nsys.stdin.read()\n")
-    monkeypatch.setattr(lerobot_process, "_SCRIPT", script)
+    monkeypatch.setattr(lerobot, "_SCRIPT", script)
     with LeRobot(sys.executable, tmp_path) as robot:
         robot.add({"state": np.zeros((1, 2))}, ends_episode=True)
         with pytest.raises(RecordingError, match="could not be read: UnicodeDecodeError") as caught:

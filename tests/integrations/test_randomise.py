@@ -105,6 +105,14 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
             URLabEnv.connect(where(second), randomise=Randomisation())
 
 
+def declared_while(client: urlab_client.URLabClient, path: Path) -> Randomisation | None:
+    """Return what a recording that is made now says about what varies."""
+    with record(client, path, pose_hz=0):
+        pass
+    said = read_run(path).summary().about.get("randomise")
+    return None if said is None else Randomisation.from_json(said)
+
+
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
 def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(
     made: list[Any], dialect: Any, tmp_path: Path
@@ -148,9 +156,14 @@ def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(
                 assert np.allclose(ours[0], theirs[0], rtol=0, atol=1e-3)
             assert robot.controller.kp != before
             assert client.runtime.set_sim_options().gravity != gravity
+            less = Randomisation(vary=declared.vary[:1])
+            unused = URLabEnv(client, task=FreeWalk(), **{**options, "randomise": less})
+            assert declared_while(client, tmp_path / "unused.mcap") == less, "the newest environment"
             env.close()
             assert robot.controller.kp == before
             assert client.runtime.set_sim_options().gravity == gravity
+            unused.close()
+            assert declared_while(client, tmp_path / "closed.mcap") is None
 
             wire = URLabVectorEnv([where(server)], task=FreeWalk(), **options)
             made.append(wire)

@@ -137,6 +137,8 @@ def test_the_file_holds_to_the_bit_what_the_client_saw(client: urlab_client.URLa
     assert summary.topics["/state/arm"].messages == 120
     assert summary.topics["/state/arm"].rate_hz == pytest.approx(250)
     assert math.isclose(summary.duration_s, 0.004 * 119)
+    assert summary.wall_s == pytest.approx((table.wall_ns[-1] - table.wall_ns[0]) / 1e9)
+    assert summary.wall_s > 0
 
 
 async def test_the_async_flavour_writes_the_same(server: SimulatedServer, tmp_path: Path) -> None:

@@ -24,21 +24,19 @@ import urlab_client
 from urlab_client.cli import main
 from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
-from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import (
     RecordingError,
     Run,
     export,
-    lerobot_process,
-    lerobot_writer,
     read_run,
     record,
-    table_builder,
+    tables,
 )
-from urlab_client.integrations.record.lerobot_process import LeRobot
-from urlab_client.integrations.record.lerobot_writer import _rate
-from urlab_client.integrations.record.pixels import even, visible
+from urlab_client.integrations.record import lerobot as lerobot_dataset
+from urlab_client.integrations.record.lerobot import LeRobot, _rate
+from urlab_client.integrations.record.pictures import even, visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
@@ -129,8 +127,8 @@ def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
 @pytest.fixture
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording of a hundred states is read in about fifteen pieces, as one of a night is."""
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
-    monkeypatch.setattr(lerobot_writer, "_TOGETHER", 3)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 500)
+    monkeypatch.setattr(lerobot_dataset, "_TOGETHER", 3)
 
 
 @pytest.mark.usefixtures("small_pieces")
@@ -271,7 +269,7 @@ def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, mon
         "time.sleep(600)\n"
     )
     python.chmod(0o700)
-    monkeypatch.setattr(lerobot_process, "_DEADLINE_S", 0.1)
+    monkeypatch.setattr(lerobot_dataset, "_DEADLINE_S", 0.1)
     with LeRobot(str(python), tmp_path) as writer:
         writer._process.wait()
         with pytest.raises(RecordingError, match="LeRobot did not finish"):

@@ -11,21 +11,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from children import in_background
 from made_recordings import Robot, write_recording
 
 from urlab_client._whole_files import replaced
 from urlab_client.cli import main
-from urlab_client.integrations.record import Run, export, read_run, table_builder
-from urlab_client.integrations.record.transitions import transition_pieces, transitions_of
+from urlab_client.integrations.record import Run, export, read_run, tables
+from urlab_client.integrations.record.transitions import transitions_of
 
 
 def changing(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
-    """States of a scene in which a robot and an entity come later, and a sensor gets wider."""
+    """States of a scene in which a robot and an entity come later, and a sensor gets wider in between."""
     for i in range(count):
-        readings = {"touch": [0.5] if i < 23 else [0.5, float(i)]}
+        readings = {"touch": [0.5] if i < 37 else [0.5, float(i)]}
         late = {"late": Robot([i / 3, 1.0])} if i > 31 and i % 7 else {}
         yield {"arm": Robot([i / 7], readings), **late}, {"box": [float(i), 0.0, 0.0]} if i > 41 else {}
 
@@ -37,7 +37,8 @@ def steady(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]
 def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "run.mcap"
+    file, made = tmp_path / "run.mcap", tmp_path / "made" / "run.parquet"
+    made.parent.mkdir()
     write_recording(file, changing(70), episode_length=20, chunk_size=350)
     partial = set[bool]()
     size = file.stat().st_size
@@ -45,32 +46,35 @@ def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_m
     for end in (size, *range(messages_end - 50, messages_end - 1000, -200)):
         os.truncate(file, end)
         run = read_run(file)
+        monkeypatch.setattr(tables, "PIECE_VALUES", 1 << 21)
         whole, pairs = run.table(), transitions_of(run)
         partial.add(len(whole) < run.summary().topics["/state/arm"].messages)
         assert {"arm/sensors", "late/qpos", "box/pose"} <= whole.columns.keys()
         for values in (1, 150):
-            monkeypatch.setattr(table_builder, "PIECE_VALUES", values)
+            monkeypatch.setattr(tables, "PIECE_VALUES", values)
             with run.stored_table(tmp_path) as stored:
-                assert len(stored) == len(whole)
-                pieces = [*stored.pieces()]
-                assert len(pieces) > 5
-                found = [*transition_pieces(pieces, (), "kept")]
-                for name, expected in whole.arrays().items():
-                    assert np.concatenate([*stored.parts(name)]).tobytes() == expected.tobytes()
-                for name, expected in pairs.flat().items():
-                    assert np.concatenate([piece.flat()[name] for piece in found]).tobytes() == expected.tobytes()
-                assert [(one.names, one.quantities) for one in stored.last.columns.values()] == [
-                    (one.names, one.quantities) for one in whole.columns.values()
-                ]
+                for found in (stored, run.table()):
+                    assert found.columns.keys() == whole.columns.keys()
+                    for name, expected in whole.arrays().items():
+                        assert found.arrays()[name].tobytes() == expected.tobytes()
+                    assert [(one.names, one.quantities) for one in found.columns.values()] == [
+                        (one.names, one.quantities) for one in whole.columns.values()
+                    ]
+            assert export.write_parquet(run, made) == len(pairs)
+            read = parquet.read_table(made)
+            assert parquet.ParquetFile(made).num_row_groups > 5
+            for name, expected in pairs.flat().items():
+                assert read[name].to_numpy().tobytes() == expected.tobytes()
     assert partial == {False, True}, "some of the files end in the middle of a state"
-    assert os.listdir(tmp_path) == [file.name]
+    assert sorted(os.listdir(tmp_path)) == ["made", file.name]
+    assert os.listdir(made.parent) == [made.name]
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
 def test_a_long_recording_is_converted_in_the_memory_of_a_short_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 2000)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 2000)
     file, write = tmp_path / "run.mcap", getattr(export, f"write_{kind}")
     peaks: list[int] = []
     for count in (200, 200, 1600):  # the first time imports what the conversion needs
@@ -90,7 +94,7 @@ def test_a_long_recording_is_converted_in_the_memory_of_a_short_one(
 def test_a_conversion_that_breaks_off_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    monkeypatch.setattr(tables, "PIECE_VALUES", 500)
     source, folder = tmp_path / "run.mcap", tmp_path / "made"
     folder.mkdir()
     write_recording(source, steady(100), chunk_size=5000)

@@ -234,6 +234,11 @@ class ClientState:
         """
         return self._state.matches(snapshot)
 
+    @property
+    def observers(self) -> tuple[ClientObserver, ...]:
+        """The observers that `add_observer()` has added."""
+        return self._state.observers
+
     def add_observer(self, observer: ClientObserver) -> None:
         """Notify `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
         if observer not in self._state.observers:

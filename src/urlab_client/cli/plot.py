@@ -99,7 +99,7 @@ def run(arguments: PlotArguments) -> int:
 
 
 def _chosen(table: Table, arguments: PlotArguments) -> dict[str, list[str]]:
-    from urlab_client.integrations._feed.scene_messages import joint_columns  # noqa: PLC0415
+    from urlab_client.integrations._feed.scene import joint_columns  # noqa: PLC0415
 
     chosen: dict[str, list[str]] = {}
     there: list[str] = []

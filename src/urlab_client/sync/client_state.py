@@ -199,6 +199,11 @@ class ClientState(Facade, twin=aio.ClientState):
         """
         return self._aio.matches(snapshot)
 
+    @property
+    def observers(self) -> tuple[ClientObserver, ...]:
+        """The observers that `add_observer()` has added."""
+        return self._aio.observers
+
     def add_observer(self, observer: ClientObserver) -> None:
         """Notify `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
         self._aio.add_observer(observer)

@@ -7,7 +7,8 @@ import copy
 import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
-from typing import Literal, TypeVar
+from types import TracebackType
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -15,17 +16,16 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
-from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
-from urlab_client.integrations._varied import OVER_WIRE
+from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import did_you_mean
 from urlab_client.protocol.observer import ClientObserver
-
-__all__ = ["Follower"]
+from urlab_client.sync._portal import Portal
 
 log = logging.getLogger("urlab_client.feed")
 
@@ -73,14 +73,14 @@ class Follower(ClientObserver):
         self._room: Callable[[], Awaitable[None]] | None = None
         self._lost: Callable[[int], None] | None = None
         self._failed: Callable[[URLabError], None] = lambda _: None
-        self._scene: SceneMessages | None = None
+        self._scene: FollowedScene | None = None
         self._described: object = None
         self._due_at: int | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
-    def check(self) -> SceneMessages:
+    def check(self) -> FollowedScene:
         """Describe the scene.
 
         Raises:
@@ -88,9 +88,7 @@ class Follower(ClientObserver):
             KeyError: A camera is unknown.
         """
         if not self._client.urlab_version:
-            raise URLabError(
-                f"{self._name}: what there is to see is not known yet.", hint="Call discover() first, during play."
-            )
+            raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:
             raise URLabError(
                 f"{self._name}: poses are computed with the local model, which this client does not have.",
@@ -152,7 +150,7 @@ class Follower(ClientObserver):
             else:
                 self._ignore()
         if not live:
-            self._hand_on(_detached(state))
+            self._pass_on(_detached(state))
 
     def step_cameras(self, n_steps: int) -> Mapping[str, str]:
         """See the base class; requests the cameras whose next picture is due."""
@@ -174,14 +172,14 @@ class Follower(ClientObserver):
 
     # Inside
 
-    def _current(self) -> SceneMessages:
+    def _current(self) -> FollowedScene:
         """Return the scene, described again after another handshake."""
         described = self._client.articulations  # a new map with each handshake
         if self._scene is None or described is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: the new scene has %s", self._name, unknown)
             self._described = described
-            self._scene = SceneMessages.of(self._client, self._views())
+            self._scene = FollowedScene.of(self._client, self._views())
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
@@ -214,7 +212,7 @@ class Follower(ClientObserver):
         wanted = {id(self._camera(name)) for name in self._wanted_cameras}
         return [(name, view) for name, view in every.items() if id(view) in wanted]
 
-    def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
+    def _pass_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
         if put is None:
             return
@@ -225,10 +223,9 @@ class Follower(ClientObserver):
         set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
         restarts = isinstance(reply, ResetOk)
         seed = client.reset_seed if restarts else None
-        over_wire = OVER_WIRE.get(client) if restarts else None
-        draws = (
-            None if over_wire is None or over_wire.draws is None or over_wire.draws.seed != seed else over_wire.draws
-        )
+        varied = varied_by_ops(client) if restarts else None
+        # A reset of somebody else has another seed, or none.
+        draws = varied.draws if varied is not None and varied.draws is not None and varied.draws.seed == seed else None
         put(State(scene, reply, set_points, nanoseconds, restarts, wall_ns, not self._live, seed, draws))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)
@@ -249,7 +246,7 @@ class Follower(ClientObserver):
         self._begin(self._follow_states)
         self._follow_cameras(scene)
 
-    def _follow_cameras(self, scene: SceneMessages) -> None:
+    def _follow_cameras(self, scene: FollowedScene) -> None:
         """Follow this scene's cameras instead of the previous ones."""
         for task in self._camera_tasks:
             task.cancel()
@@ -289,7 +286,7 @@ class Follower(ClientObserver):
                 fresh = self._client.step_mode is StepMode.LIVE and snapshot.time != last
                 if fresh and self._client.matches(snapshot):
                     last = snapshot.time
-                    self._hand_on(snapshot)
+                    self._pass_on(snapshot)
 
     async def _follow_camera(self, camera: CameraLayout) -> None:
         schedule = Schedule(self._camera_ns)
@@ -302,6 +299,48 @@ class Follower(ClientObserver):
                 nanoseconds = round((self._client.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+
+
+class Following(Protocol):
+    """Follows a client for the duration of an `async with` block."""
+
+    async def __aenter__(self) -> Any: ...
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None: ...
+
+    def finish(self) -> None:
+        """End if the client's loop has already ended. Blocks."""
+        ...
+
+
+F = TypeVar("F", bound=Following)
+
+
+class BlockingFlavour(Generic[F]):
+    """Runs its async counterpart for the duration of a `with` block, on the loop of the followed client."""
+
+    def __init__(self, aio: F, portal: Portal) -> None:
+        self._aio = aio
+        self._portal = portal
+
+    @property
+    def aio(self) -> F:
+        """The async counterpart."""
+        return self._aio
+
+    def __enter__(self) -> Self:
+        self._portal.call(self._aio.__aenter__)
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self._portal.call(self._aio.__aexit__, exc_type, exc, traceback)
+        except ClientClosed:
+            self._aio.finish()
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:

@@ -13,31 +13,6 @@ from msgspec import Meta, Struct
 
 from urlab_client.protocol.base import Floats
 
-__all__ = [
-    "ArticulationMessage",
-    "CameraCalibration",
-    "CompressedImage",
-    "ContactMessage",
-    "ContactsMessage",
-    "Count",
-    "EntityMessage",
-    "EpisodeOutcome",
-    "FrameTransform",
-    "FrameTransforms",
-    "GapMessage",
-    "JointState",
-    "JointStates",
-    "OutcomeMessage",
-    "Quaternion",
-    "RawImage",
-    "Time",
-    "Vector3",
-    "encode",
-    "schema_name",
-    "schema_of",
-    "values",
-]
-
 _NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as in protobuf's JSON
 
 
@@ -55,11 +30,6 @@ class Time(Struct, frozen=True):
     def of(cls, nanoseconds: int) -> Time:
         """Split nanoseconds."""
         return cls(*divmod(nanoseconds, 1_000_000_000))
-
-    @property
-    def nanoseconds(self) -> int:
-        """Both parts as one number of nanoseconds."""
-        return self.sec * 1_000_000_000 + self.nsec
 
 
 class Vector3(Struct, frozen=True):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from urlab_client.integrations._feed.scene_messages import SceneLayout
-
-__all__ = ["component_name", "quantities"]
+from urlab_client.integrations._feed.scene import SceneLayout
 
 _UNKNOWN = "reading"
 

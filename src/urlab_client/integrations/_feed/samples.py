@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from urlab_client.integrations._feed.messages import CompressedImage, EpisodeOutcome, RawImage, Time
-from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
+from urlab_client.integrations._feed.messages import (
+    ArticulationMessage,
+    CompressedImage,
+    EpisodeOutcome,
+    RawImage,
+    Time,
+    values,
+)
+from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -18,8 +25,6 @@ from urlab_client.protocol.pixels import Pixels, decode_camera
 
 if TYPE_CHECKING:
     from urlab_client.randomise.variation import EpisodeDraws
-
-__all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
 _FALLBACK_NS = 1_000_000
 
@@ -33,7 +38,7 @@ class State:
     over the wire; a server's draws follow from `scene` and `seed`.
     """
 
-    scene: SceneMessages
+    scene: FollowedScene
     reply: StateReply | StateSnapshot
     set_points: dict[str, list[float]]
     nanoseconds: int
@@ -124,6 +129,37 @@ class SampleClock:
                 self.step = sim - self.sim
         self.sim, self.last = sim, self.offset + sim
         return self.last
+
+
+def articulation_message(
+    item: State, key: str, stamp: Time, *, sample: int, episode: int, sensors: bool = True
+) -> ArticulationMessage:
+    """Return the state of one articulation as a message.
+
+    Args:
+        item: The state.
+        key: Key of the articulation.
+        stamp: Time on the run's clock.
+        sample: Number of the sample.
+        episode: Number of preceding resets.
+        sensors: Whether to include readings.
+    """
+    reply = item.reply
+    state = reply.per_articulation[key]
+    return ArticulationMessage(
+        timestamp=stamp,
+        sim_time=reply.time,
+        sample=sample,
+        step=reply.step,
+        episode=episode,
+        wall_time=Time.of(item.wall_ns),
+        qpos=state.qpos.tolist(),
+        qvel=state.qvel.tolist(),
+        set_points=item.set_points.get(key, []),
+        ctrl=values(state.ctrl),
+        act=values(state.act),
+        sensors=(state.sensors or {}) if sensors else {},
+    )
 
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:

@@ -16,7 +16,7 @@ from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.integrations._varied import variation_of
+from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
     Field,
@@ -205,7 +205,7 @@ class EnvEpisode:
 
     async def close(self) -> None:
         """Undo the variation by ops. If the server is gone, do nothing."""
-        if self.over_wire is not None and self._draws is not None:
+        if self.over_wire is not None:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.integrations._varied import OVER_WIRE, VariedOverWire, controlled_actuators
+from urlab_client.integrations._episode_variation import VariedByOps, controlled_actuators, varied_by_ops
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Randomisation, UnsupportedRandomisation, Vary
 from urlab_client.randomise.quantities import START, elements_of
@@ -69,7 +69,10 @@ class WireVariation:
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
-        self._registered = OVER_WIRE[client] = VariedOverWire(declared)
+        if (before := varied_by_ops(client)) is not None:
+            client.remove_observer(before)
+        self._varied = VariedByOps(declared)
+        client.add_observer(self._varied)
         self._model_fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields
         }
@@ -85,7 +88,7 @@ class WireVariation:
 
     async def apply(self, draws: EpisodeDraws) -> None:
         """Set the quantities that a reset does not change: gravity, and the gains of controllers."""
-        self._registered.draws = draws
+        self._varied.draws = draws
         if self._model_fields:
             self.variation.write(draws, self._model_fields.__getitem__)
             await self._set_gravity()
@@ -102,10 +105,11 @@ class WireVariation:
         self.variation.start(draws, qpos)
 
     async def undo(self) -> None:
-        """Restore gravity and gains."""
-        self._registered.draws = None
-        if OVER_WIRE.get(self._client) is self._registered:
-            del OVER_WIRE[self._client]
+        """Restore gravity and gains if an episode has varied them."""
+        self._client.remove_observer(self._varied)
+        if self._varied.draws is None:
+            return
+        self._varied.draws = None
         if self._model_fields:
             self.variation.restore(self._model_fields.__getitem__)
             await self._set_gravity()

@@ -12,10 +12,9 @@ from urlab_client.integrations.policy.evaluation import (
     evaluate_on,
     wilson,
 )
-from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxDictNetwork, OnnxInputs, OnnxNetwork, PicturesNetwork
 from urlab_client.integrations.policy.policy import Policy, load
-from urlab_client.integrations.policy.robot import RobotState
 from urlab_client.integrations.policy.runner import PolicyRun, require, run, run_blocking
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
 

@@ -20,8 +20,6 @@ from urlab_client.protocol.serializable import Serializable
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
 
-__all__ = ["Estimate", "Evaluation", "Outcome", "bootstrap_mean", "evaluate_in", "evaluate_on", "wilson"]
-
 RESAMPLES: Final = 10_000
 _SEED_BITS: Final = 31  # every server keeps at least this many
 

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.model.elements import Actuator, Joint, Sensor
-from urlab_client.integrations.policy.robot import PolicyRobot, RobotState
-from urlab_client.integrations.policy.spec import PolicySpec
-from urlab_client.integrations.policy.terms import (
+from urlab_client.integrations.policy.spec import (
     AngularVelocity,
     BaseHeight,
     CommandTerm,
@@ -30,21 +29,67 @@ from urlab_client.integrations.policy.terms import (
     NumberTerm,
     PhaseClock,
     PictureTerm,
+    PolicySpec,
     SensorTerm,
 )
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.pixels import observed_pixels
-
-__all__ = ["Input", "PolicyMapping", "PolicyMismatch"]
+from urlab_client.sync.articulation import URLabArticulation
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
-_COMMAND: Final = 3
+
+PolicyRobot: TypeAlias = AsyncArticulation | URLabArticulation
+"""An articulation of either flavour."""
 
 
 class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session. The message names what was found, what is required and a fix."""
+
+
+class RobotState(NamedTuple):
+    """The state of one robot or of a batch.
+
+    Attributes:
+        qpos: Joint positions in the order of `qpos_array`, shape (…, nq).
+        qvel: Joint velocities in the order of `qvel_array`, shape (…, nv).
+        sensors: Readings by sensor name, shape (…, dim).
+    """
+
+    qpos: Floats
+    qvel: Floats
+    sensors: Mapping[str, Floats] = {}
+
+    @classmethod
+    def of(cls, robot: PolicyRobot) -> RobotState:
+        """Return the current state of an articulation."""
+        return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
+
+    @property
+    def gravity(self) -> Floats:
+        """Direction of gravity in the base frame, shape (…, 3)."""
+        return -self._rotation()[..., 2, :]
+
+    @property
+    def linear_velocity(self) -> Floats:
+        """Velocity of the base, m/s, base frame, shape (…, 3)."""
+        return np.einsum("...ij,...i->...j", self._rotation(), self.qvel[..., :3])
+
+    @property
+    def angular_velocity(self) -> Floats:
+        """Angular velocity of the base, rad/s, base frame, shape (…, 3)."""
+        return self.qvel[..., 3:6]
+
+    def _rotation(self) -> Floats:
+        """Return the rotation from the base frame to the world frame, shape (…, 3, 3)."""
+        w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 class Input(NamedTuple):
@@ -70,6 +115,15 @@ class _Moment(NamedTuple):
 
 
 _Read = Callable[[_Moment], Floats]
+
+_PLAIN: Final[dict[type[NumberTerm], tuple[int, _Read]]] = {
+    BaseHeight: (1, lambda moment: moment.state.qpos[..., 2:3]),
+    Gravity: (3, lambda moment: moment.state.gravity),
+    LinearVelocity: (3, lambda moment: moment.state.linear_velocity),
+    AngularVelocity: (3, lambda moment: moment.state.angular_velocity),
+    CommandTerm: (3, lambda moment: moment.command),
+}
+"""Size of the terms that are the same for every robot, and a function that reads them."""
 
 
 class PolicyMapping:
@@ -267,34 +321,36 @@ class PolicyMapping:
     def _term(self, robot: PolicyRobot, term: NumberTerm, where: str) -> tuple[int, _Read]:
         """Return the number of values of a term, and a function that reads them."""
         match term:
-            case JointPosition():
-                qpos, _ = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
-                return len(qpos), lambda moment: moment.state.qpos[..., qpos]
-            case JointVelocity():
-                _, qvel = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
-                return len(qvel), lambda moment: moment.state.qvel[..., qvel]
-            case SensorTerm():
-                sensor = self._sensor(robot, term.sensor, f"{where}.sensor")
-                name = sensor.name
-                return sensor.dim, lambda moment: moment.state.sensors[name]
-            case GoalTerm():
-                return self._goal_term(robot, term, where)
-            case PhaseClock() | CommandTerm() | LastAction():
-                return _free_term(term, self.action_size)
+            case JointPosition() | JointVelocity():
+                joints = self._joints(robot, term.joints, f"{where}.joints") or self.joints
+                qpos, qvel = _offsets(joints)
+                if isinstance(term, JointPosition):
+                    return len(joints), lambda moment: moment.state.qpos[..., qpos]
+                return len(joints), lambda moment: moment.state.qvel[..., qvel]
+            case SensorTerm() | GoalTerm():
+                return self._sensor_term(robot, term, where)
+            case LastAction():
+                return self.action_size, lambda moment: moment.last_action
+            case PhaseClock():
+                rate = 2 * math.pi * term.hz
+                return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
             case _:
-                if not self._has_base:
+                if not self._has_base and not isinstance(term, CommandTerm):
                     raise self._misfit(where, f"needs a free base; {robot.prefix!r} has none")
-                return _base_term(term)
+                return _PLAIN[type(term)]
 
-    def _goal_term(self, robot: PolicyRobot, term: GoalTerm, where: str) -> tuple[int, _Read]:
+    def _sensor_term(self, robot: PolicyRobot, term: SensorTerm | GoalTerm, where: str) -> tuple[int, _Read]:
+        if isinstance(term, SensorTerm):
+            sensor = self._sensor(robot, term.sensor, f"{where}.sensor")
+            return sensor.dim, lambda moment: moment.state.sensors[sensor.name]
         size = len(self.default_goal)
         if not term.relative_to:
             return size, lambda moment: moment.goal
         sensor = self._sensor(robot, term.relative_to, f"{where}.relative_to")
         if sensor.dim != size:
             raise self._misfit(f"{where}.relative_to", f"{sensor.name!r} has {sensor.dim} numbers, the goal {size}")
-        name = self._sensor_names[term.relative_to] = sensor.name
-        return size, lambda moment: moment.goal - moment.state.sensors[name]
+        self._sensor_names[term.relative_to] = sensor.name
+        return size, lambda moment: moment.goal - moment.state.sensors[sensor.name]
 
     def _sensor(self, robot: PolicyRobot, name: str, where: str) -> Sensor:
         sensor = robot.sensors.get(name)
@@ -317,32 +373,11 @@ class PolicyMapping:
         return PolicyMismatch(f"{self._source}: {where}: {problem}.")
 
 
-def _free_term(term: PhaseClock | CommandTerm | LastAction, action_size: int) -> tuple[int, _Read]:
-    if isinstance(term, LastAction):
-        return action_size, lambda moment: moment.last_action
-    if isinstance(term, CommandTerm):
-        return _COMMAND, lambda moment: moment.command
-    rate = 2 * math.pi * term.hz
-    return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
-
-
 def _picture(term: PictureTerm) -> Input:
     width, height = term.size
     if term.mode is CameraMode.DEPTH:
         return Input((height, width), np.dtype(np.float32))
     return Input((height, width, 3 if term.mode is CameraMode.REAL else 4), np.dtype(np.uint8))
-
-
-def _base_term(term: BaseHeight | Gravity | LinearVelocity | AngularVelocity) -> tuple[int, _Read]:
-    match term:
-        case BaseHeight():
-            return 1, lambda moment: moment.state.qpos[..., 2:3]
-        case Gravity():
-            return 3, lambda moment: moment.state.gravity
-        case LinearVelocity():
-            return 3, lambda moment: moment.state.linear_velocity
-        case AngularVelocity():
-            return 3, lambda moment: moment.state.angular_velocity
 
 
 def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:

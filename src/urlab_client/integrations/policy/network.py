@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,40 +14,14 @@ from urlab_client._extras import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Entry", "Network", "OnnxDictNetwork", "OnnxInputs", "OnnxNetwork", "PicturesNetwork"]
-
-
 _BYTES: Final = "tensor(uint8)"
 
 
-class Network(Protocol):
-    """Any callable that maps an observation to outputs."""
+Network: TypeAlias = Callable[[Floats], Floats]
+"""Maps an observation, shape (n_inputs,), to outputs, shape (n_outputs,)."""
 
-    def __call__(self, observation: Floats, /) -> Floats:
-        """Return the outputs, shape (n_outputs,), for an observation, shape (n_inputs,)."""
-        ...
-
-
-class PicturesNetwork(Protocol):
-    """Any callable that maps named inputs, which may include pictures, to outputs."""
-
-    def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
-        """Return the outputs, shape (n_outputs,), for the declared inputs, by name."""
-        ...
-
-
-class Entry(Protocol):
-    """Shape and type of an input. Gymnasium spaces satisfy this protocol."""
-
-    @property
-    def shape(self) -> tuple[int, ...] | None:
-        """Shape of the input."""
-        ...
-
-    @property
-    def dtype(self) -> np.dtype[Any] | None:
-        """Type of the input; numbers of any width are passed as float32."""
-        ...
+PicturesNetwork: TypeAlias = Callable[[Mapping[str, NDArray[Any]]], Floats]
+"""Maps named inputs, which may include pictures, to outputs, shape (n_outputs,)."""
 
 
 class OnnxNetwork:
@@ -82,7 +56,7 @@ class OnnxNetwork:
         self.outputs: int | None = _width(ends["output"][0].shape)
 
     def __call__(self, observation: Floats, /) -> Floats:
-        """See `Network`."""
+        """Return the outputs, shape (n_outputs,), for an observation, shape (n_inputs,)."""
         fed = np.asarray(observation, dtype=np.float32)
         (outputs,) = self._session.run(None, {self._input: fed[None] if self._batched else fed})
         return np.asarray(outputs, dtype=np.float64).reshape(-1)
@@ -110,8 +84,12 @@ class OnnxInputs:
         self._types = {one.name: np.uint8 if one.type == _BYTES else np.float32 for one in self._session.get_inputs()}
         self.inputs: tuple[str, ...] = tuple(self._types)
 
-    def require(self, entries: Mapping[str, Entry], outputs: int) -> None:
+    def require(self, entries: Mapping[str, Any], outputs: int) -> None:
         """Check that the inputs are among the entries, and that the network has the given number of outputs.
+
+        Args:
+            entries: What there is for inputs, by name: spaces of Gymnasium, or others with a `shape` and a `dtype`.
+            outputs: Number of outputs.
 
         Raises:
             PolicyFileError: A check fails.
@@ -125,7 +103,7 @@ class OnnxInputs:
                     f"{', '.join(entries)}."
                 )
             wanted = _BYTES if entry.dtype == np.uint8 else "tensor(float)"
-            sizes = list(entry.shape or ())
+            sizes: list[int] = [*(entry.shape or ())]
             if one.type != wanted or len(one.shape) != 1 + len(sizes) or not _fits(one.shape[1:], sizes):
                 raise PolicyFileError(
                     f"{self.path}: its input {one.name!r} must be {wanted} of shape {['batch', *sizes]}, "
@@ -137,22 +115,17 @@ class OnnxInputs:
             )
 
     def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
-        """See `PicturesNetwork`. Further entries are ignored."""
+        """Return the outputs, shape (n_outputs,), for inputs by name; further ones are ignored."""
         fed = {name: np.asarray(inputs[name], dtype)[None] for name, dtype in self._types.items()}
         (outputs,) = self._session.run(None, fed)
         return np.asarray(outputs[0], dtype=np.float64)
 
 
-class OnnxDictNetwork:
+class OnnxDictNetwork(OnnxInputs):
     """A network in an ONNX file that maps dictionary observations, which may include pictures, to actions.
 
-    Each input is named after an entry, such as `arm/qpos`, `task` or `cameras/arm/overview`, and has a batch axis
-    followed by the shape of that entry. Pictures are uint8, numbers are float32. Entries without an input are ignored.
-    The only output is the action of the only articulation with actuators.
-
-    Attributes:
-        path: The file.
-        inputs: Names of the entries that the network uses.
+    Each input is named after an entry, such as `arm/qpos`, `task` or `cameras/arm/overview`. Entries without an input
+    are ignored. The only output is the action of the only articulation with actuators.
     """
 
     def __init__(self, path: Path, observation_space: Any, outputs: int) -> None:
@@ -167,14 +140,12 @@ class OnnxDictNetwork:
             PolicyFileError: The file is missing, is not an ONNX file, or does not fit the environment.
             ImportError: The extra `onnx` is not installed.
         """
-        self._network = OnnxInputs(path)
-        self._network.require(_entries(observation_space), outputs)
-        self.path = path
-        self.inputs: tuple[str, ...] = self._network.inputs
+        super().__init__(path)
+        self.require(_entries(observation_space), outputs)
 
     def __call__(self, observation: Any, /) -> Floats:
         """Return the action, shape (n,), for the observation of one environment."""
-        return self._network(_entries(observation))
+        return super().__call__(_entries(observation))
 
 
 def _session(path: Path) -> Any:

@@ -10,13 +10,10 @@ from typing import Any, overload
 
 import numpy as np
 
-from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, PolicyRobot, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxInputs, OnnxNetwork, PicturesNetwork
-from urlab_client.integrations.policy.robot import PolicyRobot, RobotState
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
 from urlab_client.protocol.base import Floats
-
-__all__ = ["Policy", "load"]
 
 
 class Policy:
@@ -71,7 +68,7 @@ class Policy:
         given = np.array(values, dtype=np.float64)
         if known is None:
             raise ValueError(f"{self.source} takes no command")
-        if given.shape != (3,) or not np.all((given >= known.low) & (given <= known.high)):
+        if not known.contains(given):
             raise ValueError(
                 f"a command must be vx, vy, yaw rate from {list(known.low)} to {list(known.high)} (m/s, m/s, rad/s), "
                 f"not {given.tolist()}"
@@ -94,9 +91,8 @@ class Policy:
         given = np.array(values, dtype=np.float64)
         if known is None:
             raise ValueError(f"{self.source} has no goal")
-        inside = given.shape == (len(known.default),) and np.all((given >= known.low) & (given <= known.high))
-        if not inside:
-            raise ValueError(f"a goal must be from {known.low} to {known.high}, not {given.tolist()}")
+        if not known.contains(given):
+            raise ValueError(f"a goal must be from {list(known.low)} to {list(known.high)}, not {given.tolist()}")
         self._goal = given
 
     @property

@@ -13,38 +13,154 @@ from typing import Annotated, Any, Final, Literal, cast, get_args
 from urllib.parse import urlencode
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 
-from urlab_client.integrations.policy.terms import (
-    CommandTerm,
-    GoalTerm,
-    Numbers,
-    PictureTerm,
-    Positive,
-    Term,
-    check_clip,
-    check_numbers,
-    listed,
-)
-from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.protocol.errors import URLabError
-
-__all__ = [
-    "Action",
-    "Command",
-    "Fall",
-    "Gains",
-    "Goal",
-    "PolicyFileError",
-    "PolicySpec",
-    "TrackingReward",
-    "parse_spec",
-    "read_spec",
-]
 
 
 class PolicyFileError(URLabError, ValueError):
     """The files of a policy cannot be used. The message names the file, the place in it and the valid choices."""
+
+
+Numbers = float | list[float]
+"""A single number for all, or one per element."""
+
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """One part of an observation: `clip((value - offset) * scale)`.
+
+    Attributes:
+        scale: Factor, a single number or one per value.
+        offset: Offset subtracted before scaling, a single number or one per value.
+        clip: Lowest and highest result.
+        input: Name of the network input that the values belong to, after those of earlier terms; empty if the network
+            has only one input.
+    """
+
+    scale: Numbers = 1.0
+    offset: Numbers = 0.0
+    clip: tuple[float, float] | None = None
+    input: str = ""
+
+    def __post_init__(self) -> None:
+        _check_numbers("scale", self.scale)
+        _check_numbers("offset", self.offset)
+        _check_clip(self.clip)
+
+
+class BaseHeight(_Term, tag="base_height", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Height of the free base, metres, world frame; 1 number."""
+
+
+class Gravity(_Term, tag="gravity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Direction of gravity, a unit vector in the base frame; 3 numbers."""
+
+
+class LinearVelocity(_Term, tag="linear_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Velocity of the free base, m/s, base frame; 3 numbers."""
+
+
+class AngularVelocity(_Term, tag="angular_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Angular velocity of the free base, rad/s, base frame; 3 numbers."""
+
+
+class JointPosition(_Term, tag="joint_position", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Positions of hinge and slide joints, rad or m; one number each.
+
+    Attributes:
+        joints: Joint names; those of the action if empty.
+    """
+
+    joints: list[str] = []
+
+
+class JointVelocity(_Term, tag="joint_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Velocities of hinge and slide joints, rad/s or m/s; one number each.
+
+    Attributes:
+        joints: Joint names; those of the action if empty.
+    """
+
+    joints: list[str] = []
+
+
+class SensorTerm(_Term, tag="sensor", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The reading of a sensor, in its own units and frame.
+
+    Attributes:
+        sensor: Name of the sensor.
+    """
+
+    sensor: str
+
+
+class CommandTerm(_Term, tag="command", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The command (vx, vy, yaw rate), m/s and rad/s, base frame; 3 numbers. Needs the table `command`."""
+
+
+class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The goal of the policy, such as a position in the world; as many numbers as in the table `goal`.
+
+    Attributes:
+        relative_to: Sensor whose reading is subtracted, so that the term is the remaining distance vector. Empty for
+            no subtraction.
+    """
+
+    relative_to: str = ""
+
+
+class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The network's last output after clipping, zeros at the start; one number per joint of the action."""
+
+
+class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """Sine and cosine of a phase that advances with time; 2 numbers.
+
+    Attributes:
+        hz: Cycles per second.
+    """
+
+    hz: Positive
+
+
+class PictureTerm(Struct, tag_field="term", tag="picture", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The picture of a camera of the robot, in its own network input and in the format of environments.
+
+    `real` is RGB, uint8 of shape (H, W, 3). `depth` is in metres, float32 of shape (H, W). `semantic` and `instance`
+    are BGRA, uint8 of shape (H, W, 4).
+
+    Attributes:
+        camera: Name of the camera.
+        input: Name of the network input.
+        size: Width and height, pixels.
+        mode: Meaning of the pixels.
+    """
+
+    camera: str
+    input: Annotated[str, Meta(min_length=1)]
+    size: tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]]
+    mode: CameraMode = CameraMode.REAL
+
+
+NumberTerm = (
+    BaseHeight
+    | Gravity
+    | LinearVelocity
+    | AngularVelocity
+    | JointPosition
+    | JointVelocity
+    | SensorTerm
+    | CommandTerm
+    | GoalTerm
+    | LastAction
+    | PhaseClock
+)
+Term = NumberTerm | PictureTerm
 
 
 class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
@@ -71,9 +187,9 @@ class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def __post_init__(self) -> None:
         if len(set(self.joints)) != len(self.joints):
             raise ValueError("joints contains a joint twice")
-        check_numbers("scale", self.scale, len(self.joints))
-        check_numbers("offset", self.offset, len(self.joints))
-        check_clip(self.clip)
+        _check_numbers("scale", self.scale, len(self.joints))
+        _check_numbers("offset", self.offset, len(self.joints))
+        _check_clip(self.clip)
         if self.kind == "torque" and self.via != "actuators":
             raise ValueError(f"kind = 'torque' requires via = 'actuators', not {self.via!r}")
 
@@ -94,27 +210,9 @@ class Gains(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def __post_init__(self) -> None:
         for name in ("kp", "kv", "torque_limit"):
             value: Numbers = getattr(self, name)
-            check_numbers(name, value)
-            if min(listed(value)) < 0:
+            _check_numbers(name, value)
+            if min(_listed(value)) < 0:
                 raise ValueError(f"{name} must be 0 or more")
-
-
-class Command(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The commands the network was trained for: (vx, vy, yaw rate), m/s and rad/s, base frame.
-
-    Attributes:
-        default: Command used if none is given.
-        low: Lowest value of each component.
-        high: Highest value of each component.
-    """
-
-    default: tuple[float, float, float]
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        if not all(low <= value <= high for low, value, high in zip(self.low, self.default, self.high, strict=True)):
-            raise ValueError(f"default {list(self.default)} is not between low and high")
 
 
 class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
@@ -126,15 +224,27 @@ class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
         high: Highest value of each component.
     """
 
-    default: Annotated[list[float], Meta(min_length=1)]
-    low: list[float]
-    high: list[float]
+    default: Annotated[tuple[float, ...], Meta(min_length=1)]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
 
     def __post_init__(self) -> None:
         if not len(self.default) == len(self.low) == len(self.high):
             raise ValueError("default, low and high must have the same length")
-        if not all(low <= value <= high for low, value, high in zip(self.low, self.default, self.high, strict=True)):
-            raise ValueError(f"default {self.default} is not between low and high")
+        if not self.contains(np.array(self.default)):
+            raise ValueError(f"default {list(self.default)} is not between low and high")
+
+    def contains(self, values: Floats) -> bool:
+        """Return whether values have the right number and are between `low` and `high`."""
+        return values.shape == (len(self.default),) and bool(np.all((values >= self.low) & (values <= self.high)))
+
+
+class Command(Goal, kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The commands the network was trained for: (vx, vy, yaw rate), m/s and rad/s, base frame."""
+
+    default: tuple[float, float, float]
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
 
 
 class Fall(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
@@ -232,7 +342,7 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
             raise ValueError(f"action.via = {self.action.via!r} {verb} the table [gains]")
         if self.gains is not None:
             for name in ("kp", "kv", "torque_limit"):
-                check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
+                _check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
         self._check_inputs()
         if self.command is None and (self.reward or any(isinstance(term, CommandTerm) for term in self.observation)):
             raise ValueError("the term 'command' and the table [reward] need the table [command]")
@@ -276,6 +386,35 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def period(self) -> float:
         """Seconds between two actions."""
         return self.timestep * self.decimation
+
+
+def _listed(value: Numbers) -> list[float]:
+    """Return numbers as a list; a single number becomes a list of one."""
+    return value if isinstance(value, list) else [value]
+
+
+def _check_numbers(name: str, value: Numbers, length: int | None = None) -> None:
+    """Check that numbers are present, finite, and either a single one or as many as expected.
+
+    Raises:
+        ValueError: A check fails.
+    """
+    if not value and isinstance(value, list):
+        raise ValueError(f"{name} is empty")
+    if not all(map(math.isfinite, _listed(value))):
+        raise ValueError(f"{name} contains NaN or infinity")
+    if length is not None and isinstance(value, list) and len(value) != length:
+        raise ValueError(f"{name} has {len(value)} numbers; it takes one, or one for each of the action's {length}")
+
+
+def _check_clip(clip: tuple[float, float] | None) -> None:
+    """Check that the limits are in order.
+
+    Raises:
+        ValueError: The lower limit is not below the upper one.
+    """
+    if clip is not None and not clip[0] < clip[1]:
+        raise ValueError(f"clip must be [low, high] with low < high, not {list(clip)}")
 
 
 def read_spec(path: Path) -> PolicySpec:

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["main"]
-
 
 def main(work: Path) -> None:
     """Write the dataset that `work/plan.json` describes, from the frames that standard input names."""

@@ -14,18 +14,6 @@ from urlab_client.integrations._feed.messages import EpisodeMessage, OutcomeMess
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.pixels import Pixels
 
-__all__ = [
-    "Camera",
-    "Column",
-    "RecordedArticulation",
-    "RecordedEntity",
-    "RecordedState",
-    "Summary",
-    "Table",
-    "Topic",
-    "describe_topic",
-]
-
 _NS = 1e9
 _GAP_FACTOR = 3.0
 

@@ -1,7 +1,7 @@
 """Conversion of recordings to tables, arrays, videos and LeRobot datasets. Output files appear only when complete.
 
 Tables contain pairs of an observation and the action taken at it, see `transitions`; arrays contain the states as
-recorded. Memory holds only a piece of the recording; a temporary file beside the output holds the others, with 8 bytes
+recorded. Memory holds only a part of the recording; a temporary file beside the output holds the whole, with 8 bytes
 for each value of each state. An exception from `progress` aborts a conversion.
 """
 
@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from urlab_client._extras import need
 from urlab_client._whole_files import replaced
+from urlab_client.integrations.record import tables
 from urlab_client.integrations.record.contents import Table
-from urlab_client.integrations.record.lerobot_writer import write_lerobot
-from urlab_client.integrations.record.phases import Progress, phases
-from urlab_client.integrations.record.pixels import even, farthest, visible
-from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.stored_table import StoredTable
-from urlab_client.integrations.record.transitions import Episodes, check_episodes, transition_pieces
+from urlab_client.integrations.record.index import Progress
+from urlab_client.integrations.record.lerobot import write_lerobot
+from urlab_client.integrations.record.pictures import even, farthest, visible
+from urlab_client.integrations.record.reader import Run, phases
+from urlab_client.integrations.record.transitions import Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
@@ -47,7 +47,7 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        _transitions(run, path.parent, episodes, progress) as (pieces, report),
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
@@ -60,7 +60,7 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
             for start in range(0, len(piece), _ROWS):
                 rows = slice(start, start + _ROWS)
                 writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
-                told(count + start)
+                report(count + start)
             count += len(piece)
     return count
 
@@ -81,11 +81,11 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
     times = {name: run.picture_times(name, next(steps)) for name in cameras}
     with (
         replaced(path) as temporary,
-        run.stored_table(path.parent, next(steps)) as stored,
+        run.stored_table(path.parent, next(steps)) as table,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
         writing = next(steps)
-        _save_table(run, archive, stored, lambda share: writing(int(share * size)))
+        _save_table(run, archive, table, lambda share: writing(int(share * size)))
         for name, when in times.items():
             pictures = (picture.pixels[None] for picture in islice(run.frames(name, next(steps)), len(when)))
             try:
@@ -93,7 +93,7 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
             except ValueError as error:
                 raise RecordingError(f"{run.path}: the pictures of {name} do not fit one array: {error}.") from None
             _save(archive, f"camera/{name}.time", [when], len(when))
-    return len(stored)
+        return len(table)
 
 
 def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
@@ -111,7 +111,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        _transitions(run, path.parent, episodes, progress) as (pieces, report),
         contextlib.ExitStack() as stack,
     ):
         writer: Any = None
@@ -124,7 +124,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
             if len(piece):
                 writer.write_table(group)
             count += len(piece)
-            told(count)
+            report(count)
     return count
 
 
@@ -172,7 +172,7 @@ class _Transitions(NamedTuple):
     """The pairs of a recording in pieces, and a callback for the number of written rows."""
 
     pieces: Iterator[Table]
-    told: Progress
+    report: Progress
 
 
 @contextlib.contextmanager
@@ -180,21 +180,25 @@ def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress 
     check_episodes(episodes)
     size = run.path.stat().st_size
     reading, writing = phases(size, progress, 2)
-    with run.stored_table(folder, reading) as stored:
-        rows = max(1, len(stored))
-        pieces = transition_pieces(stored.pieces(), run.outcomes(), episodes)
+    with run.stored_table(folder, reading) as table:
+        outcomes = run.outcomes()
+        rows = pair_rows(table, outcomes, episodes)
+        width = sum(column.values.shape[1] for column in table.columns.values()) + 1
+        parts = np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES)
+        pieces = (with_goals(pairs_at(table, part), outcomes) for part in parts)
 
-        def told(count: int) -> None:
-            writing(size * count // rows)
+        def report(count: int) -> None:
+            writing(size * count // max(1, len(rows)))
 
-        yield _Transitions(pieces, told)
+        yield _Transitions(pieces, report)
 
 
-def _save_table(run: Run, archive: zipfile.ZipFile, stored: StoredTable, told: Callable[[float], None]) -> None:
-    arrays = stored.last.arrays()
-    for number, name in enumerate(arrays):
-        _save(archive, name, stored.parts(name), len(stored), lambda: told(number / len(arrays)))  # noqa: B023
-        column = stored.last.columns.get(name)
+def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, report: Callable[[float], None]) -> None:
+    arrays = table.arrays()
+    for number, (name, values) in enumerate(arrays.items()):
+        parts = np.array_split(values, 1 + values.size // tables.PIECE_VALUES)
+        _save(archive, name, parts, len(table), lambda: report(number / len(arrays)))  # noqa: B023
+        column = table.columns.get(name)
         if column is not None:
             if len(column.names) * max(map(len, column.names)) > _NAMES_CHARS:  # each takes the space of the longest
                 raise RecordingError(f"{run.path}: the names of the values of {name} are too long for an array.")
@@ -206,7 +210,7 @@ def _save(
     name: str,
     parts: Iterable[NDArray[Any]],
     count: int,
-    told: Callable[[], None] = lambda: None,
+    report: Callable[[], None] = lambda: None,
 ) -> None:
     """Add an array of `count` rows to an archive like `numpy.savez`, with only a part of it in memory.
 
@@ -216,7 +220,7 @@ def _save(
     rows, form = 0, None
     with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
         for part in parts:
-            told()
+            report()
             if form is None:
                 form = part.shape[1:], part.dtype
                 descr = np.lib.format.dtype_to_descr(part.dtype)

@@ -1,10 +1,10 @@
-"""Recordings that the server made: the plugin's JSON files of joint states, read as a recording of our own is."""
+"""Recordings of the server: the plugin's JSON files of joint states, with the interface of our own recordings."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Collection, Generator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -14,9 +14,8 @@ import numpy as np
 
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations._feed.quantities import quantities
-from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import (
-    Camera,
     Column,
     RecordedArticulation,
     RecordedState,
@@ -24,16 +23,13 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.reader import RecordedPicture, Run
-from urlab_client.integrations.record.stored_table import StoredTable
+from urlab_client.integrations.record.index import IndexedChannel, Progress
+from urlab_client.integrations.record.reader import Run
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.protocol.base import Floats
 from urlab_client.server.physics.recording import Frame, decode_json
 
-__all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
-
 OWNER: Final = "joints"
-"""What takes the place of an articulation's key: the file names compiled joints, of whatever robot."""
+"""Key of the only articulation, because the file names compiled joints and no robots."""
 
 _NS = 1e9
 _HEAD = 64
@@ -46,17 +42,17 @@ _VELOCITIES = {1: ("",), 3: (".wx", ".wy", ".wz"), 6: (".vx", ".vy", ".vz", ".wx
 
 
 def is_joint_states(path: Path) -> bool:
-    """Return whether a file begins as the plugin's recordings do: an object with the list `Frames`."""
+    """Return whether a file begins like the plugin's recordings: an object with the list `Frames`."""
     with path.open("rb") as file:
         text = file.read(_HEAD).replace(b"\0", b"").lstrip(b"\xff\xfe\xef\xbb\xbf \t\r\n")
     return text[:1] == b"{" and text[1:].lstrip()[:8].lower() == b'"frames"'
 
 
 class JointStatesRun(Run):
-    """A recording of joint states alone: no set-points, sensors or pictures."""
+    """A recording of joint states only, without set-points, sensors and pictures."""
 
-    def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
-        """Say what is in it. Reading the file verifies it."""
+    def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
+        """Return a summary of the contents. Reading the file verifies it."""
         del progress, verify
         table = self.table()
         stamps = (table.time * _NS).astype(np.int64)
@@ -76,8 +72,8 @@ class JointStatesRun(Run):
             topics={topic: describe_topic(topic, "joint states", stamps)} if len(stamps) else {},
         )
 
-    def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
-        """Return all states, with the columns `joints/qpos` and `joints/qvel`; values are named as compiled joints are.
+    def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
+        """Return all states as `joints/qpos` and `joints/qvel`; values have the names of compiled joints.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -126,19 +122,18 @@ class JointStatesRun(Run):
 
     @contextlib.contextmanager
     def stored_table(
-        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
-    ) -> Generator[StoredTable]:
-        """Yield all states as one piece: a JSON file is read whole.
+        self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
+    ) -> Generator[Table]:
+        """Yield all states, in memory: a JSON file is read whole.
 
         Raises:
             RecordingError: The file is not a recording.
         """
-        with StoredTable(folder) as stored:
-            stored.last = self.table(progress, fields=fields)
-            yield stored
+        del folder
+        yield self.table(progress, fields=fields)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
-        """Return nothing: a server marks no episodes."""
+        """Return no outcomes, because a server marks no episodes."""
         return ()
 
     @cached_property
@@ -152,7 +147,7 @@ class JointStatesRun(Run):
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
     def state_at(self, time: float) -> RecordedState | None:
-        """Return the newest state that is not after a time, None without any; all joints are one articulation.
+        """Return the newest state at or before a time, or None; all joints are one articulation.
 
         Raises:
             RecordingError: The file is not a recording.
@@ -185,31 +180,11 @@ class JointStatesRun(Run):
         return {} if column is None else {OWNER: column.names}
 
     def cameras(self) -> list[str]:
-        """Return nothing: the file holds no pictures."""
+        """Return no cameras, because the file contains no pictures."""
         return []
 
-    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def picture_at(self, camera: str, time: float) -> Camera | None:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def encoded_picture_at(self, camera: str, time: float) -> RecordedPicture:
-        """Raise `KeyError`: the file holds no pictures."""
-        raise self._no_pictures(camera)
-
-    def _no_pictures(self, camera: str) -> KeyError:
-        return KeyError(f"no pictures of {camera!r} in {self.path}: a recording of the server holds joint states alone")
+    def _camera(self, name: str) -> list[IndexedChannel]:
+        raise KeyError(f"no pictures of {name!r} in {self.path}: a recording of the server contains only joint states")
 
 
 def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ Opening a recording and seeking read only the file's index and a few blocks, so 
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import threading
@@ -18,7 +17,6 @@ from typing import Annotated, TypeVar
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
@@ -40,14 +38,11 @@ from urlab_client.integrations.record.contents import (
     Table,
     describe_topic,
 )
-from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, RecordedMessage, RecordingIndex
-from urlab_client.integrations.record.stored_table import StoredTable
-from urlab_client.integrations.record.table_builder import Number, SampleTimes, TableBuilder
+from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
+from urlab_client.integrations.record.pictures import RecordedPicture
+from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.pixels import Pixels
-
-__all__ = ["RecordedPicture", "Run", "read_run"]
 
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -59,7 +54,6 @@ _KEPT_BYTES = 32 << 20
 _MOST_VALUES = 8 << 20
 _VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
 _NAMES_CHARS = 32 << 20
-_MOST_PIXELS = 8192 * 8192
 _T = TypeVar("_T")
 
 
@@ -97,34 +91,6 @@ _compressed = msgspec.json.Decoder(CompressedImage).decode
 _raw = msgspec.json.Decoder(RawImage).decode
 
 
-class RecordedPicture(msgspec.Struct, frozen=True):
-    """One encoded picture of the file.
-
-    Attributes:
-        time: Time on the recording's clock, seconds.
-        mode: Mode of the camera: `real`, `depth` and so on.
-        message: The encoded picture.
-        unreadable: Makes the error for a picture that is not what it says.
-    """
-
-    time: float
-    mode: str
-    message: CompressedImage | RawImage
-    unreadable: Callable[[object], RecordingError]
-
-    def pixels(self) -> Pixels:
-        """Return it as an array like `Camera.pixels`.
-
-        Raises:
-            RecordingError: It is damaged, too large, or not what the message says.
-        """
-        message = self.message
-        try:
-            return _depths(message) if isinstance(message, RawImage) else _colours(message.data)
-        except Exception as error:  # Pillow raises errors of many types
-            raise self.unreadable(error) from error
-
-
 class Run:
     """A recording on disk. Opening it reads only its index. Several threads may read.
 
@@ -139,7 +105,7 @@ class Run:
         self._indexed: tuple[tuple[int, int], RecordingIndex] | None = None
         self._lock = threading.Lock()
 
-    def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
+    def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
         """Return a summary of the contents.
 
         Args:
@@ -158,17 +124,18 @@ class Run:
             times.setdefault(index.channels[channel].topic, []).append(stamps)
         stamps_of = {topic: np.concatenate(parts) for topic, parts in sorted(times.items())}
         schemas = {channel.topic: channel.schema for channel in index.channels.values()}
-        states = [found for one in index.having(_STATES) if (found := index.newest(one.id)) is not None]
+        states = [found for one in index.channels_of(_STATES) if (found := index.newest(one.id)) is not None]
         gaps = self._contents(index, GapMessage, _gap)
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
-        began, ended = index.wall_span()
+        ends_of = [(index.first(one), index.newest(one)) for one in index.channels]
+        walls = [end.publish_time for pair in ends_of for end in pair if end is not None]
         return Summary(
             path=self.path,
             complete=index.complete and not self.damage,
             damage=self.damage,
             about=dict(index.metadata.get("urlab", {})),
             duration_s=int(max(ends) - min(ends)) / _NS if ends else 0.0,
-            wall_s=(ended - began) / _NS,
+            wall_s=(max(walls) - min(walls)) / _NS if walls else 0.0,
             episodes=max((_decoded(index, message, _state).episode for message in states), default=-1) + 1,
             dropped_states=sum(gap.states for gap in gaps),
             dropped_frames=sum(gap.frames for gap in gaps),
@@ -177,7 +144,7 @@ class Run:
             outcomes=self.outcomes(),
         )
 
-    def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
+    def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
         """Return all states. They must fit into memory, at 8 bytes for each value of each state.
 
         Args:
@@ -187,15 +154,13 @@ class Run:
         Raises:
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        builder = TableBuilder(fields, most=self._most_values())
-        self._read_states(builder, progress)
-        return builder.build(broken_off=bool(self.damage))
+        return self._read_states(self._builder(None, fields), progress)
 
     @contextlib.contextmanager
     def stored_table(
-        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
-    ) -> Generator[StoredTable]:
-        """Yield all states in pieces: memory holds one piece, a temporary file the others.
+        self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
+    ) -> Generator[Table]:
+        """Yield all states as a table that may be larger than memory: its arrays are maps of a temporary file.
 
         Args:
             folder: Folder of the temporary file, which has 8 bytes for each value of each state.
@@ -206,12 +171,8 @@ class Run:
             OSError: The temporary file cannot be written.
             RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
         """
-        with StoredTable(folder) as stored:
-            builder = TableBuilder(fields, take=stored.keep, most=self._most_values())
-            self._read_states(builder, progress)
-            stored.last = builder.build(broken_off=bool(self.damage))
-            del builder
-            yield stored
+        with contextlib.closing(self._builder(folder, fields)) as builder:
+            yield self._read_states(builder, progress)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
         """Return the marked outcomes of episodes; if an episode has several marks, the last one.
@@ -229,7 +190,7 @@ class Run:
             RecordingError: The file is not a recording.
         """
         index = self._index()
-        channels = index.having(_STATES, _ENTITIES)
+        channels = index.channels_of(_STATES, _ENTITIES)
         ends = [end for channel in channels for end in (index.first(channel.id), index.newest(channel.id))]
         times = [end.log_time for end in ends if end is not None]
         return min(times, default=0) / _NS, max(times, default=0) / _NS
@@ -245,7 +206,7 @@ class Run:
             ValueError: The time is NaN.
         """
         index = self._index()
-        found = [_newest(index, [channel], time) for channel in index.having(_STATES, _ENTITIES)]
+        found = [_newest(index, [channel], time) for channel in index.channels_of(_STATES, _ENTITIES)]
         states: dict[str, tuple[RecordedMessage, _State]] = {}
         entities: dict[str, tuple[RecordedMessage, _Entity]] = {}
         for message in found:
@@ -280,7 +241,7 @@ class Run:
         """
         index = self._index()
         found: dict[str, list[str]] = {}
-        for channel in index.having(_STATES):
+        for channel in index.channels_of(_STATES):
             first = index.first(channel.id)
             if first is not None:
                 count, names = len(_decoded(index, first, _state).qpos), channel.layout.qpos
@@ -291,11 +252,11 @@ class Run:
     def cameras(self) -> list[str]:
         """Return the names of the cameras with pictures in the file."""
         index = self._index()
-        pictures = [channel for channel in index.having(*_PICTURES) if channel.topic.startswith(_CAMERA)]
+        pictures = [channel for channel in index.channels_of(*_PICTURES) if channel.topic.startswith(_CAMERA)]
         cameras = [channel for channel in pictures if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
-    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
+    def picture_times(self, camera: str, progress: Progress | None = None) -> Floats:
         """Return the times of the pictures of `frames`, in its order, seconds on the recording's clock.
 
         Raises:
@@ -306,7 +267,7 @@ class Run:
         times = array("q", (one.log_time for one in self._messages(self._index(progress), channels, progress)))
         return np.array(times, dtype=np.int64) / _NS
 
-    def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
+    def frames(self, camera: str, progress: Progress | None = None) -> Iterator[Camera]:
         """Iterate over the pictures of a camera, `ARTICULATION/CAMERA` or a scene-level name.
 
         Raises:
@@ -316,7 +277,7 @@ class Run:
         for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
 
-    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
+    def encoded_pictures(self, camera: str, progress: Progress | None = None) -> Iterator[RecordedPicture]:
         """Iterate over the encoded pictures of a camera.
 
         Raises:
@@ -340,8 +301,8 @@ class Run:
             RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
-        index = self._index()
-        found = _newest(index, self._camera(camera), time)
+        channels, index = self._camera(camera), self._index()
+        found = _newest(index, channels, time)
         if found is None:
             return None
         picture = _picture(index, found)
@@ -355,7 +316,7 @@ class Run:
             RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
-        index, channels = self._index(), self._camera(camera)
+        channels, index = self._camera(camera), self._index()
         found = _newest(index, channels, time)
         if found is None:
             firsts = [first for channel in channels if (first := index.first(channel.id)) is not None]
@@ -364,13 +325,13 @@ class Run:
 
     def _camera(self, name: str) -> list[IndexedChannel]:
         index = self._index()
-        channels = [one for one in index.having(*_PICTURES) if one.topic == _CAMERA + name]
+        channels = [one for one in index.channels_of(*_PICTURES) if one.topic == _CAMERA + name]
         channels = [one for one in channels if index.first(one.id) is not None]
         if not channels:
             raise KeyError(f"no pictures of {name!r} in {self.path}; there are: {', '.join(self.cameras()) or 'none'}")
         return channels
 
-    def _index(self, progress: Callable[[int], None] | None = None) -> RecordingIndex:
+    def _index(self, progress: Progress | None = None) -> RecordingIndex:
         """Return the file's index, which is read again if the file has changed, for example while it is being
         written."""
         status = self.path.stat()
@@ -383,35 +344,37 @@ class Run:
         return index
 
     def _messages(
-        self, index: RecordingIndex, channels: Collection[int], progress: Callable[[int], None] | None = None
+        self, index: RecordingIndex, channels: Collection[int], progress: Progress | None = None
     ) -> Iterator[RecordedMessage]:
         """Iterate over the messages of channels, up to the first damage, which is then stored in `damage`."""
         yield from index.messages(channels, progress)
         self.damage = index.damage
 
     def _contents(self, index: RecordingIndex, kind: type[msgspec.Struct], decode: Callable[[bytes], _T]) -> list[_T]:
-        """Return all messages of a kind of which a recording has few."""
+        """Return all messages of a kind that is rare in recordings."""
         found: list[_T] = []
         left = max(_KEPT_BYTES, 4 * self.path.stat().st_size)
-        for message in self._messages(index, [channel.id for channel in index.having(schema_name(kind))]):
+        for message in self._messages(index, [channel.id for channel in index.channels_of(schema_name(kind))]):
             left -= len(message.data)
             if left < 0:
                 raise index.unreadable(message, "with those before it, it is larger than the file can be")
             found.append(_decoded(index, message, decode))
         return found
 
-    def _most_values(self) -> int:
-        return max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
+    def _builder(self, folder: Path | None, fields: Collection[str] | None) -> TableBuilder:
+        most = max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
+        return TableBuilder(folder, fields, most=most)
 
-    def _read_states(self, builder: TableBuilder, progress: Callable[[int], None] | None) -> None:
+    def _read_states(self, builder: TableBuilder, progress: Progress | None) -> Table:
         index = self._index(progress)
-        channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
+        channels = [channel.id for channel in index.channels_of(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
             take = self._take_state if message.channel.schema == _STATES else _take_entity
             try:
                 take(builder, index, message)
             except ValueError as error:  # it does not fit those before it
                 raise index.unreadable(message, error) from None
+        return builder.finish(broken_off=bool(self.damage))
 
     def _take_state(self, builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
         state, key = _decoded(index, message, _state), message.channel.topic.removeprefix(_ARTICULATION)
@@ -440,6 +403,25 @@ class Run:
                 for name, reading in state.sensors.items()
                 for i in range(len(reading))
             ]
+
+
+def phases(size: int, progress: Progress | None, count: int) -> list[Progress]:
+    """Return a progress callback for each phase, which report the total to `progress`.
+
+    Args:
+        size: Size of the recording, bytes, which is the end of each phase and of the total.
+        progress: Callback for the total; None for none.
+        count: Number of phases.
+    """
+
+    def phase(number: int) -> Progress:
+        def tell(done: int) -> None:
+            if progress is not None:
+                progress((number * size + min(done, size)) // count)
+
+        return tell
+
+    return [phase(number) for number in range(count)]
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
@@ -493,28 +475,6 @@ def _picture(index: RecordingIndex, message: RecordedMessage) -> RecordedPicture
         found,
         lambda reason: index.unreadable(place, reason),
     )
-
-
-def _depths(message: RawImage) -> Pixels:
-    height, width = message.height, message.width
-    if message.encoding != "32FC1" or message.step != 4 * width or len(message.data) != 4 * height * width:
-        raise ValueError(
-            f"{len(message.data)} bytes of {message.encoding[:20]!r} in rows of {message.step} bytes "
-            f"are not {width}x{height} depths"
-        )
-    _check_size(width, height)
-    return np.frombuffer(message.data, "<f4").astype(np.float32).reshape(height, width)
-
-
-def _colours(data: bytes) -> Pixels:
-    with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
-        _check_size(*image.size)
-        return np.array(image if image.mode in {"RGB", "RGBA"} else image.convert("RGB"))
-
-
-def _check_size(width: int, height: int) -> None:
-    if width < 1 or height < 1 or width * height > _MOST_PIXELS:
-        raise ValueError(f"a picture of {width}x{height} pixels; it can have 1 to {_MOST_PIXELS}")
 
 
 def _times(message: RecordedMessage, state: _State | _Entity) -> SampleTimes:

@@ -17,18 +17,15 @@ from numpy.typing import ArrayLike
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.numbers import finite_array
-from urlab_client.integrations._feed.blocking import BlockingTwin
-from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._episode_variation import varied_by_ops
+from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
-from urlab_client.integrations._varied import OVER_WIRE
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
-
-__all__ = ["AsyncRecorder", "Recorder", "record"]
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
@@ -151,7 +148,7 @@ class AsyncRecorder:
             self._writer.close()
 
 
-class Recorder(BlockingTwin[AsyncRecorder]):
+class Recorder(BlockingFlavour[AsyncRecorder]):
     """A recording in progress, for the duration of a `with` block. Created by `record`."""
 
     @property
@@ -289,8 +286,8 @@ def record(
 def _varied(client: AsyncClient) -> dict[str, str]:
     """Return the randomisation of the server or of an environment as an entry of a recording's metadata."""
     declared = None if client.model is None else declared_in(client.model)
-    if declared is None and client in OVER_WIRE:
-        declared = OVER_WIRE[client].declaration
+    if declared is None and (varied := varied_by_ops(client)) is not None:
+        declared = varied.declaration
     return {} if declared is None else {"randomise": declared.to_json()}
 
 

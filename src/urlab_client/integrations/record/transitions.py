@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.integrations.record.reader import Run
-
-__all__ = ["GOAL", "Episodes", "check_episodes", "transition_pieces", "transitions", "transitions_of", "with_goals"]
 
 Episodes = Literal["kept", "success", "all"]
 """Selection of episodes: those not discarded, only successes, or all."""
@@ -39,23 +37,34 @@ def transitions_of(run: Run, *, only: Episodes = "kept", progress: Callable[[int
         ValueError: `only` is not a valid selection.
         RecordingError: The file is not a recording.
     """
+    table, outcomes = run.table(progress), run.outcomes()
+    return with_goals(pairs_at(table, pair_rows(table, outcomes, only)), outcomes)
+
+
+def pair_rows(table: Table, outcomes: Sequence[OutcomeMessage] = (), only: Episodes = "all") -> NDArray[np.intp]:
+    """Return the rows of a table that are followed by an action, in a selection of episodes.
+
+    Raises:
+        ValueError: `only` is not a valid selection.
+    """
     check_episodes(only)
-    table = transitions(run.table(progress))
-    return _chosen(table, run.outcomes(), only)
+    rows = np.arange(len(table))
+    if _acting(table):
+        rows = np.flatnonzero((np.diff(table.episode) == 0) & (np.diff(table.sim_time) > 0))
+    if only != "all" and outcomes:
+        wanted = {"success"} if only == "success" else {"success", "failure"}
+        kept = [mark.episode for mark in outcomes if mark.outcome in wanted]
+        rows = rows[np.isin(table.episode[rows], kept)]
+    return rows
 
 
-def transition_pieces(pieces: Iterable[Table], outcomes: Sequence[OutcomeMessage], only: Episodes) -> Iterator[Table]:
-    """Yield the result of `transitions_of` from consecutive pieces of a table, in parts with rows of one or two
-    pieces."""
-    before: Table | None = None
-    for piece in pieces:
-        if not _acting(piece):
-            yield _chosen(piece, outcomes, only)
-            continue
-        # The last state of a piece is kept until the next one is known.
-        whole = piece if before is None else _one_after_the_other(before, piece)
-        yield _chosen(transitions(whole), outcomes, only)
-        before = _rows(whole, np.arange(len(whole))[-1:])
+def pairs_at(table: Table, rows: NDArray[np.intp]) -> Table:
+    """Return these rows of a table, of those in `pair_rows`, with the actions."""
+    found = table.with_arrays({key: values[rows] for key, values in table.arrays().items()})
+    for key in _acting(table):
+        led = table.columns[key + _SET_POINTS]
+        found.columns[f"{key}/action"] = replace(led, values=led.values[rows + 1])
+    return found
 
 
 def check_episodes(only: Episodes) -> None:
@@ -66,14 +75,6 @@ def check_episodes(only: Episodes) -> None:
     """
     if only not in ("kept", "success", "all"):
         raise ValueError(f"only must be kept, success or all, not {only!r}")
-
-
-def _chosen(table: Table, outcomes: Sequence[OutcomeMessage], only: Episodes) -> Table:
-    if only != "all" and outcomes:
-        wanted = {"success"} if only == "success" else {"success", "failure"}
-        kept = [mark.episode for mark in outcomes if mark.outcome in wanted]
-        table = _rows(table, np.flatnonzero(np.isin(table.episode, kept)))
-    return with_goals(table, outcomes)
 
 
 def with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
@@ -102,26 +103,9 @@ def transitions(table: Table) -> Table:
     Returns:
         A table with columns `ARTICULATION/action`, named as `ARTICULATION/set_points`, after all others.
     """
-    keys = _acting(table)
-    if not keys:
-        return table
-    acted = np.flatnonzero((np.diff(table.episode) == 0) & (np.diff(table.sim_time) > 0))
-    found = _rows(table, acted)
-    for key in keys:
-        led = table.columns[key + _SET_POINTS]
-        found.columns[f"{key}/action"] = replace(led, values=led.values[acted + 1])
-    return found
+    return pairs_at(table, pair_rows(table)) if _acting(table) else table
 
 
 def _acting(table: Table) -> list[str]:
     """Return the articulations with set-points."""
     return [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]
-
-
-def _rows(table: Table, rows: NDArray[np.intp]) -> Table:
-    return table.with_arrays({key: values[rows] for key, values in table.arrays().items()})
-
-
-def _one_after_the_other(first: Table, second: Table) -> Table:
-    rest = second.arrays()
-    return second.with_arrays({key: np.concatenate((values, rest[key])) for key, values in first.arrays().items()})

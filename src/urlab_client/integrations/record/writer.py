@@ -21,7 +21,6 @@ from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
 from urlab_client.integrations._feed.messages import (
-    ArticulationMessage,
     ContactsMessage,
     EntityMessage,
     EpisodeMessage,
@@ -42,16 +41,15 @@ from urlab_client.integrations._feed.samples import (
     SampleClock,
     Schedule,
     State,
+    articulation_message,
     picture_message,
 )
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.serializable import Serializable
-
-__all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
 
@@ -323,7 +321,7 @@ class _Sink:
     _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
-    _scene: SceneMessages | None = None
+    _scene: FollowedScene | None = None
     _simulation: Simulation | None = None
     _reported: tuple[int, int] = (0, 0)
     _dirty_since: float | None = None
@@ -374,24 +372,11 @@ class _Sink:
         if item.scene is not self._scene:
             self._use(item.scene)
         now = self._clock.advance(item.nanoseconds, item.restarts)
-        stamp, wall, clock = Time.of(now), Time.of(item.wall_ns), self._clock
+        stamp, clock = Time.of(now), self._clock
         self._write_episode(item, now)
-        for key, state in reply.per_articulation.items():
+        for key in reply.per_articulation:
             names = item.scene.names.get(key)
-            message = ArticulationMessage(
-                timestamp=stamp,
-                sim_time=reply.time,
-                sample=self.states,
-                step=reply.step,
-                episode=clock.episode,
-                wall_time=wall,
-                qpos=state.qpos.tolist(),
-                qvel=state.qvel.tolist(),
-                set_points=item.set_points.get(key, []),
-                ctrl=values(state.ctrl),
-                act=values(state.act),
-                sensors=state.sensors or {},
-            )
+            message = articulation_message(item, key, stamp, sample=self.states, episode=clock.episode)
             self._add(f"/state/{key}", message, now, item.wall_ns, to_metadata(names) if names else {})
         entities: Mapping[str, EntityState] = {}
         if isinstance(reply, StepOk | StateSnapshot):
@@ -449,7 +434,7 @@ class _Sink:
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
 
-    def _use(self, scene: SceneMessages) -> None:
+    def _use(self, scene: FollowedScene) -> None:
         self._scene = scene
         wanted = scene.model is not None and self.options.pose_ns > 0
         self._simulation = Simulation(scene, scene.model) if wanted and scene.model is not None else None

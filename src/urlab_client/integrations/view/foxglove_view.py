@@ -14,7 +14,6 @@ from msgspec import Struct
 from urlab_client._extras import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import (
-    ArticulationMessage,
     ContactsMessage,
     FrameTransforms,
     JointStates,
@@ -22,10 +21,9 @@ from urlab_client.integrations._feed.messages import (
     encode,
     schema_name,
     schema_of,
-    values,
 )
-from urlab_client.integrations._feed.samples import CameraPicture, State, picture_message
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
@@ -36,8 +34,6 @@ if TYPE_CHECKING:
     from foxglove import messages as fox
     from foxglove.channels import SceneUpdateChannel
     from foxglove.websocket import ChannelView, Client, WebSocketServer
-
-__all__ = ["foxglove_view"]
 
 _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
@@ -99,7 +95,7 @@ class _Foxglove:
                 hint="Another program may hold it; port=0 (--port 0) takes any free one.",
             ) from None
 
-    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
         self._shapes = shapes_of(simulation.model, simulation.bodies)
         del scene
@@ -131,8 +127,7 @@ class _Foxglove:
     def idle(self) -> bool:
         """See `ViewBackend`."""
         # So that clients that join while time stands still see something. Repeated, because a subscription may be
-        # reported
-        # before it takes effect.
+        # reported before it takes effect.
         now = time.monotonic()
         if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
             self._shown = now
@@ -165,26 +160,16 @@ class _Foxglove:
     def _send_states(self, moment: Moment, item: State) -> None:
         for key in item.reply.per_articulation:
             names = moment.scene.names.get(key)
-            message = functools.partial(self._state_message, moment, item, key)
-            self._send(f"/state/{key}", message, moment.ns, to_metadata(names) if names else {})
-
-    def _state_message(self, moment: Moment, item: State, key: str) -> ArticulationMessage:
-        reply = item.reply
-        state = reply.per_articulation[key]
-        return ArticulationMessage(
-            timestamp=Time.of(moment.ns),
-            sim_time=reply.time,
-            sample=reply.step,
-            step=reply.step,
-            episode=moment.episode,
-            wall_time=Time.of(moment.wall_ns),
-            qpos=state.qpos.tolist(),
-            qvel=state.qvel.tolist(),
-            set_points=item.set_points.get(key, []),
-            ctrl=values(state.ctrl),
-            act=values(state.act),
-            sensors=(state.sensors or {}) if self._sensors else {},
-        )
+            make = functools.partial(
+                articulation_message,
+                item,
+                key,
+                Time.of(moment.ns),
+                sample=item.reply.step,
+                episode=moment.episode,
+                sensors=self._sensors,
+            )
+            self._send(f"/state/{key}", make, moment.ns, to_metadata(names) if names else {})
 
     def _send_geometry(self, ns: int) -> None:
         from foxglove import messages as fox  # noqa: PLC0415

@@ -14,8 +14,6 @@ from urlab_client.aio.model.mirror import model_names
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Kind", "Shape", "shapes_of"]
-
 _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers: 0 to 2 are shown; collision geometry is usually in 3
 _PLANE_M = 20.0  # size of infinite planes
 _PLANE_THICKNESS_M = 0.001

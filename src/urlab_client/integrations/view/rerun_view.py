@@ -13,7 +13,7 @@ from urlab_client._extras import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.enums import CameraMode
@@ -22,8 +22,6 @@ from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
     import rerun
-
-__all__ = ["rerun_view"]
 
 _NS = 1_000_000_000
 _JPEG_QUALITY = 80
@@ -71,7 +69,7 @@ class _Rerun:
             recording.spawn(port=self._grpc_port)
         self._stream = recording
 
-    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
@@ -148,11 +146,11 @@ class _Rerun:
         recording.set_time("sim_time", duration=np.timedelta64(ns, "ns"))
         recording.set_time("wall_time", timestamp=np.datetime64(wall_ns, "ns"))
 
-    def _entity_of(self, scene: SceneMessages, frame: FrameTransform) -> str:
+    def _entity_of(self, scene: FollowedScene, frame: FrameTransform) -> str:
         name = frame.child_frame_id
         return _camera(name) if any(camera.name == name for camera in scene.cameras.values()) else _body(name)
 
-    def _show_values(self, state: State, scene: SceneMessages) -> None:
+    def _show_values(self, state: State, scene: FollowedScene) -> None:
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording

@@ -17,10 +17,9 @@ from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._feed.blocking import BlockingTwin
-from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
@@ -28,8 +27,6 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
-
-__all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]
 
 log: logging.Logger = logging.getLogger("urlab_client.view")
 
@@ -80,7 +77,7 @@ class Moment:
     ns: int
     wall_ns: int
     step: int
-    scene: SceneMessages
+    scene: FollowedScene
     simulation: Simulation
     episode: int
     contacts: bool
@@ -104,7 +101,7 @@ class ViewBackend(Protocol):
         """
         ...
 
-    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """Show this scene from now on."""
         ...
 
@@ -129,7 +126,7 @@ class ViewBackend(Protocol):
 class _Start:
     """The client's state when the view starts."""
 
-    scene: SceneMessages
+    scene: FollowedScene
     qpos: Floats
     qvel: Floats
     nanoseconds: int
@@ -152,7 +149,7 @@ class AsyncView:
         self._counts = {"states": 0, "frames": 0, "dropped_states": 0, "dropped_frames": 0}
         self._clock = SampleClock()
         self._simulation: Simulation | None = None
-        self._scene: SceneMessages | None = None
+        self._scene: FollowedScene | None = None
         self._shown: int = 0
         self._stop = threading.Event()
         self._gone = threading.Event()
@@ -200,7 +197,7 @@ class AsyncView:
         await self._follower.ended()
         await anyio.to_thread.run_sync(self._thread.join, abandon_on_cancel=True)
 
-    def _start(self, scene: SceneMessages) -> _Start:
+    def _start(self, scene: FollowedScene) -> _Start:
         client = self._client
         with client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # public by the reference
             data = client.data
@@ -295,7 +292,7 @@ class AsyncView:
         self._counts["states"] += 1
 
 
-class View(BlockingTwin[AsyncView]):
+class View(BlockingFlavour[AsyncView]):
     """A view that is open for the duration of a `with` block. Created by `rerun_view` and similar functions."""
 
     @property

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any, overload
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.samples import CameraPicture
-from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
     import mujoco
-
-__all__ = ["missing_for_window", "window_view"]
 
 
 def missing_for_window() -> str:
@@ -49,7 +47,7 @@ class _Window:
                 f"window_view: {missing}.", hint="Use rerun_view, foxglove_view or `urlab console`, or set a display."
             )
 
-    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
         import mujoco  # noqa: PLC0415
 

@@ -1,14 +1,13 @@
-"""Variation from episode to episode, as seen by the client."""
+"""How a client's episodes vary: by its server, or by an environment through ops."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.protocol.enums import ControllerKind
+from urlab_client.protocol.observer import ClientObserver
 
 if TYPE_CHECKING:
     import mujoco
@@ -17,24 +16,25 @@ if TYPE_CHECKING:
     from urlab_client.randomise.declaration import Randomisation
     from urlab_client.randomise.variation import EpisodeDraws, Variation
 
-__all__ = ["OVER_WIRE", "VariedOverWire", "controlled_actuators", "variation_of"]
 
-
-@dataclass(eq=False)
-class VariedOverWire:
+class VariedByOps(ClientObserver):
     """What an environment varies by ops, on a server that varies nothing itself.
+
+    One of its client's observers, so that recordings, which see the client but not the environment, find it there.
 
     Attributes:
         declaration: What varies.
         draws: The values drawn for the current episode; None before the first.
     """
 
-    declaration: Randomisation
-    draws: EpisodeDraws | None = None
+    def __init__(self, declaration: Randomisation) -> None:
+        self.declaration = declaration
+        self.draws: EpisodeDraws | None = None
 
 
-OVER_WIRE: WeakKeyDictionary[URLabClient, VariedOverWire] = WeakKeyDictionary()
-"""Variation by ops, by client. Recordings use it, because they see the client but not the environment."""
+def varied_by_ops(client: URLabClient) -> VariedByOps | None:
+    """Return what an environment varies by ops on this client, or None if no environment does."""
+    return next((found for found in client.observers if isinstance(found, VariedByOps)), None)
 
 
 def variation_of(

@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import queue
+import signal
 import subprocess
+import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import TracebackType
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._children import APART
+from urlab_client.aio.background import background_thread
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Table
-from urlab_client.integrations.record.lerobot_process import LeRobot, last_line
-from urlab_client.integrations.record.phases import Progress, phases
-from urlab_client.integrations.record.pixels import even, farthest, visible
-from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, transition_pieces, with_goals
+from urlab_client.integrations.record.index import Progress
+from urlab_client.integrations.record.pictures import even, farthest, visible
+from urlab_client.integrations.record.reader import Run, phases
+from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import URLabError
 
-__all__ = ["write_lerobot"]
-
+_SCRIPT = Path(__file__).with_name("_lerobot_script.py")
+_DEADLINE_S = 600.0
+_FRAME_S = 2.0  # which may pass for each frame of an episode besides, while that is encoded
+_LOOK_S = 0.5  # on Windows nothing interrupts a thread that waits
+_ENDING_S = 10.0
+_AHEAD = 2  # pending files
 _PROBE_S = 120.0
 _TOGETHER = 64  # frames per batch
 _MOST_FRAMES = 10_000_000  # of an episode
@@ -79,23 +93,22 @@ def write_lerobot(
     steps = iter(phases(run.path.stat().st_size, progress, 1 + 2 * len(names)))
     times = {name: run.picture_times(name, next(steps)) for name in names}
     with (
-        run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as stored,
+        run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as table,
         # Beside the dataset, which may be too large for the system's temporary folder.
         tempfile.TemporaryDirectory(prefix=".urlab-", dir=folder.parent, ignore_cleanup_errors=True) as temporary,
     ):
         work, outcomes = Path(temporary), run.outcomes()
-        everything = _timeline(stored.pieces())
-        table = _timeline(transition_pieces(stored.pieces(), outcomes, episodes))
-        rate = _rate(run, [*times.values()] or [everything.time]) if fps is None else fps
-        rows = _resampled(run, table, rate, [*times.values()], _episode_starts(everything))
+        pairs = pair_rows(table, outcomes, episodes)
+        rate = _rate(run, [*times.values()] or [table.time]) if fps is None else fps
+        rows = _resampled(run, table, pairs, rate, [*times.values()])
         if not len(rows):
-            raise RecordingError(f"{run.path}: there is nothing to make a dataset of.")
+            raise RecordingError(f"{run.path}: it contains nothing for a dataset.")
         episode, when = table.episode[rows], table.time[rows]
         limit = 1 / rate if max_picture_age is None else max_picture_age
         chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
         if not np.isfinite(_goals_of(np.unique(episode), outcomes)).all():
-            raise RecordingError(f"{run.path}: it is not known what some of its episodes were about.")
-        first = next(transition_pieces(stored.pieces(), outcomes, episodes))
+            raise RecordingError(f"{run.path}: the goals of some of its episodes are unknown.")
+        first = with_goals(pairs_at(table, rows[:1]), outcomes)
         robots = [key.removesuffix("/action") for key in first.columns if key.endswith("/action")]
         plan = {
             "folder": str((work / "dataset").absolute()),
@@ -111,9 +124,8 @@ def write_lerobot(
         }
         (work / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
         pictures = [_Pictures(run, name, video, next(steps)) for name in names]
-        pieces = transition_pieces(stored.pieces(), outcomes, episodes)
         with LeRobot(python, work) as writer:
-            for frames in _frames(pieces, rows, episode):
+            for frames in _frames(table, rows, outcomes):
                 wanted = [
                     one.take(which[frames.start : frames.stop]) for one, which in zip(pictures, chosen, strict=True)
                 ]
@@ -121,13 +133,6 @@ def write_lerobot(
             writer.finish()
         (work / "dataset").rename(folder)
     return len(rows)
-
-
-class _Timeline(NamedTuple):
-    """Time, seconds, and episode of states, each of shape (n,)."""
-
-    time: Floats
-    episode: NDArray[np.int64]
 
 
 class _Frames(NamedTuple):
@@ -139,25 +144,17 @@ class _Frames(NamedTuple):
     ends_episode: bool
 
 
-def _timeline(pieces: Iterable[Table]) -> _Timeline:
-    parts = [(piece.time, piece.episode) for piece in pieces]
-    return _Timeline(np.concatenate([time for time, _ in parts]), np.concatenate([episode for _, episode in parts]))
-
-
-def _frames(pieces: Iterable[Table], rows: NDArray[np.intp], episode: NDArray[np.int64]) -> Iterator[_Frames]:
+def _frames(table: Table, rows: NDArray[np.intp], outcomes: Sequence[OutcomeMessage]) -> Iterator[_Frames]:
     """Yield the frames at some rows of a table, in batches that fit into memory with their pictures."""
-    ends = {*(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(rows)}
-    first = start = 0
-    for piece in pieces:
-        after = int(np.searchsorted(rows, first + len(piece)))
-        values = {"state": _joined(piece, "qpos")[1], "action": _joined(piece, "action")[1], "goal": _goal(piece)[1]}
-        while start < after:
-            stop = next(i for i in range(start + 1, after + 1) if i in ends or i in {after, start + _TOGETHER})
-            own = rows[start:stop] - first
-            arrays = {name: given[own].astype(np.float32) for name, given in values.items()}
-            yield _Frames(start, stop, arrays, ends_episode=stop in ends)
+    start = 0
+    for end in (*(np.flatnonzero(np.diff(table.episode[rows])) + 1).tolist(), len(rows)):
+        while start < end:
+            stop = min(start + _TOGETHER, end)
+            part = with_goals(pairs_at(table, rows[start:stop]), outcomes)
+            values = {"state": _joined(part, "qpos")[1], "action": _joined(part, "action")[1], "goal": _goal(part)[1]}
+            arrays = {name: given.astype(np.float32) for name, given in values.items()}
+            yield _Frames(start, stop, arrays, ends_episode=stop == end)
             start = stop
-        first += len(piece)
 
 
 class _Pictures:
@@ -174,7 +171,7 @@ class _Pictures:
         """Return pictures, shape (k, H, W, 3), and which of them each of some frames shows.
 
         Raises:
-            RecordingError: They are not all of one size, or are other ones than before.
+            RecordingError: They are not all of one size, or some that were there before are missing.
         """
         wanted, places = np.unique(numbers, return_inverse=True)
         found = [self._picture(number) for number in wanted.tolist()]
@@ -193,7 +190,7 @@ class _Pictures:
                 shown = visible(pixels, self._far)
                 self._pixels = even(shown) if self._video else shown
         if self._number != number:
-            raise RecordingError(f"{self._run.path}: the pictures of {self._camera} are other ones than before.")
+            raise RecordingError(f"{self._run.path}: some pictures of {self._camera} have disappeared.")
         return self._pixels
 
 
@@ -220,7 +217,7 @@ def _check(python: str) -> None:
         raise RecordingError(f"{python} did not import lerobot within {_PROBE_S:g} s.") from None
     if done.returncode:
         raise RecordingError(
-            f"{python} has no LeRobot: {last_line(done.stderr)}.",
+            f"{python} has no LeRobot: {_last_line(done.stderr)}.",
             hint="Make an environment for it (pip install 'lerobot[dataset]') and name its interpreter with --python.",
         )
 
@@ -231,25 +228,27 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
     rate = 1 / float(np.median(distances)) if len(distances) else 0.0
     if round(rate) < 1 or abs(rate - round(rate)) > 0.01 * rate:
         raise RecordingError(
-            f"{run.path}: LeRobot wants whole frames per second, and the recording has {rate:.3g}.",
+            f"{run.path}: LeRobot needs a whole number of frames per second, but the recording has {rate:.3g}.",
             hint="Name the rate with --fps.",
         )
     return round(rate)
 
 
-def _episode_starts(table: _Timeline) -> dict[int, float]:
+def _starts(table: Table) -> dict[int, float]:
+    """Return the time of the first state of each episode."""
     episodes, first = np.unique(table.episode, return_index=True)
     return dict(zip(episodes.tolist(), table.time[first].tolist(), strict=True))
 
 
 def _resampled(
-    run: Run, table: _Timeline, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
+    run: Run, table: Table, pairs: NDArray[np.intp], fps: int, pictures: list[NDArray[np.float64]]
 ) -> NDArray[np.intp]:
     """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
     rows: list[NDArray[np.intp]] = []
-    for episode in np.unique(table.episode).tolist():
-        own = np.flatnonzero(table.episode == episode)
-        first, last = float(table.time[own[0]]), float(table.time[own[-1]])
+    time, episodes, starts = table.time[pairs], table.episode[pairs], _starts(table)
+    for episode in np.unique(episodes).tolist():
+        own = np.flatnonzero(episodes == episode)
+        first, last = float(time[own[0]]), float(time[own[-1]])
         for times in pictures:
             later = times[times >= starts[episode] - _SLACK_S]
             first = max(first, float(later[0]) if len(later) else np.inf)
@@ -259,8 +258,8 @@ def _resampled(
                     f"{run.path}: episode {episode} of {last - first:.0f} s has more than {_MOST_FRAMES} frames."
                 )
             grid = first + np.arange(int((last - first) * fps + _SLACK_S) + 1) / fps
-            found = np.searchsorted(table.time[own], grid + _SLACK_S, side="right") - 1
-            rows.append(own[np.maximum(found, 0)])
+            found = np.searchsorted(time[own], grid + _SLACK_S, side="right") - 1
+            rows.append(pairs[own[np.maximum(found, 0)]])
     return np.sort(np.concatenate(rows)) if rows else np.zeros(0, dtype=np.intp)
 
 
@@ -297,3 +296,134 @@ def _joined(table: Table, field: str) -> tuple[list[str], NDArray[np.float64]]:
     names = [f"{key.rpartition('/')[0]}.{name}" for key, column in chosen.items() for name in column.names]
     values = [column.values for column in chosen.values()]
     return names, np.concatenate(values, axis=1) if values else np.zeros((len(table), 0))
+
+
+class LeRobot:
+    """Writes one dataset. Killed if the block ends before `finish`.
+
+    Args:
+        python: The interpreter.
+        work: A folder with `plan.json`; see `_lerobot_script`.
+    """
+
+    def __init__(self, python: str, work: Path) -> None:
+        self._work = work
+        self._frames = self._files = 0
+        self._waiting: deque[float] = deque()
+        """Seconds within which LeRobot must read each file, from the start of the wait for it."""
+        self._replies: queue.SimpleQueue[str] = queue.SimpleQueue()
+        with (work / "errors.txt").open("wb") as errors:
+            self._process = subprocess.Popen(  # noqa: S603  # the user's own interpreter
+                [python, "-P", str(_SCRIPT), str(work)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                encoding="utf-8",
+                **APART,
+            )
+        self._failure: URLabError | None = None
+        background_thread("urlab-lerobot", self._listen, failed=self._die).start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._kill()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):  # if LeRobot has stopped reading
+                self._process.stdin.close()
+
+    def add(self, arrays: Mapping[str, NDArray[Any]], *, ends_episode: bool) -> None:
+        """Pass on frames, and wait while too many are pending.
+
+        Raises:
+            RecordingError: LeRobot failed, or takes too long.
+        """
+        while len(self._waiting) >= _AHEAD:
+            self._wait()
+        name = f"{self._files}.npz"
+        np.savez(self._work / name, allow_pickle=False, **dict[str, Any](arrays))
+        self._files += 1
+        self._frames += len(arrays["state"])
+        self._waiting.append(_DEADLINE_S + _FRAME_S * self._frames)
+        try:
+            if self._process.stdin is not None:
+                self._process.stdin.write(json.dumps({"file": name, "ends_episode": ends_episode}) + "\n")
+                self._process.stdin.flush()
+        except OSError:
+            raise self._broken_off() from None
+
+    def finish(self) -> None:
+        """Wait until the dataset is complete.
+
+        Raises:
+            RecordingError: LeRobot failed, or takes too long.
+        """
+        while self._waiting:
+            self._wait()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        self._waiting.append(_DEADLINE_S + _FRAME_S * self._frames)
+        try:
+            failed = self._reply() or self._process.wait(_DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            raise RecordingError(f"LeRobot did not end within {_DEADLINE_S:g} s.") from None
+        if failed:
+            raise self._broken_off()
+
+    def _wait(self) -> None:
+        if not self._reply():
+            raise self._broken_off()
+
+    def _reply(self) -> str:
+        """Return the next reply, which is empty when there are no more."""
+        allowed = self._waiting.popleft()
+        until = time.monotonic() + allowed
+        while True:
+            try:
+                return self._replies.get(timeout=_LOOK_S)
+            except queue.Empty:
+                if time.monotonic() > until:
+                    raise RecordingError(f"LeRobot did not finish within {allowed:g} s.") from None
+
+    def _listen(self) -> None:
+        output = self._process.stdout
+        if output is not None:
+            with (
+                output
+            ):  # closed here and not by the waiting thread, because encoders may outlive LeRobot and keep it open
+                for line in output:
+                    self._replies.put(line)
+        self._replies.put("")
+
+    def _die(self, error: URLabError) -> None:
+        self._failure = error
+        self._replies.put("")
+
+    def _kill(self) -> None:
+        if self._process.poll() is None:
+            if sys.platform == "win32":
+                self._process.kill()
+            else:
+                os.killpg(self._process.pid, signal.SIGKILL)  # with the encoders of its videos
+            self._process.wait()
+
+    def _broken_off(self) -> RecordingError:
+        if self._failure is not None:
+            failed = RecordingError(f"LeRobot's replies could not be read: {self._failure.__cause__!r}.")
+            failed.__cause__ = self._failure.__cause__
+            return failed
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_ENDING_S)  # its reason is complete when it has ended
+        self._kill()
+        said = (self._work / "errors.txt").read_text(encoding="utf-8", errors="replace")
+        return RecordingError(f"LeRobot failed: {_last_line(said)}.")
+
+
+def _last_line(text: str) -> str:
+    """Return the last line of the output of a program."""
+    lines = text.strip().splitlines()
+    return lines[-1] if lines else "it printed nothing"

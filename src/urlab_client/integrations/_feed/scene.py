@@ -1,4 +1,4 @@
-"""Names, addresses and cameras of a recording from one handshake, and poses from its model."""
+"""The scene of a client after a handshake: names, addresses and cameras, and poses computed with its model."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -25,7 +26,6 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
-from urlab_client.integrations._varied import variation_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
@@ -34,17 +34,6 @@ if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.randomise.variation import Variation
-
-__all__ = [
-    "CameraLayout",
-    "SceneLayout",
-    "SceneMessages",
-    "Simulation",
-    "calibration",
-    "from_metadata",
-    "joint_columns",
-    "to_metadata",
-]
 
 _BALL, _SLIDE = 1, 2  # mjJNT_BALL, mjJNT_SLIDE
 # From MuJoCo's camera axes (x right, y up, looking along -z) to an image's (x right, y down, looking along z).
@@ -85,7 +74,7 @@ class CameraLayout:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneMessages:
+class FollowedScene:
     """The parts of a handshake that a recording needs. Immutable, because the writing thread uses it.
 
     Attributes:
@@ -107,7 +96,7 @@ class SceneMessages:
     variation: Variation | None
 
     @classmethod
-    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
+    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
         """Build the description of a client's scene."""
         model, arts = client.model, client.articulations
         prefixes = {key: art.compiled_prefix for key, art in arts.items()}
@@ -146,7 +135,7 @@ class Simulation:
         scene: The scene, with a model.
     """
 
-    def __init__(self, scene: SceneMessages, model: mujoco.MjModel) -> None:
+    def __init__(self, scene: FollowedScene, model: mujoco.MjModel) -> None:
         import mujoco  # noqa: PLC0415
 
         self._scene = scene
@@ -254,7 +243,7 @@ class Simulation:
         return found
 
     def _owner(self, geom: int) -> str:
-        """Return the body of a geom; None for a flex."""
+        """Return the body of a geom; empty for a flex."""
         return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
 
     def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
