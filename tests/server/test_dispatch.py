@@ -12,12 +12,13 @@ from typing import Any
 import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
-from odd_requests import mangled_requests, plain_requests
+from hypothesis import strategies as st
+from odd_requests import mangled, plain_request
 from wire import Wire, check_numbers, pack, write_level
 
 from urlab_client.protocol.base import Needs
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
-from urlab_client.protocol.dialects import ALPHA
+from urlab_client.protocol.dialects import ALPHA, BETA
 from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.messages.runtime import SetPaused, SetPausedOk
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
@@ -31,6 +32,9 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import Dispatcher, HandlerTable
 
 Serve = Callable[..., Wire]
+
+
+any_request = st.sampled_from(sorted(BETA.ops)).flatmap(plain_request)
 
 
 @pytest.fixture(scope="module")
@@ -345,7 +349,7 @@ def fuzzed(models: Path) -> Iterator[tuple[Dispatcher, ServerCore]]:
         yield Dispatcher(core, HANDLERS), core
 
 
-@given(request_=plain_requests | mangled_requests)
+@given(request_=any_request | mangled(any_request))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)
 def test_no_request_makes_the_server_fail(fuzzed: tuple[Dispatcher, ServerCore], request_: dict[str, Any]) -> None:
     dispatcher, core = fuzzed
