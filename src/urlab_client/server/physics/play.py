@@ -72,7 +72,7 @@ class Running:
         return ControlClaims()
 
     @cached_property
-    def step_frames(self) -> StepReplies:
+    def step_replies(self) -> StepReplies:
         """The encoder of the replies to `step`."""
         return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
 
