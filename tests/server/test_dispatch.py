@@ -25,7 +25,8 @@ from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
 from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.core import PhysicsConfig, ServerCore
+from urlab_client.server.config import ServerConfig
+from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.refusal import Refusal
@@ -245,7 +246,7 @@ def test_a_frame_beyond_the_limit_is_answered(idle: Wire) -> None:
 @pytest.fixture
 def core(tmp_path: Path) -> ServerCore:
     world = EditorWorld(ContentRoot(tmp_path))
-    return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
+    return ServerCore(world=world, config=ServerConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
 
 
 def ask(dispatcher: Dispatcher, transport: Transport = Transport.ZMQ, **request: Any) -> dict[str, Any]:
@@ -344,9 +345,7 @@ def fuzzed(models: Path) -> Iterator[tuple[Dispatcher, ServerCore]]:
     with SimulatedServer(models / "bot.xml", models / "hand.xml", play=True) as server:
         opened = server._opened
         assert opened is not None
-        core = opened._core
-        assert core is not None
-        yield Dispatcher(core, HANDLERS), core
+        yield Dispatcher(opened.core, HANDLERS), opened.core
 
 
 @given(request_=any_request | mangled(any_request))

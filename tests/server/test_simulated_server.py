@@ -219,7 +219,7 @@ def test_close_during_a_long_step(models: Path, connect: Connect) -> None:
         wire = connect(server)
         wire.hello()
         wire.ask("set_mode", mode="direct")
-        engine = server._opened._core.play.running().engine
+        engine = server._opened.core.play.running().engine
         engine.on_substep.append(lambda: eventually(lambda: engine._thread.stopping))  # or it may have ended by then
         engine._step_timeout_s = 60.0
         reply = ask_later(wire, "step", n_steps=Limits().n_steps)
@@ -233,7 +233,7 @@ def test_close_while_a_step_waits(models: Path, connect: Connect) -> None:
         wire.hello()
         wire.ask("set_mode", mode="direct")
         wire.ask("set_paused", paused=True)
-        engine = server._opened._core.play.running().engine
+        engine = server._opened.core.play.running().engine
         engine._step_timeout_s = 60.0
         reply = ask_later(wire, "step")
         eventually(lambda: engine._queue)

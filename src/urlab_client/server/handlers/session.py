@@ -129,7 +129,7 @@ def _articulation(server: ServerCore, name: str, control: ArticulationControl) -
         ),
         camera_topics={
             dialect.camera_key(name, camera.name): CameraInfo(
-                mode=server.physics.camera_mode(index, camera.name),
+                mode=server.config.camera_mode(index, camera.name),
                 resolution=camera.resolution,
                 fovy=float32(camera.fovy),
                 zmq_endpoint=server.camera_endpoint(name, dialect.camera_part(camera.name)),
