@@ -143,7 +143,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "system",
         "limits",
         "refusal",
-        "lease",
         "assets",
         "compile",
         "editor",

@@ -13,7 +13,7 @@ from beta_bench import ME, OTHER, Bench, Clock
 from wire import Wire
 
 from urlab_client.protocol.control_messages import ControlPayload
-from urlab_client.server.lease import DriverLease
+from urlab_client.server.session import DriverLease
 
 # Claims.
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.cli._files import replaced
-from urlab_client.server.editor.geometry import Box, box_around
+from urlab_client.server.compile.bounds import Box, box_around
 from urlab_client.server.render.opengl import ADVICE
 
 if TYPE_CHECKING:

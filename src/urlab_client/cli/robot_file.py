@@ -12,7 +12,7 @@ from urlab_client._mujoco import actuator_count, control_starts
 from urlab_client.cli._failure import CommandError, one_line
 from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.assets.importer import mujoco_messages
-from urlab_client.server.editor.geometry import box_around
+from urlab_client.server.compile.bounds import box_around
 
 __all__ = ["RobotFile", "read_robot"]
 

@@ -10,7 +10,7 @@ from urlab_client.server.initial_level import ModelError
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.opengl import RenderingUnavailable
-from urlab_client.server.rpc.served_request import ServedRequest
+from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.simulated import SimulatedServer
 from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
 from urlab_client.server.transport.endpoint import PortInUse

@@ -23,7 +23,6 @@ from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceIn
 from urlab_client.randomise.declaration import MODEL_TEXT
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.config import ServerConfig
@@ -31,16 +30,16 @@ from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
-from urlab_client.server.lease import DriverLease
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import UserChannels
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
+from urlab_client.server.refusal import CompileFailed
 from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.session import ServerSession
+from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
 

@@ -31,11 +31,10 @@ from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.initial_level import ModelError, populate
-from urlab_client.server.lease import DriverLease
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import Dispatcher
 from urlab_client.server.rpc.watchdog import Watchdog
-from urlab_client.server.session import ServerSession
+from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.snapshot import take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.publishing import StreamServer

@@ -30,7 +30,7 @@ from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.render.opengl import find_backend
-from urlab_client.server.rpc.served_request import ServedRequest
+from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp

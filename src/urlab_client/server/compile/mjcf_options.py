@@ -14,7 +14,7 @@ import numpy as np
 
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["OptionPolicy", "adopt_options", "copy_options", "ignored_options"]
 

@@ -20,7 +20,7 @@ from urlab_client._mujoco import (
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["ArticulationIndex", "EntityIndex", "SceneCamera", "index_articulation", "index_entity"]
 

@@ -2,22 +2,54 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
+from urlab_client.protocol.names import WINDOWS_DEVICES
 from urlab_client.server.assets.actors import Actor
-from urlab_client.server.assets.blueprint import sanitized
+from urlab_client.server.assets.blueprint import IMPORTS, sanitized
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.level import LevelError, read_level, write_level
-from urlab_client.server.assets.package_names import level_package
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Levels"]
+__all__ = ["Levels", "level_package"]
 
 UNTITLED: Final = "/Temp/Untitled_1"
+
+
+_LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
+_MAX_SEGMENT_BYTES: Final = 240
+_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
+
+
+def level_package(name: str) -> str:
+    """Expand a level's name to its package path: `lab`, `/Game/Levels/lab` and `/Game/Levels/lab.lab` are one level.
+
+    Raises:
+        ValueError: The name has a part that cannot be a file name everywhere, or leads out of the content root.
+    """
+    in_game = name[:6].casefold() == "/game/"
+    parts = name[6:].split("/") if in_game else name.split("/")
+    package, _, described = parts[-1].partition(".")
+    if described.casefold() == package.casefold():  # an object path says the name again; the engine ignores case
+        parts[-1] = package
+    for part in parts:
+        if (
+            not _LEVEL_SEGMENT.fullmatch(part)
+            or len(part.encode()) > _MAX_SEGMENT_BYTES
+            or part.upper() in WINDOWS_DEVICES
+        ):
+            raise ValueError(
+                f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
+                "or a path of such parts that begins with /Game/"
+            )
+    if in_game and parts[0].casefold() in _RESERVED:
+        raise ValueError(f"'{name}' is not a level's name: /Game/{parts[0]} {_RESERVED[parts[0].casefold()]}")
+    return f"/Game/{'/'.join(parts)}" if in_game else f"/Game/Levels/{'/'.join(parts)}"
 
 
 class Levels:

@@ -29,13 +29,12 @@ from urlab_client.server.assets.actors import (
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.bounds import actor_bounds
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.blueprints import Blueprints
 from urlab_client.server.editor.level_actors import ActorNames, LevelActors, match_actor
 from urlab_client.server.editor.levels import Levels
 from urlab_client.server.editor.quick_convert import QuickConvert
-from urlab_client.server.refusal import Refusal
+from urlab_client.server.refusal import CompileFailed, Refusal
 
 __all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
 
