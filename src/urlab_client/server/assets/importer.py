@@ -27,8 +27,7 @@ from urlab_client._mujoco import (
     compiled_file,
     write_model,
 )
-from urlab_client.server.assets.option_ranges import options_problem
-from urlab_client.server.limits import Limits
+from urlab_client.server.limits import Limits, options_problem
 
 __all__ = [
     "Compiled",

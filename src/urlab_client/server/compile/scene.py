@@ -21,14 +21,13 @@ import numpy as np
 from urlab_client._mujoco import export_model
 from urlab_client.server.assets.actors import Actor, scene_problem
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.compile.composition import compose
 from urlab_client.server.compile.duplicates import coinciding_planes, draw_once, floor_warning
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene_document import attached_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.compile.static_meshes import unique_name
-from urlab_client.server.limits import Limits
+from urlab_client.server.limits import Limits, options_problem
 from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["CompiledScene", "compile_scene", "saved_model"]
