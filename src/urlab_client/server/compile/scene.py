@@ -60,11 +60,11 @@ class CompiledScene:
     warnings: tuple[str, ...] = ()
 
     def mjb(self) -> bytes:
-        """Return the live model in MuJoCo's binary format. The caller holds whatever guards the model."""
+        """Return the live model in MuJoCo's binary format. The caller holds the model's lock."""
         return saved_model(self.model)
 
     def export(self, *, attached: bool = False) -> tuple[str, dict[str, bytes]]:
-        """Return the scene as MJCF, and the content of every file it names; `file` attributes are bare names.
+        """Return the scene as MJCF, and the content of every file it refers to, by bare name.
 
         Args:
             attached: Whether each robot has a document of its own among the files, which the scene attaches.
@@ -140,7 +140,7 @@ def compile_scene(
         _refuse(options_problem(spec.option, limits))
         model = spec.compile()
         memory = sum(max(blueprint.spec.memory, 0) for _, blueprint in articulations)
-        if memory > model.narena:  # somebody found MuJoCo's own estimate too small
+        if memory > model.narena:  # the user found MuJoCo's own estimate too small
             spec.memory = memory
             model = spec.compile()
         _refuse(_size_problem(model, limits))
@@ -181,7 +181,7 @@ def _refuse(problem: str) -> None:
 
 
 def _size_problem(model: mujoco.MjModel, limits: Limits) -> str:
-    """Return which limit the compiled scene exceeds where its parts gave no number, or nothing."""
+    """Return which limit the scene exceeds, or nothing; for numbers that are known only after compilation."""
     n_bytes = mujoco.mj_sizeModel(model) + model.narena
     if n_bytes > limits.scene_bytes:
         return f"the scene takes {n_bytes} bytes, more than the limit scene_bytes, {limits.scene_bytes}"

@@ -1,4 +1,4 @@
-"""The levels of the content root: which one is open, and creating, loading, saving and deleting them."""
+"""The levels of the content root: creating, loading, saving and deleting them, and which one is open."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def level_package(name: str) -> str:
     """Expand a level's name to its package path: `lab`, `/Game/Levels/lab` and `/Game/Levels/lab.lab` are one level.
 
     Raises:
-        ValueError: The name has a part that cannot be a file name everywhere, or leads out of the content root.
+        ValueError: A part of the name is not a portable file name, or leads out of the content root.
     """
     in_game = name[:6].casefold() == "/game/"
     parts = name[6:].split("/") if in_game else name.split("/")
@@ -61,7 +61,7 @@ class Levels:
     """
 
     def __init__(self, content: ContentRoot, actors: LevelActors, playing: Callable[[], bool]) -> None:
-        """Begin with an empty, untitled level.
+        """Open an empty, untitled level.
 
         Args:
             content: The content root.
@@ -115,7 +115,7 @@ class Levels:
     def load_file(self, path: Path) -> str:
         """Open a level file named by the server's operator, and return the level's path.
 
-        It may lie anywhere; `save_level` then writes to that file. Models it names are imported from where it says.
+        It may lie anywhere; `save_level` then writes to that file. Its models are imported from the paths in it.
 
         Raises:
             Refusal: `load_level_failed`.
@@ -158,7 +158,7 @@ class Levels:
         return f"{folder}/UEDPIE_0_{name}"
 
     def destroy(self, package: str) -> bool:
-        """Delete a level and return whether there was one; instead of the open one an empty level is open then.
+        """Delete a level and return whether there was one; if it was open, an empty level takes its place.
 
         Raises:
             Refusal: `destroy_asset_failed` for a file outside the content root.
