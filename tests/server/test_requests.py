@@ -478,6 +478,10 @@ def test_both_ways_agree_on_odd_requests(request: dict[str, Any]) -> None:
     agree(request)
 
 
+def test_bytes_are_read_beside_an_unknown_field() -> None:
+    agree({"op": "upload_model_chunk", "upload_id": "u", "kind": "xml", "data": b"\x00\xff"})
+
+
 @pytest.mark.parametrize("op", [op for op in BETA.ops if op != "configure_controller"])
 def test_what_our_client_sends_is_read_as_it_means_it(op: str) -> None:
     samples: dict[str, Any] = {
