@@ -153,7 +153,7 @@ def mirrored(client: URLabClient) -> dict[str, Any]:
 
 def actual(server: SimulatedServer, client: URLabClient) -> dict[str, Any]:
     """What is so."""
-    core: Any = server._running._core  # type: ignore[union-attr]
+    core: Any = server._running.core  # type: ignore[union-attr]
     known = {"session": core.session.id, "playing": core.play.manager_present}
     if not core.play.manager_present:
         return known | {"seed": client.reset_seed, "recording": False}

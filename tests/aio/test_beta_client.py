@@ -501,7 +501,7 @@ async def test_a_step_that_timed_out_is_not_sent_again(served: SimulatedServer) 
         await client.discover()
         before = (await client.step()).step
         await client.runtime.set_paused(True)
-        core: Any = served._running._core  # type: ignore[union-attr]
+        core: Any = served._running.core  # type: ignore[union-attr]
         core.play.running().engine._step_timeout_s = 0.05
         sent = client.transport_stats.sent
         with pytest.raises(StepTimeout):

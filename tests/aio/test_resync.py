@@ -269,7 +269,7 @@ async def test_a_lost_mode_change_is_made_certain(client: URLabClient, relay: Re
 
 
 async def test_a_lost_pause_is_made_certain(client: URLabClient, relay: Relay, server: SimulatedServer) -> None:
-    session, play = client.session_id, server._running._core.play  # type: ignore[union-attr]
+    session, play = client.session_id, server._running.core.play  # type: ignore[union-attr]
     await lose_the_request(relay, asyncio.create_task(client.runtime.set_paused(True)))
     await client.resync()
     assert client.session_id != session, "it may still be on its way, and must not arrive after another"

@@ -68,7 +68,7 @@ def handle(client: Any) -> Any:
 
 def of_server(server: SimulatedServer) -> tuple[Any, ...]:
     """Return all that a request may change: the whole state, what was computed from it, and the owners of robots."""
-    running = server._running._core.play.running()  # type: ignore[union-attr]
+    running = server._running.core.play.running()  # type: ignore[union-attr]
     engine = running.engine
     with engine.lock:
         model, data = engine._model, engine._data

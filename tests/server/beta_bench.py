@@ -84,7 +84,7 @@ class Bench:
     @property
     def core(self) -> Any:
         """The server's inside, for clocks that a test sets."""
-        return self.server._running._core  # type: ignore[union-attr]
+        return self.server._running.core  # type: ignore[union-attr]
 
     def shm(self) -> RawShm:
         """A bare client of the same session over shared memory."""

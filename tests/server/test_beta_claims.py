@@ -14,7 +14,7 @@ from waiting import eventually
 from wire import Wire
 
 from urlab_client.protocol.control_messages import ControlPayload
-from urlab_client.server.lease import DriverLease
+from urlab_client.server.session import DriverLease
 
 # Claims.
 

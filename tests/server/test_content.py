@@ -22,7 +22,7 @@ from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.importer import mujoco_messages
-from urlab_client.server.assets.package_names import level_package
+from urlab_client.server.editor.levels import level_package
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import working_in

@@ -12,25 +12,30 @@ from typing import Any
 import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
-from odd_requests import mangled_requests, plain_requests
+from hypothesis import strategies as st
+from odd_requests import mangled, plain_request
 from wire import Wire, check_numbers, pack, write_level
 
 from urlab_client.protocol.base import Needs
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
-from urlab_client.protocol.dialects import ALPHA
+from urlab_client.protocol.dialects import ALPHA, BETA
 from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.messages.runtime import SetPaused, SetPausedOk
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
 from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.core import PhysicsConfig, ServerCore
+from urlab_client.server.config import ServerConfig
+from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import Dispatcher, HandlerTable
 
 Serve = Callable[..., Wire]
+
+
+any_request = st.sampled_from(sorted(BETA.ops)).flatmap(plain_request)
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +246,7 @@ def test_a_frame_beyond_the_limit_is_answered(idle: Wire) -> None:
 @pytest.fixture
 def core(tmp_path: Path) -> ServerCore:
     world = EditorWorld(ContentRoot(tmp_path))
-    return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
+    return ServerCore(world=world, config=ServerConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
 
 
 def ask(dispatcher: Dispatcher, transport: Transport = Transport.ZMQ, **request: Any) -> dict[str, Any]:
@@ -340,12 +345,10 @@ def fuzzed(models: Path) -> Iterator[tuple[Dispatcher, ServerCore]]:
     with SimulatedServer(models / "bot.xml", models / "hand.xml", play=True) as server:
         opened = server._opened
         assert opened is not None
-        core = opened._core
-        assert core is not None
-        yield Dispatcher(core, HANDLERS), core
+        yield Dispatcher(opened.core, HANDLERS), opened.core
 
 
-@given(request_=plain_requests | mangled_requests)
+@given(request_=any_request | mangled(any_request))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)
 def test_no_request_makes_the_server_fail(fuzzed: tuple[Dispatcher, ServerCore], request_: dict[str, Any]) -> None:
     dispatcher, core = fuzzed

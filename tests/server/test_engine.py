@@ -21,11 +21,11 @@ from waiting import eventually
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
+from urlab_client.server.handlers.runtime import parse_control_source, parse_mode
 from urlab_client.server.physics import engine as engine_module
 from urlab_client.server.physics import pacing
 from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.parsing import parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 
 DT = 0.002

@@ -122,7 +122,7 @@ def test_a_server_closes_in_the_middle_of_a_million_steps(models: Path, connect:
     with SimulatedServer(models / "bot.xml", play=True, unpaused=True, step_mode="direct") as server:
         wire = connect(server)
         wire.hello()
-        core = server._running._core
+        core = server._running.core
         assert core is not None
         engine = core.play.running().engine
         engine.on_substep.append(lambda: eventually(lambda: engine._thread.stopping))  # or it may have ended by then

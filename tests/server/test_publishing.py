@@ -87,7 +87,7 @@ class Bench:
 
     @property
     def engine(self) -> Engine:
-        running = self.server._running._core.play.current
+        running = self.server._running.core.play.current
         assert running is not None
         return running.engine
 

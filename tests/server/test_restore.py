@@ -185,7 +185,7 @@ def test_a_server_that_hangs_is_started_again(models: Path) -> None:
         with Wire(server) as wire, context.socket(zmq.REQ) as asking:
             wire.hello()
             wire.ask("set_mode", mode="direct")
-            server._opened._core.play.running().engine.on_substep.append(hang)
+            server._opened.core.play.running().engine.on_substep.append(hang)
             asking.linger = 0
             asking.connect(f"{server.address}:{server.step_port}")
             asking.send(pack({"op": "step", "session_id": wire.session_id}))

@@ -12,10 +12,10 @@ import pytest
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.world import EditorWorld
+from urlab_client.server.refusal import CompileFailed
 
 BALL = mjcf(BALL_BODY, model="ball")
 FLOOR = '<geom name="floor" type="plane" size="5 5 0.1"/>'

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from worlds import BALL_BODY, BOT, Workspace, mjcf, write_obj
 
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.refusal import CompileFailed
 
 CRAB = """
 <mujoco model="crab"><asset><mesh name="claw" file="claw.obj"/></asset>

@@ -194,8 +194,12 @@ def test_our_client_finds_it(models: Path) -> None:
         assert list(client.articulations) == ["bot"]
 
 
-def test_a_forked_child_leaves_the_server_alone(models: Path, connect: Connect) -> None:
-    with SimulatedServer(models / "bot.xml", play=True) as server:
+def test_a_forked_child_leaves_the_server_alone(
+    models: Path, connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = tmp_path / "registry"
+    monkeypatch.setenv("URLAB_REGISTRY_DIR", str(registry))
+    with SimulatedServer(models / "bot.xml", play=True, dialect="beta") as server:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads is what is tested
             child = os.fork()
@@ -205,6 +209,8 @@ def test_a_forked_child_leaves_the_server_alone(models: Path, connect: Connect) 
         assert os.waitpid(child, 0)[1] == 0
         assert connect(server).hello()["manager_present"] is True
         assert server.saved_dir.is_dir()
+        assert len([*registry.iterdir()]) == 1
+    assert not [*registry.iterdir()]
 
 
 # Closing while something is under way
@@ -219,7 +225,7 @@ def test_close_during_a_long_step(models: Path, connect: Connect) -> None:
         wire = connect(server)
         wire.hello()
         wire.ask("set_mode", mode="direct")
-        engine = server._opened._core.play.running().engine
+        engine = server._opened.core.play.running().engine
         engine.on_substep.append(lambda: eventually(lambda: engine._thread.stopping))  # or it may have ended by then
         engine._step_timeout_s = 60.0
         reply = ask_later(wire, "step", n_steps=Limits().n_steps)
@@ -233,7 +239,7 @@ def test_close_while_a_step_waits(models: Path, connect: Connect) -> None:
         wire.hello()
         wire.ask("set_mode", mode="direct")
         wire.ask("set_paused", paused=True)
-        engine = server._opened._core.play.running().engine
+        engine = server._opened.core.play.running().engine
         engine._step_timeout_s = 60.0
         reply = ask_later(wire, "step")
         eventually(lambda: engine._queue)

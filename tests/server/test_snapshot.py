@@ -238,7 +238,7 @@ def test_what_lives_for_one_frame_is_seen_once(stage: Stage) -> None:
 @pytest.mark.opengl
 def test_time_to_live_ends(stage: Stage) -> None:
     now = [0.0]
-    core = stage.server._running._core
+    core = stage.server._running.core
     assert core is not None
     core.drawings = Drawings(lambda: now[0])
     before, marked = stage.before_and_after("draw_marker", location=[-1, 0, 0], color=RED, ttl=2)

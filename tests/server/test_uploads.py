@@ -123,7 +123,7 @@ def test_uploads_that_are_open(wire: Wire, server: SimulatedServer) -> None:
     for _ in range(MAX_OPEN):
         wire.ask("upload_model_manifest", **manifest())
     assert wire.refused("upload_model_manifest", **manifest()) == "bad_request"
-    core = server._running._core  # type: ignore[union-attr]
+    core = server._running.core  # type: ignore[union-attr]
     now = core.uploads.clock()
     core.uploads.clock = lambda: now + IDLE_S + 1
     upload = wire.ask("upload_model_manifest", **manifest())["upload_id"]

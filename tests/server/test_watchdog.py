@@ -49,9 +49,7 @@ class Stuck:
 
 
 def core_of(server: SimulatedServer) -> ServerCore:
-    core = server._running._core
-    assert core is not None
-    return core
+    return server._running.core
 
 
 def hurry(server: SimulatedServer) -> None:

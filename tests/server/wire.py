@@ -128,7 +128,7 @@ class Wire:
     @property
     def core(self) -> Any:
         """The inside of the server, where no op shows what is asked about."""
-        return self._server._running._core  # type: ignore[union-attr]
+        return self._server._running.core  # type: ignore[union-attr]
 
     def __enter__(self) -> Self:
         return self

@@ -20,6 +20,8 @@ from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "EDITOR_TIMEOUT_S",
+    "INT32_MAX",
+    "INT32_MIN",
     "ActorId",
     "ActorTarget",
     "Color",
@@ -28,6 +30,7 @@ __all__ = [
     "Effect",
     "EulerDeg",
     "Floats",
+    "Int32",
     "Needs",
     "Op",
     "Quat",
@@ -50,6 +53,13 @@ Quat: TypeAlias = tuple[float, float, float, float]
 
 DialectName: TypeAlias = Literal["alpha", "beta"]
 """The supported wire dialects of the plugin; see `protocol.dialects`."""
+
+
+INT32_MIN: Final = -(2**31)
+INT32_MAX: Final = 2**31 - 1
+
+Int32: TypeAlias = Annotated[int, Meta(ge=INT32_MIN, le=INT32_MAX)]
+"""An integer of a request that the server decodes directly: the plugin reads one beyond 32 bits as absent."""
 
 
 def doc(text: str) -> Meta:
@@ -126,7 +136,7 @@ class Op:
         effect: Whether it may be sent again after a lost reply.
         timeout: Minimum time to wait for the reply, seconds; None for the client's default.
         hot: Built by the client itself at kilohertz rates or with megabytes of data: sent without checking the struct's
-            field types again, and decoded by the server directly.
+            field types again, and decoded by the server directly. The struct, and those in it, forbid unknown fields.
         infinite: Request fields whose numbers may be infinite; all others are finite.
         errors: Error codes of the op, in addition to those of every request.
         generated: Whether `tools/gen_ops.py` writes the client's method. Methods of ops that mirror state or create

@@ -365,7 +365,7 @@ def _widener(struct: type[Struct]) -> Widener | None:
         return None
 
     def apply(value: Any) -> Any:
-        widened = copy.copy(value)  # what is encoded belongs to others, too: a picture also to the camera's stream
+        widened = value.__copy__()  # what is encoded belongs to others, too: a picture also to the camera's stream
         for name, widen in plan:
             item = getattr(value, name)
             if item is not None:
@@ -388,8 +388,8 @@ def _plan_info(info: msgspec.inspect.Type, owner: type[Struct]) -> Widener | Non
             return plans[0] if plans else None
         case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
             return float
-        case msgspec.inspect.TupleType() | msgspec.inspect.VarTupleType():
-            return _widen_sequence
+        case msgspec.inspect.TupleType() | msgspec.inspect.ListType(item_type=msgspec.inspect.FloatType()):
+            return _widen_numbers  # tuples on the wire are vectors and sizes
         case msgspec.inspect.ListType(item_type=item):
             return _each(_plan_info(item, owner))
         case msgspec.inspect.DictType(value_type=item):
@@ -408,8 +408,8 @@ def _widen_struct(value: Struct) -> Struct:
     return widen(value) if widen is not None else value
 
 
-def _widen_sequence(value: Any) -> Any:
-    return [float(v) if isinstance(v, (int, float)) and not isinstance(v, bool) else v for v in value]
+def _widen_numbers(values: Any) -> list[float]:
+    return [*map(float, values)]
 
 
 def _each(widen: Widener | None) -> Widener | None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from urlab_client.server.limits import Limits
     from urlab_client.server.physics.controllers import ControllerConfig
     from urlab_client.server.render.opengl import RenderingUnavailable
-    from urlab_client.server.rpc.served_request import ServedRequest
+    from urlab_client.server.rpc.dispatch import ServedRequest
     from urlab_client.server.simulated import SimulatedServer
     from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
     from urlab_client.server.transport.endpoint import PortInUse
@@ -33,7 +33,7 @@ _HOMES = {
     "Limits": "urlab_client.server.limits",
     "ControllerConfig": "urlab_client.server.physics.controllers",
     "RenderingUnavailable": "urlab_client.server.render.opengl",
-    "ServedRequest": "urlab_client.server.rpc.served_request",
+    "ServedRequest": "urlab_client.server.rpc.dispatch",
     "SimulatedServer": "urlab_client.server.simulated",
     "CurveServer": "urlab_client.server.transport.curve_authentication",
     "UnprotectedServer": "urlab_client.server.transport.curve_authentication",

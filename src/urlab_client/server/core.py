@@ -17,82 +17,37 @@ import mujoco
 from urlab_client._mujoco import copy_options
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.dialects import ALPHA, Dialect
+from urlab_client.protocol.dialects import Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
-from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation
+from urlab_client.randomise.declaration import MODEL_TEXT
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
-from urlab_client.server.compile.scene_index import ArticulationIndex
+from urlab_client.server.config import ServerConfig
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
-from urlab_client.server.lease import DriverLease
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import UserChannels
-from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
-from urlab_client.server.render.appearance import Appearance, RenderQuality
+from urlab_client.server.refusal import CompileFailed
+from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.session import ServerSession
+from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
 
-__all__ = ["PhysicsConfig", "ServerCore"]
+__all__ = ["ServerCore"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhysicsConfig:
-    """Configuration of the play sessions of a server.
-
-    Attributes:
-        step_mode: Mode that every session is locked to; `auto` starts live and lets clients choose.
-        unpaused: Let physics run from the start.
-        controllers: Controller by actor id or articulation key; `*` matches all others. Takes precedence over the
-            level and the MJCF.
-        camera_modes: Meaning of the pixels by `ACTOR/CAMERA`; the actor is an id or a key.
-        camera_size: Width and height of cameras without a resolution in their MJCF, pixels.
-        mjcf_options: Use the `<option>` of the first model.
-        render_quality: Rendering quality of cameras and the viewport.
-        user_channels: Initial values of the level's user channels, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
-        randomise: Variations drawn at each reset.
-    """
-
-    step_mode: StepMode = StepMode.AUTO
-    unpaused: bool = False
-    controllers: Mapping[str, ControllerConfig] = field(default_factory=dict[str, ControllerConfig])
-    camera_modes: Mapping[str, CameraMode] = field(default_factory=dict[str, CameraMode])
-    camera_size: tuple[int, int] | None = None
-    mjcf_options: bool = False
-    render_quality: RenderQuality = "auto"
-    user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    randomise: Randomisation | None = None
-
-    def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
-        """Return the controller of an articulation: the one configured here, otherwise that of the level or its
-        MJCF."""
-        for name in (index.actor_id, index.key, "*"):
-            if name and name in self.controllers:
-                return self.controllers[name]
-        return None if index.controller is None else ControllerConfig.of(index.controller)
-
-    def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
-        """Return the mode of an articulation's camera."""
-        for name in (index.actor_id, index.key):
-            if name and f"{name}/{camera}" in self.camera_modes:
-                return self.camera_modes[f"{name}/{camera}"]
-        return CameraMode.REAL
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
@@ -105,10 +60,9 @@ class ServerCore:
 
     Attributes:
         world: The level being edited.
-        physics: Configuration of play sessions.
+        config: Configuration of the server.
         camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
         switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
-        dialect: Wire dialect.
         shm_directory: Directory of the shared-memory regions; None without shared memory.
         session: The client's session.
         play: The play session.
@@ -123,10 +77,9 @@ class ServerCore:
     """
 
     world: EditorWorld
-    physics: PhysicsConfig
+    config: ServerConfig
     camera_endpoint: Callable[[str, str], str]
     switch_camera: Callable[..., None] = _no_switch
-    dialect: Dialect = ALPHA
     shm_directory: str | None = None
     session: ServerSession = field(default_factory=ServerSession)
     play: Play = field(init=False)
@@ -148,6 +101,11 @@ class ServerCore:
         self.jobs = EditorJobs(self.health)
         self.drawings = Drawings(limit=self.limits.markers)
         self.uploads = Uploads(self.world.content.root / UPLOADS, self.limits.upload_cache_bytes)
+
+    @property
+    def dialect(self) -> Dialect:
+        """Wire dialect."""
+        return self.config.dialect
 
     @property
     def limits(self) -> Limits:
@@ -172,13 +130,13 @@ class ServerCore:
             names_fit: Whether to fail if a configured controller or camera mode matches nothing in the level.
         """
         actors = self.world.freeze()
-        physics = self.physics
+        config = self.config
 
         def build() -> Running:
             scene = compile_scene(
                 actors,
                 options=self._options,
-                camera_size=physics.camera_size,
+                camera_size=config.camera_size,
                 texts=self._texts(actors),
                 limits=self.limits,
             )
@@ -216,29 +174,29 @@ class ServerCore:
         return self.play.wait(timeout) is PIEState.READY
 
     def _run(self, scene: CompiledScene, actors: Sequence[Actor], *, names_fit: bool = False) -> Running:
-        physics = self.physics
+        config = self.config
         files = recordings(replay_folder(self.world.content.root))
-        controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-        for problem in _unmatched_names(scene, physics):
+        controllers = {index.key: found for index in scene.articulations if (found := config.controller(index))}
+        for problem in _unmatched_names(scene, config):
             if names_fit:
                 raise CompileFailed(problem)
             logger.warning("%s", problem)
         try:
             engine = Engine(
                 scene,
-                pinned_mode=physics.step_mode,
-                paused=not physics.unpaused,
+                pinned_mode=config.step_mode,
+                paused=not config.unpaused,
                 controllers=controllers,
                 health=self.health,
                 dialect=self.dialect,
-                randomise=physics.randomise,
+                randomise=config.randomise,
             )
         except ValueError as error:
             raise CompileFailed(f"what is to vary: {error}") from None
         varied = () if engine.variation is None else engine.variation.visible_fields
-        channels = UserChannels(physics.user_channels)
+        channels = UserChannels(config.user_channels)
         modes = {
-            (index.key, camera.name): physics.camera_mode(index, camera.name)
+            (index.key, camera.name): config.camera_mode(index, camera.name)
             for index in scene.articulations
             for camera in index.cameras
         }
@@ -254,7 +212,7 @@ class ServerCore:
 
     @property
     def _options(self) -> OptionPolicy:
-        if self.physics.mjcf_options:
+        if self.config.mjcf_options:
             return "first"
         return "merged" if self.dialect.options_merged else "ignored"
 
@@ -287,15 +245,24 @@ class ServerCore:
         )
 
     def _appearance(self, actors: Sequence[Actor]) -> Appearance:
-        return Appearance(quality=self.physics.render_quality, classes={actor.name: _kind(actor) for actor in actors})
+        return Appearance(quality=self.config.render_quality, classes={actor.name: _kind(actor) for actor in actors})
 
     def _texts(self, actors: Sequence[Actor]) -> dict[str, str]:
         """Return the handshake's facts about the compiled model."""
-        physics, appearance = self.physics, self._appearance(actors)
-        if not any(mode in _SEGMENTATIONS for mode in physics.camera_modes.values()):
+        config, appearance = self.config, self._appearance(actors)
+        if not any(mode in _SEGMENTATIONS for mode in config.camera_modes.values()):
             appearance = Appearance(quality=appearance.quality)
-        varied = {} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()}
+        varied = {} if config.randomise is None else {MODEL_TEXT: config.randomise.to_json()}
         return varied | appearance.texts()
+
+    def stop(self) -> None:
+        """Let go of jobs and uploads, as the server closes."""
+        self.jobs.close()
+        self.uploads.close()
+
+    def join(self, timeout: float) -> bool:
+        """End play permanently; return False if physics is busy for longer than half of `timeout` seconds."""
+        return self.play.close(timeout / 2)
 
     def stop_play(self) -> None:
         """Stop play if it is running."""
@@ -320,7 +287,7 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def _unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
+def _unmatched_names(scene: CompiledScene, config: ServerConfig) -> list[str]:
     """Return messages for configured names that match nothing in a scene; most likely they are misspelt."""
     actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {
@@ -333,11 +300,11 @@ def _unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
     return [
         *(
             f"a controller is configured for '{unknown}', but the articulations are {_listed(actors)}"
-            for unknown in sorted(physics.controllers.keys() - actors - {"*"})
+            for unknown in sorted(config.controllers.keys() - actors - {"*"})
         ),
         *(
             f"a camera mode is configured for '{unknown}', but the cameras are {_listed(cameras)}"
-            for unknown in sorted(physics.camera_modes.keys() - cameras)
+            for unknown in sorted(config.camera_modes.keys() - cameras)
         ),
     ]
 

@@ -6,8 +6,11 @@ A request that exceeds one is refused with an error that contains the name of th
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
-__all__ = ["Limits"]
+from urlab_client.protocol import sim_options
+
+__all__ = ["Limits", "option_problem", "options_problem"]
 
 _MIB = 2**20
 
@@ -67,3 +70,22 @@ class Limits:
         for field in fields(self):
             if getattr(self, field.name) < 1:
                 raise ValueError(f"limit {field.name} must be at least 1, not {getattr(self, field.name)}")
+
+
+def option_problem(name: str, value: Any, limits: Limits) -> str:
+    """Return what is wrong with the value of an option, or nothing; options without a range may have any.
+
+    Args:
+        name: As in `mjOption`.
+        value: A number, or three.
+        limits: For the iterations.
+    """
+    if name in sim_options.ITERATIONS and not 0 <= value <= limits.solver_iterations:
+        return f"{name} must be from 0 to the limit solver_iterations, {limits.solver_iterations}, not {value}"
+    return sim_options.option_problem(name, value)
+
+
+def options_problem(option: Any, limits: Limits) -> str:
+    """Return what is wrong with a model's `mjOption`, or nothing."""
+    problems = (option_problem(name, getattr(option, name), limits) for name in sim_options.RANGED_OPTIONS)
+    return next(filter(None, problems), "")

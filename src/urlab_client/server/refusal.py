@@ -1,8 +1,8 @@
-"""The exception by which a handler answers with an error."""
+"""The exceptions of what a server cannot do: serve a request, compile a scene."""
 
 from __future__ import annotations
 
-__all__ = ["Refusal"]
+__all__ = ["CompileFailed", "Refusal"]
 
 
 class Refusal(Exception):
@@ -40,3 +40,17 @@ class Refusal(Exception):
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"
+
+
+class CompileFailed(Exception):
+    """MuJoCo rejects the scene.
+
+    Attributes:
+        message: MuJoCo's message on one line.
+    """
+
+    message: str
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.message = message

@@ -21,16 +21,16 @@ from urlab_client.protocol.base import DialectName
 from urlab_client.protocol.dialects import DIALECTS
 from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.server.core import PhysicsConfig
+from urlab_client.server.config import ServerConfig
 from urlab_client.server.faults import Faults
 from urlab_client.server.initial_level import is_level
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import OpenServer, ServerConfig, ServerPorts
+from urlab_client.server.open_server import OpenServer, open_server
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.render.opengl import find_backend
-from urlab_client.server.rpc.served_request import ServedRequest
+from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
@@ -166,35 +166,37 @@ class SimulatedServer:
                 raise ValueError(f"instance_index must be a number from 0 to {_LAST_INDEX}, not {instance_index}")
             base = _FIRST_PORT + _PORTS_EACH * instance_index
             step_port, state_port, camera_port = step_port or base, state_port or base + 1, camera_port or base + 2
-        ports = ServerPorts(step=step_port, state=state_port, ctrl=ctrl_port, info=info_port, camera=camera_port)
-        for name, port in vars(ports).items():
+        ports = {"step": step_port, "state": state_port, "ctrl": ctrl_port, "info": info_port, "camera": camera_port}
+        for name, port in ports.items():
             if not 0 <= port <= 65535:
                 raise ValueError(f"{name}_port must be a number from 0 to 65535, not {port}")
         self._config = ServerConfig(
             models=names,
             play=play,
+            unpaused=unpaused,
+            step_mode=StepMode(step_mode),
             host=host,
             curve=curve,
             insecure_no_auth=insecure_no_auth,
             limits=limits,
-            ports=ports,
+            step_port=step_port,
+            state_port=state_port,
+            ctrl_port=ctrl_port,
+            info_port=info_port,
+            camera_port=camera_port,
             saved_dir=None if saved_dir is None else Path(saved_dir),
             model_roots=None if model_roots is None else tuple(map(Path, model_roots)),
+            controllers=dict(controllers),
+            camera_modes={camera: CameraMode(mode) for camera, mode in camera_modes.items()},
+            camera_size=camera_size,
+            render_quality=render_quality,
+            mjcf_options=mjcf_options,
             actor_names=actor_names,
-            physics=PhysicsConfig(
-                step_mode=StepMode(step_mode),
-                unpaused=unpaused,
-                controllers=dict(controllers),
-                camera_modes={camera: CameraMode(mode) for camera, mode in camera_modes.items()},
-                camera_size=camera_size,
-                mjcf_options=mjcf_options,
-                render_quality=render_quality,
-                user_channels=dict(user_channels),
-                randomise=None if randomise is None else Randomisation.of(randomise),
-            ),
             faults=faults,
             shm_dir=None if shm_dir is None else Path(shm_dir),
             dialect=DIALECTS[dialect],
+            user_channels=dict(user_channels),
+            randomise=None if randomise is None else Randomisation.of(randomise),
             instance_id=instance_id or ("live" if instance_index is None else f"instance_{instance_index}"),
             index=-1 if instance_index is None else instance_index,
         )
@@ -226,7 +228,7 @@ class SimulatedServer:
         """
         with self._lock:
             if self._opened is None:
-                self._opened = OpenServer.open(self._config)
+                self._opened = open_server(self._config)
                 self._finalizer = weakref.finalize(self, self._opened.close)
         return self
 
@@ -291,7 +293,7 @@ class SimulatedServer:
         started again.
         """
         opened = self._opened
-        return None if opened is None else opened.health.failure
+        return None if opened is None else opened.core.health.failure
 
     def add_failure_callback(self, callback: Callable[[str], None]) -> None:
         """Call `callback` with `failure` when a thread of the server dies, on that thread; immediately if one has died.
@@ -301,7 +303,7 @@ class SimulatedServer:
         Raises:
             RuntimeError: The server is closed.
         """
-        self._running.health.add_callback(callback)
+        self._running.core.health.add_callback(callback)
 
     def add_request_callback(self, callback: Callable[[ServedRequest], None]) -> None:
         """Call `callback` with each answered request, on the thread that answers, until the server is closed.
@@ -311,7 +313,7 @@ class SimulatedServer:
         Raises:
             RuntimeError: The server is closed.
         """
-        self._running.request_callbacks.append(callback)
+        self._running.dispatcher.callbacks.append(callback)
 
     @property
     def sim_time(self) -> float | None:
@@ -395,7 +397,7 @@ class SimulatedServer:
     @property
     def saved_dir(self) -> Path:
         """Folder of levels and imported models."""
-        return self._running.saved_dir
+        return self._running.core.world.content.root
 
     @property
     def shm_dir(self) -> Path | None:

@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.viewport import look
-from urlab_client.server.refusal import Refusal
+from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.opengl import RenderingUnavailable, need_backend
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.rpc.dispatch import Dispatcher

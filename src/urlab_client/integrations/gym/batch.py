@@ -49,7 +49,13 @@ from urlab_client.protocol.names import compiled_names
 from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import declared_in
-from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
+from urlab_client.server.physics.controllers import (
+    Actuated,
+    Controller,
+    ControllerConfig,
+    PassthroughController,
+    PDController,
+)
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 
@@ -434,19 +440,10 @@ def _fetch(address: str, client_options: Mapping[str, Any], cameras: Sequence[st
         )
 
 
-@dataclass(frozen=True)
-class _Actuated:
-    """See `urlab_client.server.physics.controllers.Actuated`."""
-
-    actuators: Indices
-    actuator_names: tuple[str, ...]
-    ctrl_adr: Indices
-
-
 def _controller(
     model: mujoco.MjModel, layout: ArticulationLayout, kind: str, params: Mapping[str, object]
 ) -> Controller:
-    actuated = _Actuated(np.array([*layout.actuators.values()], dtype=np.intp), (*layout.actuators,), layout.ctrl_adr)
+    actuated = Actuated(np.array([*layout.actuators.values()], dtype=np.intp), (*layout.actuators,), layout.ctrl_adr)
     if kind != ControllerKind.PD:
         return PassthroughController(model, actuated)
     controller = PDController(model, actuated, ControllerConfig())

@@ -8,7 +8,19 @@ from typing import Annotated, Any, Final, TypeAlias
 import msgspec
 from msgspec import Struct, field
 
-from urlab_client.protocol.base import ControlRequest, Effect, Floats, Needs, Op, QuatWXYZ, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import (
+    ControlRequest,
+    Effect,
+    Floats,
+    Int32,
+    Needs,
+    Op,
+    QuatWXYZ,
+    Reply,
+    Request,
+    Vec3,
+    doc,
+)
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
@@ -199,7 +211,7 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
             self.entities = self.scene
 
 
-class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True):
+class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """Command of a direct or live step for one articulation."""
 
     ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
@@ -216,10 +228,10 @@ CameraChoice: TypeAlias = bool | Mapping[str, str | dict[str, float] | None]
 """Pictures that a step requests: all or none, or camera name to the kind of picture."""
 
 
-class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True):
+class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """Advance physics, or exchange state, according to the step mode."""
 
-    n_steps: Annotated[int, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
+    n_steps: Annotated[Int32, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
     observations: Annotated[str | None, doc("Observation level; sticky on the server.")] = None
     include_cameras: Annotated[
         CameraChoice,

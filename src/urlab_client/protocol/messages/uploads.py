@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 from msgspec import Struct, field
 
-from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+from urlab_client.protocol.base import Int32, Needs, Op, Reply, Request, doc
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
@@ -65,14 +65,20 @@ class UploadModelChunkOk(Reply, tag="upload_model_chunk_ok", kw_only=True):
     complete: Annotated[bool, doc("Whether the file is complete and its hash matches.")]
 
 
-class UploadModelChunk(Request[UploadModelChunkOk], tag="upload_model_chunk", kw_only=True, omit_defaults=True):
+class UploadModelChunk(
+    Request[UploadModelChunkOk],
+    tag="upload_model_chunk",
+    kw_only=True,
+    omit_defaults=True,
+    forbid_unknown_fields=True,
+):
     """Send a chunk of a file."""
 
     upload_id: Annotated[str, doc("Id of the upload.")]
     kind: Annotated[str, doc("`xml` or `asset`.")]
     name: Annotated[str, doc("Name of the asset.")] = ""
-    offset: Annotated[int, doc("Offset of the chunk, bytes.")] = 0
-    total: Annotated[int, doc("Size of the whole file, bytes.")] = 0
+    offset: Annotated[Int32, doc("Offset of the chunk, bytes.")] = 0
+    total: Annotated[Int32, doc("Size of the whole file, bytes.")] = 0
     data: Annotated[bytes, doc("Content of the chunk.")]
 
 

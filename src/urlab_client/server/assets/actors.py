@@ -1,4 +1,4 @@
-"""What a level consists of: actors and their settings, as plain values.
+"""The contents of a level: actors and their settings, as plain values.
 
 For `World`, which edits them, `level`, which stores them, and `compile_scene`, which turns them into a model. Positions
 are metres and rotations quaternions (x, y, z, w), both in MuJoCo's world frame.
@@ -130,7 +130,7 @@ class Actor:
 
     @property
     def prefix(self) -> str:
-        """What the compiled names of an articulation begin with."""
+        """Prefix of an articulation's compiled names."""
         return f"{self.name}_"
 
     @property
@@ -164,7 +164,7 @@ class Actor:
         return self.own_tags
 
     def has_id(self, actor_id: str) -> bool:
-        """Whether this is the actor of that id. Ids kept as tags compare without letter case, as Unreal's names do."""
+        """Whether the actor has this id. Letter case does not count for ids kept as tags, as for Unreal's names."""
         if self.kind is ActorKind.ARTICULATION:
             return self.actor_id == actor_id
         return self.actor_id.casefold() == actor_id.casefold()

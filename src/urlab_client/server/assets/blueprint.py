@@ -1,4 +1,4 @@
-"""An imported MJCF: its snapshot, and the record that keeps it from one start of a server to the next."""
+"""An imported MJCF: its snapshot, and the record by which the server finds it after a restart."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ class Blueprint:
         cameras: Camera names in compiled order.
         n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
         n_asset_bytes: How much of its compiled size all robots of its kind share.
-        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
-        n_sensor_values: Numbers that its sensors give.
+        n_data_bytes: Memory of its simulation, without the arena if MuJoCo chooses its size.
+        n_sensor_values: Total size of its sensor readings, in numbers.
     """
 
     stem: str
@@ -133,7 +133,7 @@ class Blueprint:
 
     @cached_property
     def element_names(self) -> frozenset[str]:
-        """Names of all elements that get the actor's prefix, of whatever kind."""
+        """Names of all elements that get the actor's prefix, of all kinds."""
         spec = self.spec
         kinds = [
             *(elements for elements, _ in named_kinds(spec)),
@@ -186,7 +186,7 @@ def from_record(folder: Path, record: BlueprintRecord) -> Blueprint:
 
 
 def to_record(blueprint: Blueprint) -> BlueprintRecord:
-    """Return what is stored of a blueprint."""
+    """Return the record of a blueprint."""
     return BlueprintRecord(
         stem=blueprint.stem,
         source=blueprint.source,

@@ -26,6 +26,6 @@ def bundled_models() -> dict[str, Path]:
 
 
 def unknown_model(name: str) -> str:
-    """Return what to say of a name that is neither a file nor a bundled robot."""
+    """Return the error message for a name that is neither a file nor a bundled robot."""
     known = bundled_models()
     return f"{name} is neither a file nor a bundled robot.{did_you_mean(name, known)} Bundled: {', '.join(known)}."

@@ -1,8 +1,8 @@
-"""Which files a model would make MuJoCo read, and whether all of them lie where a client may read.
+"""Which files MuJoCo would read for a model, and whether all of them are in allowed folders.
 
 For the sandbox, before MuJoCo sees the model. MuJoCo joins file names with folders named elsewhere in the model; this
-looks for names and folders wherever they stand and tries all combinations. What it finds may be too much, never too
-little.
+looks for names and folders wherever they stand and tries all combinations. It may find too many files, but never too
+few.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _MAX_COMBINATIONS = 1_000_000
 
 
 class Outside(Exception):
-    """A model names what it must not.
+    """A model refers to a file outside its allowed folders.
 
     Attributes:
-        message: What, in one line.
+        message: What is wrong, in one line.
     """
 
     def __init__(self, message: str) -> None:
@@ -32,7 +32,7 @@ class Outside(Exception):
 
 
 def check_references(file: Path, roots: tuple[Path, ...], limits: Limits) -> None:
-    """Look at an MJCF and, again and again, at whatever document it names.
+    """Check an MJCF and, recursively, all documents that it includes.
 
     Args:
         file: The model; resolved.
@@ -78,7 +78,7 @@ def _combined(bases: Iterable[Path], folders: Iterable[str], names: Iterable[str
 
 
 def _inside(candidate: Path, roots: tuple[Path, ...]) -> Path | None:
-    """Return the real file; None if there is none.
+    """Return the resolved file; None if it does not exist.
 
     Raises:
         Outside: It is elsewhere, or not a file but a device or the like.
@@ -88,7 +88,7 @@ def _inside(candidate: Path, roots: tuple[Path, ...]) -> Path | None:
             return None
         real = candidate.resolve()
         is_folder, is_file = real.is_dir(), real.is_file()
-    except (OSError, ValueError, RuntimeError):  # too long, a null byte, a loop of links: not for MuJoCo either
+    except (OSError, ValueError, RuntimeError):  # too long, a null byte, a loop of links: MuJoCo cannot open it either
         return None
     if is_folder:
         return None

@@ -51,10 +51,10 @@ __all__ = ["ContentRoot"]
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 UPLOADED: Final = "uploaded"
-"""In place of the source of a blueprint that came over the wire."""
+"""Source of a blueprint that a client has uploaded."""
 
 _UNDER_WAY: Final = ".import-"
-"""What the folders begin with that are not finished yet, or are being removed."""
+"""Prefix of folders that are being written or removed."""
 
 _DEFAULT_LIMITS: Final = Limits()
 
@@ -127,7 +127,7 @@ class ContentRoot:
         return self._import_file(file, source, roots, force_reimport=force_reimport)
 
     def import_uploaded(self, document: Path) -> Blueprint:
-        """Import a model that a client has sent, always anew; it reads files of its own folder only.
+        """Import a model that a client has sent. It is always imported anew, and reads only files of its own folder.
 
         Raises:
             Refusal: `import_failed`.
@@ -219,10 +219,10 @@ class ContentRoot:
         return self.root / IMPORTS / blueprint.stem / "blueprint.json"
 
     def _locate(self, path: str, *, trusted: bool) -> tuple[Path, str]:
-        """Return the file behind a request's path and how the blueprint names its source."""
+        """Return the file of a request's path, and the blueprint's name for its source."""
         bundled = bundled_models()
         name = path.removeprefix(BUNDLED_PREFIX)
-        if name in bundled:  # no file is meant: MuJoCo reads none without a suffix
+        if name in bundled:  # not a file: MuJoCo reads none without a suffix
             return bundled[name], f"{BUNDLED_PREFIX}{name}"
         if name != path:
             raise Refusal("import_failed", f"no bundled model is called '{name}': use {', '.join(bundled)}")
@@ -246,7 +246,7 @@ class ContentRoot:
         raise Refusal("import_failed", f"{path} does not exist{where}")
 
     def _candidates(self, path: str, *, trusted: bool) -> list[Path]:
-        """Return the resolved places that may stand for `path`; empty when all are out of bounds."""
+        """Return the resolved files that `path` may mean; empty if all are outside the allowed folders."""
         bases = [Path.cwd()] if trusted else self.model_roots
         places = [Path(path)] if Path(path).is_absolute() else [base / path for base in bases]
         resolved = [place.resolve() for place in places]
@@ -299,7 +299,7 @@ class ContentRoot:
             raise
 
     def _build(self, file: Path, snapshot: Path, home: Path) -> tuple[Compiled, Path, bool]:
-        """Compile a file in this process; return what was learnt, its folder, and whether that is new."""
+        """Compile a file in this process; return its properties, its folder, and whether that is new."""
         folder, is_new = home, False
         try:
             written = write_snapshot(file, snapshot)

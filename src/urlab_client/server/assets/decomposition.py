@@ -24,7 +24,7 @@ _REMEMBERED: Final = 64
 
 
 def advice() -> str:
-    """Return what to say where CoACD is missing."""
+    """Return the error message for a missing CoACD."""
     return f"complex_mesh needs convex decomposition; install it on the server: {install_command('coacd')}"
 
 
@@ -34,7 +34,7 @@ def is_available() -> bool:
 
 
 def convex_parts(file: Path, threshold: float) -> tuple[Part, ...]:
-    """Return the parts of a mesh; the same for the same content and threshold, which are remembered.
+    """Return the parts of a mesh. Results are cached by content and threshold.
 
     Args:
         file: STL, OBJ or MSH file.
@@ -62,7 +62,7 @@ def _decompose(digest: str, threshold: float, file: str) -> tuple[Part, ...]:
 
 
 def _triangles(file: str) -> Part:
-    """Read a mesh as MuJoCo does, and undo that it moves meshes into their inertial frames."""
+    """Read a mesh as MuJoCo does, but in the frame of the file: MuJoCo moves meshes into their inertial frames."""
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="mesh", file=file)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)

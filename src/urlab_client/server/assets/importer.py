@@ -1,7 +1,7 @@
-"""What becomes of an MJCF when it is imported: a self-contained copy in which everything has a name.
+"""Importing an MJCF: a self-contained copy in which all elements have names.
 
-For `ContentRoot` and the sandbox, which say where files lie and what a model may ask for. Names and keyframes are those
-that the plugin's importer makes.
+For `ContentRoot` and the sandbox, which determine the folders and limits. Names and keyframes are those of the plugin's
+importer.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from urlab_client._mujoco import (
     compiled_file,
     write_model,
 )
-from urlab_client.server.assets.option_ranges import options_problem
-from urlab_client.server.limits import Limits
+from urlab_client.server.limits import Limits, options_problem
 
 __all__ = [
     "Compiled",
@@ -44,7 +43,7 @@ __all__ = [
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
-"""What MuJoCo calls a model whose file gives no name."""
+"""MuJoCo's name for a model whose file gives none."""
 
 
 def one_line(error: object) -> str:
@@ -53,15 +52,15 @@ def one_line(error: object) -> str:
 
 
 class Compiled(msgspec.Struct, frozen=True, kw_only=True):
-    """What is learnt from compiling a model; see `Blueprint` for the fields it shares.
+    """Properties of a compiled model; see `Blueprint` for the fields it shares.
 
     Attributes:
         messages: MuJoCo's warnings.
         n_bytes: Size of the compiled model.
-        n_asset_bytes: How much of that are meshes and textures, which all robots of a kind share.
-        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_asset_bytes: The part of that for meshes and textures, which all robots of a kind share.
+        n_data_bytes: Memory of its simulation, without the arena if MuJoCo chooses its size.
         n_arena_bytes: Memory of its arena.
-        n_sensor_values: Numbers that its sensors give.
+        n_sensor_values: Total size of its sensor readings, in numbers.
         options_problem: What is wrong with its `<option>`, if anything.
         largest_image: Largest width or height of its cameras, pixels.
     """
@@ -84,12 +83,12 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Written:
-    """What was learnt from writing a snapshot.
+    """Properties of a written snapshot.
 
     Attributes:
         model_name: The MJCF's `model` attribute; empty if it gives none.
         actuator_types: See `Blueprint`.
-        n_memory: Bytes of arena that its `<size>` asks for; 0 if it asks for none.
+        n_memory: Size of the arena in its `<size>`, bytes; 0 if it gives none.
         messages: MuJoCo's warnings.
     """
 
@@ -100,12 +99,12 @@ class Written:
 
 
 def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
-    """Do what `write_snapshot` and `compile_snapshot` do."""
+    """Call `write_snapshot` and `compile_snapshot`."""
     return compile_snapshot(write_snapshot(file, snapshot), file, snapshot, limits)
 
 
 def write_snapshot(file: Path, snapshot: Path) -> Written:
-    """Write what is kept of an MJCF file.
+    """Write the snapshot of an MJCF file.
 
     Args:
         file: The file.
@@ -117,7 +116,7 @@ def write_snapshot(file: Path, snapshot: Path) -> Written:
     with mujoco_messages() as messages, _naming_the_source(file):
         spec = mujoco.MjSpec.from_file(str(file))
         if spec.compiler.settotalmass > 0.0 or any(len(key.mpos) or len(key.mquat) for key in spec.keys):
-            compiled_file(file)  # for what MuJoCo has to say about that: the snapshot does without
+            compiled_file(file)  # for MuJoCo's warnings about what the snapshot omits
         prepared = _prepared(spec)
         kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
         _write_snapshot(prepared, snapshot, messages)
@@ -130,15 +129,15 @@ def write_snapshot(file: Path, snapshot: Path) -> Written:
 
 
 def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
-    """Compile what was written of an MJCF file, and return what was learnt and the model.
+    """Compile the snapshot of an MJCF file, and return its properties and the model.
 
     MuJoCo keeps compiled meshes by the paths of their files, so a snapshot compiled where it stays is compiled quickly
     from then on.
 
     Args:
-        written: What `write_snapshot` returned.
+        written: Result of `write_snapshot`.
         file: The file.
-        snapshot: Folder of what was written.
+        snapshot: Folder of the snapshot.
         limits: For the ranges of its options; nothing is refused here.
 
     Raises:
@@ -208,7 +207,7 @@ def mujoco_messages() -> Generator[list[str]]:
 
 
 def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> None:
-    """Write a spec and every file it needs to `folder`, as `model.xml` and what is beside it."""
+    """Write a spec to `folder` as `model.xml`, with all files that it needs."""
     before = len(messages)
     try:
         write_model(spec, folder)
@@ -224,7 +223,7 @@ def _names(count: int, element: Callable[[int], Any]) -> tuple[str, ...]:
 
 
 def _prepared(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Return a copy of a parsed spec as the importer of the plugin would leave it: all named, keyframes complete."""
+    """Return a copy of a parsed spec with names and complete keyframes, as the plugin's importer does."""
     prepared = spec.copy()  # a copy no longer repeats the warnings of parsing when it is compiled
     prepared.compiler.settotalmass = -1.0  # has no effect once attached, and warns at every compilation
     _name_elements(prepared)
@@ -257,7 +256,7 @@ def _file_stem(asset: Any) -> str:
 
 
 def named_kinds(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any], str]]]:
-    """Return each kind of element that MJCF allows without a name, and what the plugin's importer calls one."""
+    """Return the kinds of element that MJCF allows without a name, with the names that the plugin's importer gives."""
     return [
         (spec.bodies[1:], lambda body: f"{body.parent.name if body.parent.id else 'worldbody'}_Body"),
         (spec.joints, lambda joint: f"{_constant(joint.type).capitalize()}Joint"),
@@ -283,7 +282,7 @@ def named_kinds(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any]
 
 
 def _name_elements(spec: mujoco.MjSpec) -> None:
-    """Give every unnamed element a name that no other of its kind has: `HingeJoint`, then `HingeJoint1`, …"""
+    """Give every unnamed element a name that is unique for its kind: `HingeJoint`, then `HingeJoint1`, …"""
     for elements, base in named_kinds(spec):
         taken = {element.name for element in elements}
         following: dict[str, int] = {}

@@ -38,7 +38,7 @@ _SIZES: Final = {"box": 3, "ellipsoid": 3, "sphere": 1, "capsule": 2, "cylinder"
 
 
 class LevelError(Exception):
-    """A level file cannot be used; the text says why, in one line."""
+    """A level file cannot be used; the message says why, in one line."""
 
 
 class _Header(Struct):
@@ -134,14 +134,14 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     Args:
         path: The level file.
         content: Where blueprints are registered.
-        trusted: The server's operator named the level: its models may lie anywhere, and where they differ
-            from what the content root has, the level's are taken.
+        trusted: The server's operator named the level: its models may lie anywhere, and take
+            precedence over different ones of the content root.
 
     Returns:
         The actors by name, in spawn order.
 
     Raises:
-        LevelError: The file is missing, no level, of a newer version, or names something unusable.
+        LevelError: The file is missing, not a level, of a newer version, or refers to something unusable.
     """
     try:
         data = path.read_bytes()
@@ -174,7 +174,7 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
 
 
 def _relative(target: str, folder: Path) -> str:
-    """Return a path as seen from `folder`, with forward slashes; unchanged if it has none, as across drives."""
+    """Return a path relative to `folder`, with forward slashes; unchanged if that is impossible, as across drives."""
     if target.startswith(BUNDLED_PREFIX):
         return target
     try:
@@ -195,7 +195,7 @@ def _resolve(stem: str, entry: _Blueprint | None, folder: Path, content: Content
     if known is not None and (not trusted or known.digest == entry.digest or record == content.snapshot_record(known)):
         return known
     try:
-        # A record that a client may have written could stand for anything: its model is imported again, confined.
+        # A client may have written the record, so its model is imported again, in the sandbox.
         adopt = entry.record and (trusted or record.is_relative_to(content.root))
         found = _from_record(record, entry.digest, content) if adopt else None
         if found is None:
@@ -213,7 +213,7 @@ def _resolve(stem: str, entry: _Blueprint | None, folder: Path, content: Content
 
 
 def _from_record(record: Path, digest: str, content: ContentRoot) -> Blueprint | None:
-    """Return the blueprint of another content root, if it is there and still what the level was saved with."""
+    """Return the blueprint of another content root, if it exists and is still the one that the level was saved with."""
     if not record.is_file():
         return None
     try:
@@ -235,7 +235,7 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
         entry: The entry.
         folder: Folder of the level.
         blueprints: The blueprints of the level.
-        confined_to: Says where files may lie; None for anywhere.
+        confined_to: Determines the allowed folders; None for any.
 
     Raises:
         ValueError: What is wrong with it.

@@ -1,7 +1,7 @@
 """Compiling models that clients name, in a child process with limits.
 
-For `ContentRoot`. MuJoCo's compiler takes all the memory and time that a file asks for, cannot be broken off, and is
-written in C++: so it runs where it may fail. A child is started with the first such model, with MuJoCo loaded, and
+For `ContentRoot`. MuJoCo's compiler uses all the memory and time that a file demands, cannot be interrupted, and may
+crash: so it runs where that does no harm. A child is started with the first such model, with MuJoCo loaded, and
 kept; for each model it forks a grandchild, which lives under the limits and sees no other model. Where there is no
 `fork` (Windows) the child does the work itself and is replaced after each model; there the limits are wall time and
 what the operating system gives. Both are killed together, and nobody waits for their pipes beyond a model's time.
@@ -37,16 +37,16 @@ from urlab_client.server.refusal import Refusal
 __all__ = ["build_confined"]
 
 _GRACE_S: Final = 5.0 if hasattr(os, "fork") else 30.0
-"""For the child to answer beyond a model's time. Without `fork` the child starts for each model, which counts, too."""
+"""Extra time for the child's answer, seconds. Without `fork` it includes the start of the child."""
 
 _END_S: Final = 1.0
-"""For a killed process to go, which takes no time unless the system is at its end."""
+"""Time for a killed process to end, seconds."""
 
 _REPLY_BYTES: Final = 64 * 2**20
 
 
 class _SandboxJob(msgspec.Struct):
-    """One line to the child."""
+    """An order to the child, one line."""
 
     file: str
     snapshot: str
@@ -55,7 +55,7 @@ class _SandboxJob(msgspec.Struct):
 
 
 class _Outcome(msgspec.Struct):
-    """One line back: what was done, or why not, and of what that is said if not of the file alone."""
+    """The child's answer: the result, or the reason for the refusal and its subject."""
 
     done: Compiled | None = None
     refused: str = ""
@@ -111,16 +111,17 @@ class _Compiler:
         answers.put(answer)
 
     def end(self) -> None:
-        """Kill the process with all that it has forked, within a bounded time."""
+        """Kill the process and everything that it has forked, within a bounded time."""
         if sys.platform != "win32":
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.process.pid, signal.SIGKILL)  # before `kill`, after which the number may be another's
+                # Before `kill`, after which the number may be reused.
+                os.killpg(self.process.pid, signal.SIGKILL)
         self.process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(_END_S)
         if self._asking is not None:
             self._asking.join(_END_S)
-        if self._asking is None or not self._asking.is_alive():  # otherwise it closes them when the pipe lets it
+        if self._asking is None or not self._asking.is_alive():  # otherwise it closes them when the pipe allows
             self._close()
 
     def _close(self) -> None:
@@ -131,7 +132,7 @@ class _Compiler:
 
 
 class _Compilers:
-    """The processes that compile: as many as there are models at once, of which one is kept for the next."""
+    """The processes that compile, one for each model at the same time. One is kept for the next model."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -140,9 +141,9 @@ class _Compilers:
         self._pid = 0
 
     def build(self, order: _SandboxJob) -> _Outcome:
-        """Have a model compiled; whatever happens to the processes, there is an outcome in its time."""
+        """Compile a model in a process; there is a result in time, whatever happens to the process."""
         deadline = time.monotonic() + order.limits.model_wall_s + _GRACE_S
-        for _ in range(2):  # a process that ended meanwhile is replaced, once
+        for _ in range(2):  # a process that has ended meanwhile is replaced once
             try:
                 compiler = self._take()
             except OSError as error:
@@ -168,7 +169,7 @@ class _Compilers:
 
     def _take(self) -> _Compiler:
         with self._lock:
-            if self._pid != os.getpid():  # a forked copy of this program has none of its own
+            if self._pid != os.getpid():  # a fork of this program has none of its own
                 self._all, self._idle, self._pid = set(), None, os.getpid()
             compiler, self._idle = self._idle or _Compiler(), None
             self._all.add(compiler)
@@ -188,7 +189,7 @@ atexit.register(_compilers.close)
 
 
 def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: Limits) -> Compiled:
-    """Do what `build_snapshot` does, in a child process, for a file that may only name files below `roots`.
+    """Call `build_snapshot` in a child process, for a file that may refer only to files below `roots`.
 
     Raises:
         Refusal: `import_failed`, with what was wrong or which limit was exceeded.
@@ -204,11 +205,11 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
 
 
 def serve() -> None:
-    """Take orders from standard input until it ends."""
+    """Serve orders from standard input until it ends."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is not an answer
+    os.dup2(2, 1)  # output of libraries is not an answer
     for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
+        signal.signal(signum, signal.SIG_IGN)  # they are meant for the server, which ends this process
     for line in sys.stdin.buffer:
         order = _ORDER.decode(line)
         outcome = _fork(order, answers.fileno()) if hasattr(os, "fork") else _work(order)
@@ -222,7 +223,7 @@ def _fork(order: _SandboxJob, answers: int) -> _Outcome:
     if pid == 0:
         try:
             os.close(reading)
-            os.close(answers)  # so that its end is seen at once if this process's parent dies
+            os.close(answers)  # so that the end of this process's parent is noticed at once
             limit_process(order.limits.model_memory_bytes, order.limits.model_cpu_s)
             confine_files(map(Path, order.roots), (Path(order.snapshot).parent,))
             with os.fdopen(writing, "wb") as stream:
@@ -255,7 +256,7 @@ def _took_too_long(limits: Limits) -> _Outcome:
 
 
 def _read(descriptor: int, deadline: float) -> tuple[bytes, bool]:
-    """Read to the end; return what came, and whether it ended by the deadline."""
+    """Read to the end; return the data, and whether the end came before the deadline."""
     parts: list[bytes] = []
     while select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))[0]:
         part = os.read(descriptor, 1 << 16)
@@ -271,7 +272,7 @@ def _work(order: _SandboxJob) -> _Outcome:
         check_references(Path(order.file), tuple(map(Path, order.roots)), limits)
         snapshot, stage = Path(order.snapshot), f"cannot store the snapshot of {order.file}"
         compiled, model = build_snapshot(Path(order.file), snapshot, limits)
-        check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it with nothing in its way
+        check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it without restrictions
         exceeded = _exceeded(compiled, limits)
         if not exceeded:
             _simulate(model)
@@ -289,7 +290,7 @@ def _work(order: _SandboxJob) -> _Outcome:
 
 
 def _simulate(model: mujoco.MjModel) -> None:
-    """Step once: what crashes MuJoCo, or takes for ever, does so here and not in the server."""
+    """Step once, so that a crash or an endless step happens here and not in the server."""
     with mujoco_messages(), contextlib.suppress(mujoco.FatalError):  # play has other options, and its own errors
         mujoco.mj_step(model, mujoco.MjData(model))
 

@@ -35,16 +35,16 @@ from urlab_client.server.system.temporary_folder import sweep, working_in
 __all__ = ["DOCUMENT", "UPLOADS", "Uploads"]
 
 DOCUMENT: Final = "model.xml"
-"""What the document is called when it is imported; so no other file may be."""
+"""Name of the document when it is imported; no other file may have it."""
 
 UPLOADS: Final = "Uploads"
-"""Folder of the content root for the cache and for uploads under way; no level can be called so."""
+"""Folder of the content root for the cache and for open uploads; no level can have this name."""
 
 MAX_OPEN: Final = 16
 IDLE_S: Final = 300.0
 
 _UNDER_WAY: Final = ".upload-"
-"""What the folders of uploads under way begin with."""
+"""Prefix of the folders of open uploads."""
 
 _DOCUMENT_IN_REPLIES: Final = "<xml>"
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
@@ -69,7 +69,7 @@ class _File:
 
 @dataclass
 class _Upload:
-    """One upload under way."""
+    """An open upload."""
 
     document: _File
     assets: dict[str, _File]
@@ -78,7 +78,7 @@ class _Upload:
     folder: Path
 
     def file(self, kind: str, name: str) -> tuple[str, _File]:
-        """Return a file and what replies call it."""
+        """Return a file and its name in replies."""
         if kind == "xml":
             return _DOCUMENT_IN_REPLIES, self.document
         if name not in self.assets:
@@ -91,9 +91,9 @@ class Uploads:
     """The uploads of a server. For the dispatcher's thread.
 
     Attributes:
-        root: Folder for the cache and for what is under way; made when something is first sent.
-        cache_bytes: Size of the cache and of what is under way; what was used longest ago gives way.
-        clock: Tells the time, seconds.
+        root: Folder for the cache and for open uploads; created with the first upload.
+        cache_bytes: Size of the cache and of open uploads; the least recently used files are removed.
+        clock: Returns the time, seconds.
     """
 
     root: Path
@@ -102,7 +102,7 @@ class Uploads:
     _open: dict[str, _Upload] = field(default_factory=dict[str, _Upload])
     _working: contextlib.ExitStack | None = None
     _held: int = 0
-    """Bytes in the cache, as of the last manifest and of what was done since."""
+    """Size of the cache, bytes: as of the last manifest, with the changes since."""
 
     def __post_init__(self) -> None:
         sweep(self.root, f"{_UNDER_WAY}*")
@@ -144,7 +144,7 @@ class Uploads:
             )
         document = _File(manifest.xml_sha256, None)
         with _storing("the upload"):
-            if self._working is None:  # from now on no other server takes what is under way here for left behind
+            if self._working is None:  # so that no other server removes the open uploads as leftovers
                 self._cache.mkdir(parents=True, exist_ok=True)
                 self._working = contextlib.ExitStack()
                 self._working.enter_context(working_in(self.root))
@@ -157,14 +157,14 @@ class Uploads:
         return upload_id, need_xml, needed
 
     def receive(self, chunk: UploadModelChunk) -> tuple[str, int, bool]:
-        """Take a piece of a file.
+        """Store a chunk of a file.
 
         Returns:
-            What replies call the file, how many bytes of it were received, and whether it is complete.
+            The file's name in replies, the number of bytes received, and whether it is complete.
 
         Raises:
             Refusal: `bad_request`, `payload_too_large`, `unknown_upload`, `hash_mismatch`; `internal_error` if the
-                piece cannot be stored. Then, as with a wrong hash, the file starts anew.
+                piece cannot be stored. Then, as with a wrong hash, the file starts again.
         """
         kind, offset, total, data = chunk.kind, chunk.offset, chunk.total, chunk.data
         if kind not in ("xml", "asset"):
@@ -206,10 +206,10 @@ class Uploads:
 
     @contextmanager
     def committed(self, upload_id: str) -> Generator[tuple[Path, StepMode | None]]:
-        """Lay the files of an upload out in a folder, and close the upload at the end, however that comes.
+        """Write the files of an upload to a folder, and close the upload at the end in any case.
 
         Yields:
-            The document, and the step mode to go into.
+            The document, and the requested step mode.
 
         Raises:
             Refusal: `bad_request`, with the upload still open; `unknown_upload`.
@@ -233,7 +233,7 @@ class Uploads:
             self._close(upload_id)
 
     def close(self) -> None:
-        """Forget every upload under way. Idempotent."""
+        """Discard all open uploads. Idempotent."""
         for upload_id in list(self._open):
             self._close(upload_id)
         if self._working is not None:
@@ -264,7 +264,7 @@ class Uploads:
         return file.size is None or size == file.size
 
     def _take(self, file: _File) -> bool:
-        """Whether the cache has a file, which is now the last one used; a damaged one is removed."""
+        """Whether the cache has a file; marks it as used, and removes a damaged one."""
         path = self._cache / file.sha256
         try:
             if _hash_of(path) == file.sha256:
@@ -276,7 +276,7 @@ class Uploads:
         return self._cached(file)
 
     def _complete(self, label: str, file: _File, total: int) -> None:
-        """Move a file whose bytes are all there into the cache, if they are the right ones."""
+        """Move a complete file into the cache if its hash is right."""
         partial = file.partial
         assert partial is not None  # noqa: S101 - what was received is in it
         found, size = _hash_of(partial), partial.stat().st_size
@@ -287,7 +287,7 @@ class Uploads:
         self._held += size
 
     def _make_room(self, n_bytes: int) -> None:
-        """Drop what was used longest ago for something to be stored, but nothing that an open upload needs."""
+        """Remove the least recently used files to make room, but none that an open upload needs."""
         needed = [file for upload in self._open.values() for file in (upload.document, *upload.assets.values())]
         n_bytes += sum(file.received for file in needed)
         if self._held + n_bytes > self.cache_bytes:
@@ -322,7 +322,7 @@ def _files(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
 
 
 def _step_mode(text: str | None) -> StepMode | None:
-    """Return the step mode to go into; None for what is not one, as the plugin ignores it."""
+    """Return the requested step mode; None for an invalid one, which the plugin ignores."""
     return next((mode for mode in (StepMode.LIVE, StepMode.DIRECT, StepMode.PUPPET) if mode == text), None)
 
 
@@ -332,7 +332,7 @@ def _check_hash(text: str, what: str) -> None:
 
 
 def _check_name(name: str) -> None:
-    """Refuse what is not a bare file name on every system, and the document's own name."""
+    """Refuse anything but a bare file name that is valid on every system, and the document's own name."""
     if not is_file_name(name):
         raise Refusal("bad_request", f"'{name[:80]}' is not a bare file name")
     if name.casefold() == DOCUMENT:

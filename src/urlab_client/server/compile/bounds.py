@@ -1,4 +1,4 @@
-"""The box around an actor."""
+"""Boxes around actors and geoms."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.rotation import rotate
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.static_meshes import add_mesh
+from urlab_client.server.refusal import CompileFailed
 
-__all__ = ["actor_bounds"]
+__all__ = ["Box", "actor_bounds", "box_around"]
 
 Floats = NDArray[np.float64]
+
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lowest and highest corner of an axis-aligned box, metres, world frame."""
 
 
 def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3] | None:
@@ -85,3 +88,17 @@ def _boxes(model: mujoco.MjModel) -> _Boxes:
 def _blueprint_boxes(folder: Path) -> _Boxes:
     with mujoco_messages():
         return _boxes(compiled_file(folder / MODEL_FILE))
+
+
+def box_around(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> Box:
+    """Return the box around the chosen geoms, of which there must be one at least; none may be a plane.
+
+    Args:
+        model: The model.
+        data: Its data with positions computed.
+        geoms: Mask, shape (ngeom,).
+    """
+    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    middle = data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotation, model.geom_aabb[geoms, :3])
+    reach = np.einsum("nij,nj->ni", np.abs(rotation), model.geom_aabb[geoms, 3:])
+    return (middle - reach).min(axis=0), (middle + reach).max(axis=0)

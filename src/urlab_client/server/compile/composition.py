@@ -1,4 +1,4 @@
-"""The actors of a level, put together to one spec."""
+"""The actors of a level, combined into one spec."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def compose(
 
 
 def empty_scene() -> mujoco.MjSpec:
-    """Return the spec of a scene without anything in it."""
+    """Return the spec of an empty scene."""
     spec = mujoco.MjSpec()
     spec.modelname = "urlab"
     spec.compiler.degree = False
@@ -70,7 +70,7 @@ def populate(
 
 
 def _restore_world_references(spec: mujoco.MjSpec, prefixed: set[str]) -> None:
-    """Undo the prefix that attaching gives the world's name where lights and cameras aim at it."""
+    """Remove the prefix that attaching adds to the world's name in lights and cameras that aim at it."""
     for element in (*spec.lights, *spec.cameras):
         if element.targetbody in prefixed:
             element.targetbody = "world"

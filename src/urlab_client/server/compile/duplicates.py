@@ -1,4 +1,4 @@
-"""Floors and suns that every robot's model contains, of which one is drawn."""
+"""Floors and suns that several robots' models contain. Only one of each is drawn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SAME: Final = 1e-6
 
 
 def coinciding_planes(model: mujoco.MjModel) -> list[list[int]]:
-    """Return each set of two or more static, colliding planes that lie in one another, as floors inside robots do."""
+    """Return the sets of static, colliding planes that coincide, such as the floors of several robots' models."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
@@ -65,7 +65,7 @@ def draw_once(model: mujoco.MjModel, planes: list[list[int]]) -> None:
 
 
 def floor_warning(model: mujoco.MjModel, members: list[int]) -> str:
-    """Return what the user should know about floors that coincide."""
+    """Return a warning about floors that coincide."""
     names = ", ".join(model.geom(geom).name for geom in members[:4])
     return (
         f"{len(members)} floors coincide ({names}{', …' if len(members) > 4 else ''}): what stands on them has "

@@ -1,6 +1,6 @@
 """The options of the models in a scene: which apply, and which have no effect.
 
-How options are merged is how MuJoCo's attachment merges them where it is told to, which releases before 3.11 cannot.
+Merges options as `MjSpec.attach` does since MuJoCo 3.11.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["OptionPolicy", "adopt_options", "copy_options", "ignored_options"]
 
 OptionPolicy: TypeAlias = Literal["ignored", "first", "merged"]
-"""Which `<option>` reaches the scene: that of no model, of the first articulation, or what all of them come to."""
+"""Which `<option>` the scene gets: none, that of the first articulation, or all of them merged."""
 
 _SMALLEST: Final = frozenset({"timestep", "tolerance", "ls_tolerance"}) | {
     f"{kind}_tolerance" for kind in ("noslip", "ccd", "sleep")
@@ -36,7 +36,7 @@ def _option_names() -> tuple[str, ...]:
 
 
 def copy_options(source: Any, target: Any) -> None:
-    """Make the options of a spec those of another."""
+    """Copy the options of one spec to another."""
     for name in _option_names():
         _write(target, name, getattr(source, name))
 
@@ -49,10 +49,10 @@ def _write(option: Any, name: str, value: Any) -> None:
 
 
 def adopt_options(spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], policy: OptionPolicy) -> None:
-    """Give a scene's spec the options that its articulations bring along.
+    """Apply the options of a scene's articulations to its spec.
 
     Raises:
-        CompileFailed: Two of them want different values of what cannot be merged, as gravity or the integrator.
+        CompileFailed: Two of them differ in an option that cannot be merged, such as gravity or the integrator.
     """
     blueprints = list({blueprint.folder: blueprint for _, blueprint in articulations}.values())
     if policy == "first" and blueprints:
@@ -94,7 +94,7 @@ def _merged(name: str, one: tuple[str, Any], other: tuple[str, Any]) -> Any:
 def ignored_options(
     spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], policy: OptionPolicy
 ) -> list[str]:
-    """Return one warning that names the options of the models that will have no effect, or none."""
+    """Return a warning that names the models' options without effect, or none."""
     applied = mujoco.MjSpec()
     copy_options(spec.option, applied.option)
     if policy == "ignored":

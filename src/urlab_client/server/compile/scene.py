@@ -21,15 +21,14 @@ import numpy as np
 from urlab_client._mujoco import export_model
 from urlab_client.server.assets.actors import Actor, scene_problem
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.compile.composition import compose
 from urlab_client.server.compile.duplicates import coinciding_planes, draw_once, floor_warning
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene_document import attached_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.compile.static_meshes import unique_name
-from urlab_client.server.limits import Limits
+from urlab_client.server.limits import Limits, options_problem
+from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["CompiledScene", "compile_scene", "saved_model"]
 
@@ -61,11 +60,11 @@ class CompiledScene:
     warnings: tuple[str, ...] = ()
 
     def mjb(self) -> bytes:
-        """Return the live model in MuJoCo's binary format. The caller holds whatever guards the model."""
+        """Return the live model in MuJoCo's binary format. The caller holds the model's lock."""
         return saved_model(self.model)
 
     def export(self, *, attached: bool = False) -> tuple[str, dict[str, bytes]]:
-        """Return the scene as MJCF, and the content of every file it names; `file` attributes are bare names.
+        """Return the scene as MJCF, and the content of every file it refers to, by bare name.
 
         Args:
             attached: Whether each robot has a document of its own among the files, which the scene attaches.
@@ -141,7 +140,7 @@ def compile_scene(
         _refuse(options_problem(spec.option, limits))
         model = spec.compile()
         memory = sum(max(blueprint.spec.memory, 0) for _, blueprint in articulations)
-        if memory > model.narena:  # somebody found MuJoCo's own estimate too small
+        if memory > model.narena:  # the user found MuJoCo's own estimate too small
             spec.memory = memory
             model = spec.compile()
         _refuse(_size_problem(model, limits))
@@ -182,7 +181,7 @@ def _refuse(problem: str) -> None:
 
 
 def _size_problem(model: mujoco.MjModel, limits: Limits) -> str:
-    """Return which limit the compiled scene exceeds where its parts gave no number, or nothing."""
+    """Return which limit the scene exceeds, or nothing; for numbers that are known only after compilation."""
     n_bytes = mujoco.mj_sizeModel(model) + model.narena
     if n_bytes > limits.scene_bytes:
         return f"the scene takes {n_bytes} bytes, more than the limit scene_bytes, {limits.scene_bytes}"

@@ -1,6 +1,6 @@
 """A scene as documents: one for the scene, which attaches one for each robot.
 
-For the handshake, in dialects that describe scenes so: see `Dialect.robots_attached`.
+For the handshake of dialects with `Dialect.robots_attached`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _FILE: Final = re.compile(r'\b(file\w*)="([^"]*)"')
 def attached_scene(spec: mujoco.MjSpec, actors: Sequence[Actor]) -> tuple[str, dict[str, bytes]] | None:
     """Return a scene as a document with attached robots, and all files it needs by their bare names.
 
-    A robot's document is called after its compiled prefix, `PREFIXmodel.xml`, and so are its files. Robots of one kind
-    share those of the first: files, unlike documents, are large.
+    A robot's document is named after its compiled prefix, `PREFIXmodel.xml`, and so are its files. Robots of the same
+    kind share the files of the first, because files are large, unlike documents.
 
     Args:
         spec: The compiled scene, for its options.

@@ -1,4 +1,4 @@
-"""Tables that say which articulation or prop an element of the compiled model belongs to."""
+"""Tables that map the elements of a compiled model to articulations and props."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from urlab_client._mujoco import (
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.refusal import CompileFailed
 
 __all__ = ["ArticulationIndex", "EntityIndex", "SceneCamera", "index_articulation", "index_entity"]
 
@@ -49,14 +49,14 @@ class SceneCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ArticulationIndex:
-    """Where an articulation's elements are in the model. Ids ascend; names are short and parallel to the ids.
+    """Ids and addresses of an articulation's elements. Ids ascend; names are short and parallel to the ids.
 
     Attributes:
         key: Actor name.
-        prefix: `key` and an underscore: what its compiled names begin with.
+        prefix: `key` and an underscore, the beginning of its compiled names.
         actor_id: Stable id given by the client; may be empty.
         model_name: The MJCF's `model` attribute, or its file stem.
-        root_body: Lowest body id; 0, the world, if the MJCF has nothing but world geoms.
+        root_body: Lowest body id; 0, the world, if the MJCF has only world geoms.
         bodies: Body ids.
         joints: Joint ids.
         actuators: Actuator ids.
@@ -126,11 +126,11 @@ class EntityIndex:
 def index_articulation(
     model: mujoco.MjModel, actor: Actor, blueprint: Blueprint, camera_size: tuple[int, int] | None
 ) -> ArticulationIndex:
-    """Find an articulation's elements by their exact compiled names, which no other prefix can be mistaken for."""
+    """Find an articulation's elements by their exact compiled names, so that similar prefixes are not confused."""
 
     def find(kind: int, names: Iterable[str]) -> tuple[Ints, tuple[str, ...]]:
         ids = {name: mujoco.mj_name2id(model, kind, f"{actor.prefix}{name}") for name in names}
-        # Bodies that compilation fused away are in the spec, but not in the model.
+        # Bodies that compilation has fused are in the spec, but not in the model.
         found = sorted((index, name) for name, index in ids.items() if index >= 0)
         return np.array([index for index, _ in found], dtype=np.int32), tuple(name for _, name in found)
 
@@ -170,7 +170,7 @@ def index_articulation(
 
 
 def _controller(actor: Actor, blueprint: Blueprint) -> ControllerText | None:
-    """Return the controller that the level gives an articulation, or else its MJCF."""
+    """Return the controller of an articulation, from the level or else from its MJCF."""
     authored = [text.data for text in blueprint.spec.texts if text.name == CUSTOM_TEXT]
     text = actor.controller or next(iter(authored), "")
     try:
@@ -194,7 +194,7 @@ def _spans(starts: Ints, lengths: Ints) -> Ints:
 
 def _camera(model: mujoco.MjModel, index: int, name: str, size: tuple[int, int] | None) -> SceneCamera:
     width, height = (int(pixels) for pixels in model.cam_resolution[index])
-    if width * height <= 1:  # MuJoCo's 1x1 says that the MJCF gives none
+    if width * height <= 1:  # MuJoCo's default, 1x1: the MJCF gives none
         width, height = size or DEFAULT_CAMERA_SIZE
     return SceneCamera(name=name, id=index, resolution=(width, height), fovy=float(model.cam_fovy[index]))
 

@@ -1,4 +1,4 @@
-"""Meshes and lights of a level, added to the scene's spec."""
+"""Adding the meshes and lights of a level to the scene's spec."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from urlab_client.server.assets.decomposition import convex_parts
 
 __all__ = ["add_light", "add_mesh", "add_static_mesh", "unique_name"]
 FULL_BRIGHTNESS: Final = 5000.0
-"""Intensity of a light that counts as MuJoCo's full diffuse colour; the engine's default."""
+"""Intensity that corresponds to MuJoCo's full diffuse colour; the engine's default."""
 
 _SPOT_CUTOFF: Final = 44.0
 """Unreal's default outer cone angle, degrees."""
@@ -77,7 +77,7 @@ def _add_parts(
 
 
 def add_mesh(spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, *, name: str, **settings: Any) -> None:
-    """Add the geom of a mesh, scaled as its actor, to a body; `settings` are more attributes of the geom."""
+    """Add the geom of a mesh to a body, with the actor's scale; `settings` are further attributes of the geom."""
     sx, sy, sz = (abs(factor) for factor in actor.scale)
     if mesh.shape == "file":
         asset = spec.add_mesh(name=f"{actor.prefix}{name}", file=mesh.file, scale=actor.scale)
@@ -100,7 +100,7 @@ def add_mesh(spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, *, name: 
 
 
 def unique_name(name: str, taken: set[str], *, separator: str = "") -> str:
-    """Return `name`, or the first of its numbered variants that is not taken."""
+    """Return `name`, or its first numbered variant that is free."""
     stem, dot, suffix = name.partition(".")
     candidate, count = name, 0
     while candidate in taken:

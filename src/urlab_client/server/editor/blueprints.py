@@ -16,10 +16,10 @@ __all__ = ["Blueprints"]
 
 
 class Blueprints:
-    """What was imported, and the actors of the open level that are made from it."""
+    """The imported blueprints, and the actors of the open level that use them."""
 
     def __init__(self, content: ContentRoot, actors: LevelActors, levels: Levels) -> None:
-        """Look after the assets of a content root.
+        """Manage the assets of a content root.
 
         Args:
             content: The content root.

@@ -25,7 +25,7 @@ class LevelActors:
     """
 
     def __init__(self, naming: ActorNames) -> None:
-        """Begin without actors.
+        """Create an empty set of actors.
 
         Args:
             naming: How articulations are named: `model` after the MJCF's model name, `plugin` as the plugin does.
@@ -41,7 +41,7 @@ class LevelActors:
         return len(self._actors)
 
     def replace_all(self, actors: Mapping[str, Actor]) -> None:
-        """Hold these actors instead, by name; none is selected."""
+        """Replace all actors; none is selected afterwards."""
         self._actors = dict(actors)
         self.selected = ""
 
@@ -55,7 +55,7 @@ class LevelActors:
             self.selected = ""
 
     def put(self, actor: Actor) -> Actor:
-        """Take over an actor in place of the one of its name, and return it."""
+        """Replace the actor of the same name and return the new one."""
         self._actors[actor.name] = actor
         return actor
 
@@ -69,7 +69,7 @@ class LevelActors:
     def get(self, key: str, *, by_name: bool = False) -> Actor | None:
         """Return the actor with an id, or with an object name; None if there is none.
 
-        Unlike the editing ops, which take either, ids kept as tags compare with letter case here.
+        Unlike in the editing ops, letter case counts here for ids kept as tags.
         """
         if by_name:
             return self._actors.get(key)
@@ -126,9 +126,9 @@ class LevelActors:
         return next(name for name in self._copies(stem) if name not in ids)
 
     def _copies(self, stem: str) -> Iterator[str]:
-        """Yield `stem`, and then names like `copy1_STEM`: none begins with the name of another actor, nor that with it.
+        """Yield `stem`, then names like `copy1_STEM`, so that no actor's name is the beginning of another's.
 
-        Clients tell by how a compiled name begins which robot it belongs to, and some take the first that fits.
+        Clients identify the robot of a compiled name by its beginning, and some take the first match.
         """
         yield stem
         taken = {known for actor in self for known in (actor.name, actor.actor_id) if known}
@@ -142,7 +142,7 @@ class LevelActors:
         return next(name for name in names if name not in self._actors)
 
     def _clashes(self, name: str, blueprint: Blueprint) -> bool:
-        """Whether compiled names would repeat: `robot` with a body `1_base` beside `robot_1` with a body `base`."""
+        """Whether compiled names would collide: `robot` with a body `1_base` beside `robot_1` with a body `base`."""
         prefix = f"{name}_"
         for other in self:
             if other.blueprint is None:

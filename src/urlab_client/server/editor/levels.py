@@ -1,23 +1,55 @@
-"""The levels of the content root: which one is open, and creating, loading, saving and deleting them."""
+"""The levels of the content root: creating, loading, saving and deleting them, and which one is open."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
+from urlab_client.protocol.names import WINDOWS_DEVICES
 from urlab_client.server.assets.actors import Actor
-from urlab_client.server.assets.blueprint import sanitized
+from urlab_client.server.assets.blueprint import IMPORTS, sanitized
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.level import LevelError, read_level, write_level
-from urlab_client.server.assets.package_names import level_package
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Levels"]
+__all__ = ["Levels", "level_package"]
 
 UNTITLED: Final = "/Temp/Untitled_1"
+
+
+_LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
+_MAX_SEGMENT_BYTES: Final = 240
+_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
+
+
+def level_package(name: str) -> str:
+    """Expand a level's name to its package path: `lab`, `/Game/Levels/lab` and `/Game/Levels/lab.lab` are one level.
+
+    Raises:
+        ValueError: A part of the name is not a portable file name, or leads out of the content root.
+    """
+    in_game = name[:6].casefold() == "/game/"
+    parts = name[6:].split("/") if in_game else name.split("/")
+    package, _, described = parts[-1].partition(".")
+    if described.casefold() == package.casefold():  # an object path says the name again; the engine ignores case
+        parts[-1] = package
+    for part in parts:
+        if (
+            not _LEVEL_SEGMENT.fullmatch(part)
+            or len(part.encode()) > _MAX_SEGMENT_BYTES
+            or part.upper() in WINDOWS_DEVICES
+        ):
+            raise ValueError(
+                f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
+                "or a path of such parts that begins with /Game/"
+            )
+    if in_game and parts[0].casefold() in _RESERVED:
+        raise ValueError(f"'{name}' is not a level's name: /Game/{parts[0]} {_RESERVED[parts[0].casefold()]}")
+    return f"/Game/{'/'.join(parts)}" if in_game else f"/Game/Levels/{'/'.join(parts)}"
 
 
 class Levels:
@@ -29,7 +61,7 @@ class Levels:
     """
 
     def __init__(self, content: ContentRoot, actors: LevelActors, playing: Callable[[], bool]) -> None:
-        """Begin with an empty, untitled level.
+        """Open an empty, untitled level.
 
         Args:
             content: The content root.
@@ -83,7 +115,7 @@ class Levels:
     def load_file(self, path: Path) -> str:
         """Open a level file named by the server's operator, and return the level's path.
 
-        It may lie anywhere; `save_level` then writes to that file. Models it names are imported from where it says.
+        It may lie anywhere; `save_level` then writes to that file. Its models are imported from the paths in it.
 
         Raises:
             Refusal: `load_level_failed`.
@@ -126,7 +158,7 @@ class Levels:
         return f"{folder}/UEDPIE_0_{name}"
 
     def destroy(self, package: str) -> bool:
-        """Delete a level and return whether there was one; instead of the open one an empty level is open then.
+        """Delete a level and return whether there was one; if it was open, an empty level takes its place.
 
         Raises:
             Refusal: `destroy_asset_failed` for a file outside the content root.

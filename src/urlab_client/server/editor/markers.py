@@ -1,7 +1,7 @@
 """Debug drawing: primitives with a time to live, and one line of text.
 
 For the `debug` handlers, which add to a `Drawings`, and for `snapshot`, which reads from it. Robot cameras do not show
-any of it, so that it gets into no training data. Positions are metres and rotations quaternions (x, y, z, w), both in
+it, so that it does not get into training data. Positions are metres and rotations quaternions (x, y, z, w), both in
 MuJoCo's frame.
 """
 
@@ -45,7 +45,7 @@ class Text:
     """A label in the world.
 
     Attributes:
-        at: Where it stands.
+        at: Position.
         text: The text.
         color: Red, green, blue in 0..1.
     """
@@ -121,11 +121,11 @@ class Drawings:
     """What was drawn into the edited world and into the play world. Safe to use from several threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, *, limit: int = Limits.markers) -> None:
-        """Start with nothing.
+        """Create empty drawings.
 
         Args:
             clock: Seconds since any moment; never goes back.
-            limit: Primitives kept per world; the oldest give way.
+            limit: Primitives kept per world; the oldest are removed.
         """
         self._clock = clock
         self._lock = threading.Lock()
@@ -160,7 +160,7 @@ class Drawings:
             self._worlds[in_play].clear()
 
     def take_frame(self, *, in_play: bool) -> list[Primitive]:
-        """Return what the next frame shows; what was to last one frame is gone after it."""
+        """Return the primitives of the next frame, and remove those that last one frame."""
         with self._lock:
             entries = self._alive(in_play, self._clock())
             shown = [entry.primitive for entry in entries]

@@ -31,7 +31,7 @@ class QuickConvert:
         driven_by_unreal: bool = False,
         friction: Vec3 = UNIT_SCALE,
     ) -> Actor:
-        """Make a static mesh actor a MuJoCo body from the next play on; a repeat replaces all settings.
+        """Make a static mesh actor a MuJoCo body from the next play on. Repeating it replaces all settings.
 
         Args:
             target: Actor id or name.
@@ -64,7 +64,7 @@ class QuickConvert:
         return self._actors.put(replace(actor, quick_convert=settings))
 
     def remove(self, target: str) -> Actor:
-        """Make a static mesh actor mere decoration again.
+        """Make a static mesh actor decoration again.
 
         Raises:
             Refusal: `missing_field`; `remove_quick_convert_failed` for an unknown actor or one without the settings.

@@ -26,7 +26,7 @@ DEFAULT_OFFSET: Final[Vec3] = (0.0, -2.0, 1.0)
 MAX_SMOOTHING: Final = 0.99
 
 TICK_HZ: Final = 60.0
-"""Rate of the editor's ticks, each of which takes the camera nearer to what it follows."""
+"""Rate of the editor's ticks. Each moves the camera closer to the tracked actor."""
 
 _MIN_FOV: Final = 1.0
 _MAX_FOV: Final = 170.0
@@ -141,12 +141,12 @@ class Viewport:
         self._followed_at = None
 
     def stop_tracking(self) -> bool:
-        """Stop following and return whether there was something to follow."""
+        """Stop following, and return whether an actor was tracked."""
         track, self.track = self.track, None
         return track is not None
 
     def follow(self, location: Vec3, rotation: Quat, now: float) -> None:
-        """Take the camera towards what it follows, by as many of the editor's ticks as have passed.
+        """Move the camera towards the tracked actor, once for each of the editor's ticks that has passed.
 
         Args:
             location: Position of the tracked actor, metres.
@@ -170,10 +170,10 @@ class Viewport:
 
 
 def rotator(quat: Quat | None, euler: Vec3 | None) -> Vec3 | None:
-    """Return the rotator (roll, pitch, yaw), degrees, that a viewport or drawing op means; None if it names none.
+    """Return the rotator (roll, pitch, yaw), degrees, of a viewport or drawing op; None if the request contains none.
 
     Args:
-        quat: (x, y, z, w) in Unreal's frame; wins.
+        quat: (x, y, z, w) in Unreal's frame; takes precedence.
         euler: The rotator itself, degrees.
 
     Raises:

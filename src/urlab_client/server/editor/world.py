@@ -29,13 +29,12 @@ from urlab_client.server.assets.actors import (
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.bounds import actor_bounds
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.blueprints import Blueprints
 from urlab_client.server.editor.level_actors import ActorNames, LevelActors, match_actor
 from urlab_client.server.editor.levels import Levels
 from urlab_client.server.editor.quick_convert import QuickConvert
-from urlab_client.server.refusal import Refusal
+from urlab_client.server.refusal import CompileFailed, Refusal
 
 __all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
 
@@ -45,7 +44,7 @@ class Placed(NamedTuple):
 
     Attributes:
         actor: The actor in its new state.
-        rotation_quat: Rotation as understood from the request; not normalised.
+        rotation_quat: Rotation from the request; not normalised.
         was_existing: True if an existing actor was moved.
     """
 
@@ -55,14 +54,14 @@ class Placed(NamedTuple):
 
 
 class EditorWorld:
-    """The open level and what was imported.
+    """The open level and the imported assets.
 
     Attributes:
         content: The content root.
         pie_running: Whether a play session runs; set by the code that starts and stops it. While it is true, the ops
             that look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
-        levels: The level files; which one is open.
-        blueprints: What was imported.
+        levels: The level files, and which one is open.
+        blueprints: The imported blueprints.
         quick_convert: Static meshes that become bodies.
     """
 
@@ -83,7 +82,7 @@ class EditorWorld:
         self._frozen: tuple[Actor, ...] = ()
 
     def authored(self) -> object:
-        """Return something that compares equal for as long as no level, actor or blueprint was changed."""
+        """Return a value that compares equal until a level, actor or blueprint changes."""
         return self.levels.package, tuple(self._actors), dict(self.levels.external), dict(self.content.blueprints)
 
     # Actors
@@ -149,7 +148,7 @@ class EditorWorld:
         rotation_euler: Vec3 | None = None,
         scale: Vec3 = UNIT_SCALE,
     ) -> list[Placed]:
-        """Place a grid of actors, x fastest. All is checked before the first is placed.
+        """Place a grid of actors, x fastest. Everything is checked before the first is placed.
 
         Args:
             blueprint: Class path or package path.
@@ -314,11 +313,11 @@ class EditorWorld:
         return self._actors.get(key, by_name=by_name)
 
     def unused_id(self, stem: str) -> str:
-        """Return an id for one more actor, `stem` if no actor of the open level has that."""
+        """Return an unused actor id: `stem`, if no actor of the open level has it."""
         return self._actors.unused_id(stem)
 
     def snapshot(self) -> list[Actor]:
-        """Return every actor, of the play world while play runs."""
+        """Return all actors; during play, those of the play world."""
         return list(self._shown())
 
     def list_actors(self) -> list[Actor]:
@@ -328,7 +327,7 @@ class EditorWorld:
     def find_actors(
         self, *, class_filter: str = "", tag: str = "", name_prefix: str = "", in_pie: bool = False
     ) -> tuple[list[Actor], bool]:
-        """Return the actors that pass every filter that is given; letter case does not count.
+        """Return the actors that match all given filters; letter case does not count.
 
         Args:
             class_filter: Class or parent class, with or without Unreal's leading A, U or F.
@@ -398,7 +397,7 @@ class EditorWorld:
     # Play
 
     def freeze(self) -> tuple[Actor, ...]:
-        """Copy the level for a play session, which edits made from now on do not touch.
+        """Copy the level for a play session, so that later edits do not affect it.
 
         Returns:
             The actors in spawn order, and the replay manager that the plugin adds to every session.

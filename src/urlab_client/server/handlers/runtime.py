@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, cast
 
 import mujoco
 import numpy as np
 from msgspec import field
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.runtime import (
     ConfigureController,
@@ -33,17 +34,18 @@ from urlab_client.protocol.messages.runtime import (
     SetPausedOk,
     SetQpos,
     SetQposOk,
+    SetSimOptions,
+    SetSimOptionsOk,
     SetSimSpeed,
     SetSimSpeedOk,
     SetTwist,
     SetTwistOk,
 )
-from urlab_client.protocol.types import Contact, KeyframeInfo
+from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_all_owners, check_owner
-from urlab_client.server.physics.controllers import ArticulationControl
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.parsing import parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
@@ -268,3 +270,38 @@ def _keyframe(model: mujoco.MjModel, number: int) -> KeyframeInfo:
         mocap_pos=model.key_mpos[number].tolist(),
         mocap_quat=model.key_mquat[number].tolist(),
     )
+
+
+@handles(SetSimOptions)
+def set_sim_options(server: ServerCore, request: SetSimOptions) -> SetSimOptionsOk:
+    running = server.play.running()
+    options = need(request, request.options, "options")
+    with running.engine.lock:
+        echo = running.options.apply(running.scene.model, running.scene.data, options)
+    return SetSimOptionsOk(options=cast("SimOptions", echo))  # its fields, in the order of the wire
+
+
+def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
+    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
+
+    Raises:
+        Refusal: `bad_mode`.
+    """
+    name = text.casefold()
+    try:
+        mode = StepMode.LIVE if name == "streaming" else StepMode(name)
+    except ValueError:
+        raise Refusal("bad_mode", f"unknown step mode '{text}': use live, direct, puppet or auto") from None
+    return StepMode.LIVE if mode is StepMode.AUTO and not dialect.auto_mode else mode
+
+
+def parse_control_source(text: str) -> ControlSource:
+    """Return the control source called `text`, in any case.
+
+    Raises:
+        Refusal: `bad_value`.
+    """
+    try:
+        return ControlSource(text.casefold())
+    except ValueError:
+        raise Refusal("bad_value", f"unknown control source '{text}': use zmq or ui") from None

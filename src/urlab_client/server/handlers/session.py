@@ -39,7 +39,6 @@ from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_owner
 from urlab_client.server.physics.controllers import ArticulationControl, float32
-from urlab_client.server.physics.observe import sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import FRAMES_DEADLINE_S, Film
@@ -130,7 +129,7 @@ def _articulation(server: ServerCore, name: str, control: ArticulationControl) -
         ),
         camera_topics={
             dialect.camera_key(name, camera.name): CameraInfo(
-                mode=server.physics.camera_mode(index, camera.name),
+                mode=server.config.camera_mode(index, camera.name),
                 resolution=camera.resolution,
                 fovy=float32(camera.fovy),
                 zmq_endpoint=server.camera_endpoint(name, dialect.camera_part(camera.name)),
@@ -199,15 +198,14 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
     wait_s = _pictures_wait_s(request) if fresh else FRAMES_DEADLINE_S
     shots = running.cameras.shots(request.include_cameras, fresh=fresh)
 
-    if not shots:
-        if server.session.json or running.engine.replay is not None or running.channels.declared:
-            return running.engine.step(request, lambda _: _observe_step(running, level))
-        engine, encode = running.engine, running.step_frames.encode
+    if not (shots or server.session.json or running.engine.replay is not None or running.channels.declared):
+        # Nearly every step: only the numbers of such replies change.
+        engine, encode = running.engine, running.step_replies.encode
         return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.snapshots.number))
 
     def observe(mode: StepMode) -> tuple[StepOk, Film | None]:
         film = None
-        if forms or mode in (StepMode.DIRECT, StepMode.PUPPET):
+        if shots and (forms or mode in (StepMode.DIRECT, StepMode.PUPPET)):
             draw = server.dialect.draws_for_steps
             film = running.cameras.capture(shots, running.engine.snapshots.number, draw=draw)
         return _observe_step(running, level), film
@@ -242,13 +240,8 @@ def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
 
 def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
     engine, observer = running.engine, running.observer
-    time = engine.time
     return StepOk(
-        time=time,
-        step=engine.step_count,
-        sim_time=sim_clock(time),
-        wall_time=wall_clock(),
-        per_articulation=observer.articulations(level),
+        **observer.state(level, engine.time, engine.step_count),
         entities=observer.entities(),
         frame_id=engine.snapshots.number if engine.dialect.frame_ids else None,
         replay=None
@@ -265,14 +258,7 @@ def reset(server: ServerCore, request: Reset) -> ResetOk:
         engine.reset(
             keyframe_name=request.keyframe_name, seed=request.seed, per_articulation_qpos=request.per_articulation_qpos
         )
-        time = engine.time
-        return ResetOk(
-            time=time,
-            step=engine.step_count,
-            sim_time=sim_clock(time),
-            wall_time=wall_clock(),
-            per_articulation=running.observer.articulations(server.session.level),
-        )
+        return ResetOk(**running.observer.state(server.session.level, engine.time, engine.step_count))
 
 
 @handles(Forward)
@@ -282,11 +268,4 @@ def forward(server: ServerCore, request: Forward) -> ForwardOk:
     engine = running.engine
     with engine.lock:
         engine.forward()
-        time = engine.time
-        return ForwardOk(
-            time=time,
-            step=engine.step_count,
-            sim_time=sim_clock(time),
-            wall_time=wall_clock(),
-            per_articulation=running.observer.articulations(server.session.level),
-        )
+        return ForwardOk(**running.observer.state(server.session.level, engine.time, engine.step_count))

@@ -215,7 +215,7 @@ class Articulations:
 
 
 def _named(scene: CompiledScene, dialect: Dialect) -> list[tuple[str, ArticulationIndex]]:
-    """Return each articulation by what it is called; of two that would be called alike, the later by its actor."""
+    """Map names to articulations. If two share a name, the second is named after its actor."""
     named: dict[str, ArticulationIndex] = {}
     for index in scene.articulations:
         name = dialect.robot_key(index.actor_id, index.key)

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Final, Protocol, cast
+from typing import Any, ClassVar, Final, cast
 
 import mujoco
 import numpy as np
@@ -178,23 +178,19 @@ class ControllerConfig:
         return cls(text.kind, **text.gains)
 
 
-class Actuated(Protocol):
-    """The properties of an articulation that a controller needs; the names are those of `ArticulationIndex`."""
+@dataclass(frozen=True, slots=True)
+class Actuated:
+    """The actuators of an articulation, as a controller needs them.
 
-    @property
-    def actuators(self) -> NDArray[Any]:
-        """Actuator ids."""
-        ...
+    Attributes:
+        actuators: Actuator ids.
+        actuator_names: Short actuator names, parallel to the ids.
+        ctrl_adr: Index into `mjData.ctrl` of every control, in actuator order.
+    """
 
-    @property
-    def actuator_names(self) -> tuple[str, ...]:
-        """Short actuator names, parallel to the ids."""
-        ...
-
-    @property
-    def ctrl_adr(self) -> NDArray[Any]:
-        """Index into `mjData.ctrl` of every control, in actuator order."""
-        ...
+    actuators: NDArray[Any]
+    actuator_names: tuple[str, ...]
+    ctrl_adr: NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,12 +207,12 @@ class _Binding:
     upper: Float32s
 
 
-def _first_controls(model: mujoco.MjModel, articulation: Actuated) -> list[int]:
-    """Position of each actuator's first control among the articulation's controls."""
+def _first_controls(model: mujoco.MjModel, actuators: NDArray[Any]) -> list[int]:
+    """Position of each actuator's first control among those of all of them."""
     starts: list[int] = []
     total = 0
     counts = control_counts(model)
-    for actuator in articulation.actuators:
+    for actuator in actuators:
         starts.append(total)
         total += int(counts[actuator])
     return starts
@@ -229,7 +225,7 @@ def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
     ids: list[int] = []
     places: list[int] = []
     joints: list[int] = []
-    starts = _first_controls(model, articulation)
+    starts = _first_controls(model, articulation.actuators)
     counts = control_counts(model)
     for actuator, name, place in zip(articulation.actuators, articulation.actuator_names, starts, strict=True):
         if int(model.actuator_trntype[actuator]) not in joint_transmissions or counts[actuator] != 1:
@@ -431,7 +427,7 @@ class ArticulationControl:
         """
         self.index = index
         places: dict[str, int] = {}
-        for name, place in zip(index.actuator_names, _first_controls(model, index), strict=True):
+        for name, place in zip(index.actuator_names, _first_controls(model, index.actuators), strict=True):
             places[f"{index.prefix}{name}"] = place
         places.update({name: places[f"{index.prefix}{name}"] for name in index.actuator_names})
         self._ctrl_places = _contiguous(index.ctrl_adr.astype(np.intp))
@@ -470,6 +466,7 @@ def _contiguous(places: NDArray[np.intp]) -> slice | NDArray[np.intp]:
 def _attach(model: mujoco.MjModel, index: ArticulationIndex, config: ControllerConfig | None) -> Controller | None:
     if config is None:
         return None
+    actuated = Actuated(index.actuators, index.actuator_names, index.ctrl_adr)
     if config.kind is ControllerKind.PD:
-        return PDController(model, index, config)
-    return PassthroughController(model, index)
+        return PDController(model, actuated, config)
+    return PassthroughController(model, actuated)

@@ -25,8 +25,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig
 from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
-from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
-from urlab_client.server.physics.integrator import Integrator, shutting_down
+from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks, shutting_down
 from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
 from urlab_client.server.physics.physics_thread import PhysicsThread
 from urlab_client.server.physics.queued_step import QueuedStep

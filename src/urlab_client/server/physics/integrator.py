@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Container
+from dataclasses import dataclass, field
 from typing import Final
 
 import mujoco
@@ -14,17 +16,56 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.data_lock import MujocoCall
-from urlab_client.server.physics.hooks import Hook, call_hooks
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Integrator", "shutting_down"]
+__all__ = ["Hook", "Integrator", "Snapshots", "call_hooks", "shutting_down"]
 
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
 
 MAX_SLICE: Final = 1000
 """Sub-steps in such a slice at most, for models that get slower while they run."""
+
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+Hook = Callable[[], None]
+
+
+def call_hooks(hooks: list[Hook]) -> None:
+    """Call each hook; one that raises is logged and removed."""
+    for hook in tuple(hooks):
+        try:
+            hook()
+        except Exception:
+            logger.exception("%r failed and will not be called again", hook)
+            if hook in hooks:
+                hooks.remove(hook)
+
+
+@dataclass(eq=False)
+class Snapshots:
+    """Numbers the snapshots of the state.
+
+    Attributes:
+        number: Number of the newest snapshot.
+        episode: Number of resets so far.
+        hooks: Called for each snapshot and at each reset. One that raises is logged and removed.
+    """
+
+    number: int = 0
+    episode: int = 0
+    hooks: list[Hook] = field(default_factory=list[Hook])
+
+    def take(self) -> None:
+        """Number a new snapshot and call the hooks."""
+        self.number += 1
+        call_hooks(self.hooks)
+
+    def restart(self) -> None:
+        """Record a reset and call the hooks; the number stays."""
+        self.episode += 1
+        call_hooks(self.hooks)
 
 
 class Integrator:

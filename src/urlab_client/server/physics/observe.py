@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.protocol.base import INT32_MAX
 from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
 from urlab_client.server.compile.scene import CompiledScene
@@ -21,15 +22,13 @@ from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.physics.channels import SCENE, UserChannels
 from urlab_client.server.physics.controllers import ArticulationControl
 
-__all__ = ["Observer", "sim_clock", "sim_seconds", "wall_clock", "wall_seconds"]
-
-INT32_MAX = 2**31 - 1
+__all__ = ["Observer", "StateFields", "sim_clock", "sim_seconds", "wall_clock", "wall_seconds"]
 
 
 def sim_seconds(seconds: float) -> tuple[int, int]:
     """Split a time in seconds into whole ones and nanoseconds, truncating.
 
-    What no 32-bit second can hold reads as the nearest one.
+    Values beyond 32 bits are clamped, and those that are not finite are 0.
     """
     if -INT32_MAX <= seconds <= INT32_MAX:
         sec = int(seconds)
@@ -55,6 +54,16 @@ def wall_clock() -> Clock:
     """Return UTC now; `nsec` is a multiple of 100."""
     sec, nsec = wall_seconds()
     return Clock(sec=sec, nsec=nsec)
+
+
+class StateFields(TypedDict):
+    """The fields that all replies and messages with a state share."""
+
+    time: float
+    step: int
+    sim_time: Clock
+    wall_time: Clock
+    per_articulation: dict[str, ArticulationState]
 
 
 class _StateReader:
@@ -147,6 +156,22 @@ class Observer:
         self._xquat = data.xquat
         self._qpos = data.qpos
         self._qvel = data.qvel
+
+    def state(self, level: ObservationLevel, time: float, step: int) -> StateFields:
+        """Return the fields that all replies and messages with a state share.
+
+        Args:
+            level: Which fields the articulations have.
+            time: `mjData.time`, seconds.
+            step: Step counter of the session.
+        """
+        return StateFields(
+            time=time,
+            step=step,
+            sim_time=sim_clock(time),
+            wall_time=wall_clock(),
+            per_articulation=self.articulations(level),
+        )
 
     def articulations(self, level: ObservationLevel) -> dict[str, ArticulationState]:
         """Return the state of every articulation by key, with the fields of `level`."""

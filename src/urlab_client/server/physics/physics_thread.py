@@ -7,20 +7,55 @@ import logging
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 
 import mujoco
 
 from urlab_client.server.physics.data_lock import DataLock
 from urlab_client.server.physics.integrator import shutting_down
-from urlab_client.server.physics.mujoco_warnings import mujoco_warnings
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended, within
+from urlab_client.server.system.health import Health, ended, within
 
 __all__ = ["PhysicsThread"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+
+class _WarningLog:
+    """Sends MuJoCo's warnings to the log while an engine runs.
+
+    MuJoCo has one handler per process and by default appends to a file in the current folder. A handler that the
+    application installed stays.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._counts: Counter[str] = Counter()
+
+    def acquire(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1 and mujoco.get_mju_user_warning() is None:
+                mujoco.set_mju_user_warning(self._log)
+
+    def release(self) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0 and mujoco.get_mju_user_warning() == self._log:
+                mujoco.set_mju_user_warning(None)
+                self._counts.clear()
+
+    def _log(self, text: str) -> None:
+        kind = text[:32]  # the rest carries numbers that differ each time
+        self._counts[kind] += 1
+        count = self._counts[kind]
+        if count & (count - 1) == 0:  # an unstable model repeats itself at every step
+            logger.warning("MuJoCo: %s%s", text, f" ({count} times so far)" if count > 1 else "")
+
+
+_mujoco_warnings: _WarningLog = _WarningLog()
 
 
 class PhysicsThread:
@@ -68,7 +103,7 @@ class PhysicsThread:
 
     def start(self) -> None:
         """Start the thread."""
-        mujoco_warnings.acquire()
+        _mujoco_warnings.acquire()
         atexit.register(self.stop, 1.0)  # a thread inside MuJoCo must not meet the interpreter's end
         self._thread.start()
 
@@ -94,7 +129,7 @@ class PhysicsThread:
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             idle = ended(self._thread, deadline - time.monotonic()) and idle
         if first and self._thread.ident is not None:
-            mujoco_warnings.release()
+            _mujoco_warnings.release()
             atexit.unregister(self.stop)
         if not idle:
             logger.warning("physics did not stop within %g s", timeout)

@@ -17,7 +17,6 @@ from typing import Final
 
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
-from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import UserChannels
@@ -27,7 +26,7 @@ from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.options import OptionOverrides
 from urlab_client.server.physics.replay import ReplaySessions
 from urlab_client.server.physics.reply_template import StepReplies
-from urlab_client.server.refusal import Refusal
+from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.health import Health
 
@@ -72,7 +71,7 @@ class Running:
         return ControlClaims()
 
     @cached_property
-    def step_frames(self) -> StepReplies:
+    def step_replies(self) -> StepReplies:
         """The encoder of the replies to `step`."""
         return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
 

@@ -1,6 +1,6 @@
-"""What pictures of a scene depend on besides its model, and how the model tells of it.
+"""What pictures of a scene depend on besides its model, and how it is stored in the model.
 
-A batch of copies draws a server's scene without the server: what it knows of it is the compiled model.
+A batch of copies draws a server's scene without the server: it has only the compiled model.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from urlab_client.randomise.variation import model_text
 __all__ = ["APPEARANCE_TEXT", "Appearance", "RenderQuality"]
 
 APPEARANCE_TEXT: Final = "urlab_pictures"
-"""Name of the custom text element with which a server's compiled model tells, as JSON, what is not the default."""
+"""Name of the custom text element of a compiled model that holds, as JSON, what differs from the default."""
 
 RenderQuality: TypeAlias = Literal["auto", "fast", "high"]
 """`fast` leaves out smooth edges, shadows, reflections and blending between mipmaps, and draws round shapes a little
-coarser; `high` does not; `auto` is `fast` where the processor draws and `high` elsewhere."""
+coarser; `high` has all of these; `auto` is `fast` with software rendering and `high` otherwise."""
 
 
 class Appearance(Struct, kw_only=True, frozen=True, omit_defaults=True):
@@ -28,7 +28,7 @@ class Appearance(Struct, kw_only=True, frozen=True, omit_defaults=True):
 
     Attributes:
         quality: How well to draw.
-        classes: By actor name, the class or mesh that the colours of `semantic` and `instance` go by.
+        classes: Class or mesh by actor name; it determines the colours of `semantic` and `instance`.
     """
 
     quality: RenderQuality = "auto"
@@ -36,10 +36,10 @@ class Appearance(Struct, kw_only=True, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Self:
-        """Return what a compiled scene tells; the default where it tells nothing.
+        """Read the appearance from a compiled scene; the default if it contains none.
 
         Raises:
-            ValueError: It tells something else.
+            ValueError: The text is not an appearance.
         """
         text = model_text(model, APPEARANCE_TEXT)
         try:
@@ -48,5 +48,5 @@ class Appearance(Struct, kw_only=True, frozen=True, omit_defaults=True):
             raise ValueError(f"the scene's text {APPEARANCE_TEXT!r}: {error}") from None
 
     def texts(self) -> dict[str, str]:
-        """Return the custom text elements that tell it; none for the default."""
+        """Return the custom text elements that store it; none for the default."""
         return {} if self == type(self)() else {APPEARANCE_TEXT: msgspec.json.encode(self).decode()}

@@ -34,8 +34,7 @@ from urlab_client.server.render.latency import Instant, Latency, Past
 from urlab_client.server.render.opengl import RenderingUnavailable, need_backend, search_backend
 from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import ViewportPicture
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.health import Health, ended
 
 __all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
 
@@ -43,10 +42,10 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]
 Look = Mapping[str, NDArray[Any]]
-"""Fields of a model that pictures depend on, by name."""
+"""Names of the model fields that pictures depend on."""
 
 LATEST_S: Final = 1.0 / 30.0
-"""Age up to which a frame is the latest."""
+"""Age up to which a frame counts as the latest."""
 
 FRAMES_DEADLINE_S: Final = 30.0
 """Longest wait for the frames of a step; the first ones include the search for OpenGL."""
@@ -85,9 +84,9 @@ class Shot:
         key: The camera as the request names it, the frame's key in the reply.
         camera: The camera.
         sync: Draw the state after the step, rather than hand over the latest frame.
-        late: What delays the frame.
-        least: Number of the first snapshot that is good enough.
-        older: Whether an older frame will do when the state is not drawn in time.
+        late: The camera's latency, if it has one.
+        least: Number of the oldest acceptable snapshot.
+        older: Whether an older frame is acceptable if the state is not drawn in time.
     """
 
     key: str
@@ -105,10 +104,10 @@ class Exposure:
     Attributes:
         cameras: The cameras.
         data: The state.
-        taken_at: When it was the state, monotonic seconds.
-        frame_id: Number of its snapshot; None in dialects whose pictures do not tell.
-        past: What gets the frame instead of the one camera, which saw this some time ago.
-        look: What the model looks like, where that varies.
+        taken_at: Time of the state, monotonic seconds.
+        frame_id: Number of its snapshot; None in dialects whose pictures do not carry it.
+        past: Receiver of the delayed frame, if the camera has a latency.
+        look: Values of the model fields that vary.
         done: Set when the cameras have their frames, or never will.
     """
 
@@ -123,14 +122,14 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Film:
-    """What the frames of a request come from.
+    """The states from which the frames of a request are drawn.
 
     Attributes:
         taken_at: When it was captured, monotonic seconds.
-        captured: The same as Unix seconds.
+        captured: The same time as Unix seconds.
         number: Number of the state's snapshot.
-        jobs: What has to be drawn.
-        past: What delayed cameras show; those that have nothing to show yet are missing.
+        jobs: The states to draw.
+        past: What delayed cameras show; cameras without a state to show yet are missing.
     """
 
     taken_at: float
@@ -152,24 +151,24 @@ class Film:
         return frame if in_time or shot.older or not shot.sync else None
 
     def snapshot(self, shot: Shot) -> int:
-        """Return the number of the snapshot that the frame for a shot shows, or of an earlier one."""
+        """Return the number of the snapshot in the frame for a shot, or of an earlier one."""
         past = None if shot.late is None else self.past.get(shot.late)
         return self.number if past is None else past.frame_id
 
     def capture_time(self, shot: Shot) -> float:
-        """Return when the camera saw what the frame for a shot shows, Unix seconds."""
+        """Return the time of the state in the frame for a shot, Unix seconds."""
         past = None if shot.late is None else self.past.get(shot.late)
         return self.captured if past is None else past.captured
 
 
 @dataclass(eq=False)
 class Painting:
-    """A state of which a picture of the viewport is to be drawn.
+    """A state to be drawn as a picture of the viewport.
 
     Attributes:
         picture: What it shows.
         data: The state.
-        look: What the model looks like, where that varies.
+        look: Values of the model fields that vary.
         pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
         done: Set when it is drawn, or never will be.
     """
@@ -200,11 +199,11 @@ class CameraRenderer:
         Args:
             scene: The scene.
             modes: Meaning of the pixels by articulation key and camera name; `real` by default.
-            appearance: What pictures depend on besides the model.
+            appearance: See `Appearance`.
             health: Receives a report if the drawing thread dies.
             names: Names of articulations in requests and replies, by key; the key itself by default.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
-            dialect: Determines the names of cameras there.
+            dialect: Determines the names of cameras in requests and replies.
         """
         self._scene = scene
         self._health = Health() if health is None else health
@@ -219,7 +218,7 @@ class CameraRenderer:
                 camera = _Camera(info, modes.get((index.key, info.name), CameraMode.REAL))
                 robot = names.get(index.key, index.key)
                 self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
-                self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
+                self._bare[dialect.camera_key(robot, info.name)] = camera  # the last of several
         self._varied = tuple(varied)
         self._episode = 0
         self._model: mujoco.MjModel | None = None
@@ -255,7 +254,7 @@ class CameraRenderer:
             if camera is not None and kind is not None:
                 now = isinstance(kind, str) and kind.lower() == "sync"
                 late = None if now else _late(camera)
-                # A picture from some snapshot on is asked for: that of now is one, if there is any.
+                # The request wants a picture of some snapshot or a later one: the current one will do.
                 least = 0.0 if isinstance(kind, str) or not self._stamped else kind.get("frame_id", 0.0)
                 later = self._stamped and not isinstance(kind, str)
                 older = fresh and not later
@@ -292,7 +291,7 @@ class CameraRenderer:
 
         Args:
             frame_id: Number of its snapshot.
-            episode: Another than before, if the simulation was reset since.
+            episode: Changes with each reset.
         """
         now = self._now()
         if episode != self._episode:
@@ -323,12 +322,12 @@ class CameraRenderer:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
-            shots: What is asked for.
+            shots: The requested frames.
             frame_id: Number of the state's snapshot.
-            draw: Whether frames may be drawn; without, the ones that there are have to do.
+            draw: Whether frames may be drawn; otherwise existing ones are used.
 
         Returns:
-            What to hand to `frames`.
+            The argument for `frames`.
         """
         self._given_up = [job for job in self._given_up if not job.done.is_set()]
         now, draw = self._now(), draw and not self._broken and len(self._given_up) < GIVEN_UP

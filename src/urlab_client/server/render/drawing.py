@@ -44,7 +44,7 @@ NEAR_M: Final = 0.001
 _SLICES: Final = 16
 
 _STACKS: Final = 8
-"""How finely round shapes are drawn when it has to be fast; MuJoCo's own numbers are 28 and 16."""
+"""Slices and stacks of round shapes in `fast` quality; MuJoCo's own numbers are 28 and 16."""
 
 _OPAQUE: Final = np.array(0xFF000000, "<u4")
 
@@ -53,13 +53,13 @@ class Stage:
     """The OpenGL context and what is drawn with it. Everything happens on the thread that made it."""
 
     def __init__(self, model: mujoco.MjModel, backend: Backend, tints: Tints, quality: RenderQuality) -> None:
-        """Make the context.
+        """Create the context.
 
         Args:
-            model: A model of its own, whose visual settings are adjusted.
-            backend: What draws.
+            model: A model that nothing else uses; its visual settings are adjusted.
+            backend: The way to OpenGL.
             tints: Colours of the segmentation modes.
-            quality: How well to draw.
+            quality: Rendering quality.
         """
         self._model = model
         self._tints = tints
@@ -69,7 +69,7 @@ class Stage:
             model.vis.quality.shadowsize = 0
             model.vis.quality.numslices, model.vis.quality.numstacks = _SLICES, _STACKS
         self._option = mujoco.MjvOption()
-        self._option.sitegroup[:] = 0  # marks for the modeller, not things to be seen
+        self._option.sitegroup[:] = 0  # aids for the modeller, invisible to a camera
         self._subjects = moving_geoms(model)
         self._view = mujoco.MjvCamera()
         self._scene = mujoco.MjvScene(model, maxgeom=max(10_000, 2 * model.ngeom + 1000))
@@ -89,12 +89,12 @@ class Stage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        with contextlib.suppress(Exception):  # a driver that is in trouble is so here, too
+        with contextlib.suppress(Exception):  # a failing driver may fail here, too
             self._renderer.free()
             free_context(self._gl, sound=kind is None)
 
     def prepare(self, data: mujoco.MjData) -> None:
-        """Bring what is drawn up to the state: after a step it is that of the step's beginning."""
+        """Update derived quantities that drawing needs: after a step they belong to its beginning."""
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_comPos(self._model, data)
         mujoco.mj_camlight(self._model, data)
@@ -183,11 +183,11 @@ class Stage:
         """Return what was drawn, opaque, from the top, shape (height, width, 4).
 
         Args:
-            area: What to read.
+            area: The area to read.
             order: `BGRA` or `RGBA`.
         """
         shape = (area.height, area.width)
-        if self._renderer.offSamples:  # MuJoCo alone can read a buffer with several samples a pixel
+        if self._renderer.offSamples:  # only MuJoCo can read a buffer with several samples per pixel
             colors = np.empty((*shape, 3), np.uint8)
             mujoco.mjr_readPixels(colors, None, area, self._renderer)
             pixels = np.full((*shape, 4), 255, np.uint8)
@@ -197,7 +197,7 @@ class Stage:
         gl = self._opengl
         read = np.empty((*shape, 4), np.uint8)
         gl.glReadPixels(0, 0, area.width, area.height, getattr(gl, f"GL_{order}"), gl.GL_UNSIGNED_BYTE, array=read)
-        words = read.view("<u4")[::-1]  # one pass turns the picture over and makes it opaque
+        words = read.view("<u4")[::-1]  # one pass flips the picture and makes it opaque
         return np.bitwise_or(words, _OPAQUE).view(np.uint8)
 
     def _segments(self, colors: Bytes, mode: CameraMode) -> Bytes:

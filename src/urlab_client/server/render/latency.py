@@ -43,11 +43,11 @@ class Past:
 
     Attributes:
         frame_id: Number of its snapshot.
-        at: When it was the state, by the camera's clock, seconds.
+        at: Time of the state on the camera's clock, seconds.
         deviation: Its share of the camera's jitter, -1 to 1.
-        captured: When it was the state, Unix seconds.
+        captured: The same as Unix seconds.
         state: The state, as `mj_getState` gives it.
-        frame: Its picture, as soon as it is drawn.
+        frame: Its picture, once it is drawn.
     """
 
     frame_id: int
@@ -59,7 +59,7 @@ class Past:
 
 
 class Latency:
-    """The latency of one camera, and what the camera has seen but may not have shown yet.
+    """The latency of one camera, and the states that it has seen but may not have shown yet.
 
     Attributes:
         settings: The requested latency.
@@ -68,7 +68,7 @@ class Latency:
     """
 
     def __init__(self, settings: CameraDelayInForce, seed: int, before: Latency | None = None) -> None:
-        """Begin to delay.
+        """Start to delay.
 
         Args:
             settings: The requested latency; its numbers are finite and not negative.
@@ -103,7 +103,7 @@ class Latency:
         """
         at, past = self._at(now), self.past
         if past and at < past[-1].at:
-            past.clear()  # pushed back in time: what came after this moment has not happened
+            past.clear()  # time was set back: later states have not happened
         if past and at == past[-1].at:
             past.pop()
         past.append(Past(frame_id, at, self._random.uniform(-1.0, 1.0), captured, state))

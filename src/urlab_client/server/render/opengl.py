@@ -1,4 +1,4 @@
-"""Whether pictures can be drawn on this machine, and by what."""
+"""Whether this machine can draw pictures, and with which backend."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _DISABLED: Final = ("disable", "disabled", "off", "false", "0")
 ADVICE: Final = (
     "apt install libegl1 libgl1-mesa-dri, or libosmesa6" if sys.platform == "linux" else "install a graphics driver"
 )
-"""What to do where no OpenGL works."""
+"""Advice for machines without a working OpenGL."""
 
 _SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
 
@@ -78,11 +78,11 @@ class RenderingUnavailable(URLabError):
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to OpenGL that works on this machine.
+    """A working OpenGL backend.
 
     Attributes:
         name: `egl`, `osmesa`, `cgl` or `glfw`: the module of MuJoCo that makes contexts.
-        renderer: What draws, as the driver calls it.
+        renderer: Name of the renderer, from the driver.
     """
 
     name: str
@@ -90,24 +90,24 @@ class Backend:
 
     @property
     def software(self) -> bool:
-        """Whether the processor draws."""
+        """Whether it renders in software."""
         return self.name == "osmesa" or any(name in self.renderer.lower() for name in _SOFTWARE)
 
 
 def find_backend() -> Backend | None:
-    """Return what draws on this machine; None when nothing does.
+    """Return the OpenGL backend of this machine; None if there is none.
 
-    `MUJOCO_GL` names the only one to try, or disables drawing. The answer is looked for once per process.
+    `MUJOCO_GL` names the only one to try, or disables drawing. The search runs once per process.
     """
     found = search_backend()
     return found if isinstance(found, Backend) else None
 
 
 def need_backend() -> Backend:
-    """Return what draws on this machine.
+    """Return the OpenGL backend of this machine.
 
     Raises:
-        RenderingUnavailable: Nothing does; the message says why and what to install.
+        RenderingUnavailable: There is none; the message says why and what to install.
     """
     found = search_backend()
     if isinstance(found, Backend):
@@ -167,7 +167,7 @@ _idle: dict[int, list[Any]] = {}
 
 
 def search_backend() -> Backend | str:
-    """Return what draws, or why nothing does."""
+    """Return the backend, or why there is none."""
     with _probing:
         return _find(os.environ.get(_CHOICE, "").lower().strip())
 
@@ -198,7 +198,7 @@ def _candidates(choice: str) -> Sequence[str]:
 
 
 def _probe(name: str) -> Backend | str:
-    """Draw in a child process; return what drew, or why nothing did."""
+    """Draw in a child process; return the renderer, or why it failed."""
     environment = {**os.environ, _CHOICE: "disable", "PYTHONSAFEPATH": "1"}
     environment.pop("PYOPENGL_PLATFORM", None)
     try:

@@ -22,7 +22,7 @@ _SEEN_COSINE: Final = 0.5
 
 
 def shadow_clip(own: float) -> float:
-    """Return how far shadows reach, metres, where MuJoCo would draw them as far as `own`.
+    """Return how far shadows should reach, metres, if MuJoCo would draw them up to `own`.
 
     The ground is speckled where they end, so that small scenes have them end outside the picture.
     """

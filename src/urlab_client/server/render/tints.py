@@ -26,15 +26,15 @@ Bytes = NDArray[np.uint8]
 
 
 class Tints:
-    """Whose the geoms are, and their colours in the segmentation modes, blue, green, red."""
+    """The actors of the geoms, and their colours in the segmentation modes, as blue, green, red."""
 
     def __init__(self, model: mujoco.MjModel, classes: Mapping[str, str], bodies: Mapping[int, str]) -> None:
         """Prepare for a model.
 
         Args:
             model: The compiled scene.
-            classes: By actor name, the class or mesh that its colour goes by.
-            bodies: By body id the articulation that it is of, by its actor name; the others' names tell.
+            classes: Class or mesh by actor name; it determines the colour.
+            bodies: Actor name of the articulation by body id; other bodies are identified by their names.
         """
         self._model = model
         self._classes = classes
@@ -42,7 +42,7 @@ class Tints:
         self._found: dict[CameraMode, Bytes] = {}
 
     def of(self, mode: CameraMode) -> Bytes:
-        """Return the colours, shape (ngeom, 3); what belongs to no actor is black."""
+        """Return the colours, shape (ngeom, 3); geoms without an actor are black."""
         if mode not in self._found:
             self._found[mode] = self._compute(mode)
         return self._found[mode]

@@ -1,6 +1,6 @@
 """The viewport's picture: where MuJoCo's camera goes, what the view modes mean, and debug drawing as geoms.
 
-For the stage of `rendering`, which draws. Nothing here needs OpenGL.
+For `drawing`. Nothing here needs OpenGL.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, rotate
-from urlab_client.server.editor.geometry import box_around
+from urlab_client.server.compile.bounds import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
 
@@ -39,7 +39,7 @@ __all__ = [
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 SELECTED: Final[Vec3] = (1.0, 0.55, 0.05)
-"""Colour of the box around what is selected."""
+"""Colour of the box around the selected actor."""
 
 Bounds: TypeAlias = tuple[Vec3, Vec3]
 """Lowest and highest corner of an axis-aligned box, metres."""
@@ -78,9 +78,9 @@ class ViewportPicture:
 
 
 def aim(camera: mujoco.MjvCamera, view: ViewportCamera) -> None:
-    """Make MuJoCo's free camera look as the viewport's does, but for its roll."""
+    """Point MuJoCo's free camera like the viewport's; it cannot roll."""
     x, y, z = view.forward
-    if math.hypot(x, y) < 1e-9:  # straight up or down: what is up in the picture tells the azimuth
+    if math.hypot(x, y) < 1e-9:  # straight up or down: the upper edge determines the azimuth
         up_x, up_y, _ = view.up
         x, y = (up_x, up_y) if z < 0.0 else (-up_x, -up_y)
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -135,7 +135,7 @@ def bounds_of(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool
 
 
 def outline(bounds: Bounds) -> Box:
-    """Return the box that marks what is selected."""
+    """Return the box around the selected actor."""
     low, high = np.array(bounds)
     return Box(
         center=_point((low + high) / 2.0), half_extents=_point((high - low) / 2.0), rotation=IDENTITY, color=SELECTED
@@ -143,7 +143,7 @@ def outline(bounds: Bounds) -> Box:
 
 
 def add_primitives(scene: mujoco.MjvScene, primitives: Sequence[Primitive]) -> None:
-    """Add debug drawing to a scene; what does not fit is left out, with a warning."""
+    """Add debug drawing to a scene; geoms that do not fit are omitted with a warning."""
     geoms = itertools.chain.from_iterable(map(_strokes, primitives))
     for stroke in geoms:
         if scene.ngeom >= scene.maxgeom:

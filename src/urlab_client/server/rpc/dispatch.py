@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 import msgspec
+from msgspec import Struct
 
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import encode_reply
@@ -23,10 +24,9 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
-from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.system.serving_thread import ServingThread
 
-__all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
+__all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "ServedRequest", "handles"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -42,6 +42,24 @@ _BESIDE_JOBS: Final = frozenset({"op_status", "pie_status"})
 
 BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up case-insensitively but recognise only their exact name."""
+
+
+class ServedRequest(Struct, frozen=True, kw_only=True):
+    """An answered request; see `SimulatedServer.add_request_callback`.
+
+    Attributes:
+        op: Its op; `unknown` if the server does not have it.
+        error: Code of the error reply; empty if there was no error.
+        seconds: Time from its turn to the reply.
+        request_bytes: Size of the request.
+        reply_bytes: Size of the reply.
+    """
+
+    op: str
+    error: str
+    seconds: float
+    request_bytes: int
+    reply_bytes: int
 
 
 class HandlerTable:

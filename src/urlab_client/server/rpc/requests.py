@@ -1,42 +1,37 @@
-"""From the bytes of a request to a typed struct, by the plugin's rules of detection and coercion.
+"""From the bytes of a request to a typed struct.
 
-For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: unusual
-spellings of names and numbers are accepted, and unusable values count as absent. A `step` of exactly the declared types
-is decoded by msgspec directly, and so is a chunk of an upload. Both paths agree where the second one succeeds.
-
-The direct path saves processor time: field by field, a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
-instead of 1.2, and a chunk of an upload 4.5 ms per MiB instead of 0.1. The other ops are too rare to justify 0.8 ms
-each at the server's start.
+For the dispatcher. msgspec decodes a `step` and a chunk of an upload directly to their structs, as our client sends
+them: they come at kilohertz rates, or with megabytes. What this strict decoder refuses, and all other ops, is read
+leniently, as the plugin does it. Both ways agree where the first one succeeds.
 """
 
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Mapping
-from functools import cached_property
-from typing import Any, Final, TypeVar, Union
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Final, TypeVar, Union, cast
 
 import msgspec
-from msgspec import UNSET, Struct
+import numpy as np
+from msgspec import UNSET, Struct, inspect
 
 from urlab_client.protocol.base import Op, Request
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.dialects import ALPHA
+from urlab_client.protocol.registry import OPS
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rpc.coercion import ABSENT, as_text, struct_converter
-from urlab_client.server.rpc.exact_structs import (
-    collision_test_of,
-    longest_string,
-    strict_array,
-    strict_struct,
-    string_measures_of,
-)
-from urlab_client.server.rpc.plain_data import Plain, bad_request, decode_plain, fold_keys
+from urlab_client.server.rpc.lenient import ABSENT, as_text, bad_request, bare, fill, fold_keys, read_plain
 
 __all__ = ["Incoming", "RequestReader", "need", "usable"]
 
 _DEFAULT_LIMITS: Final = Limits()
+
+_EXACT_NAMES: Final = frozenset({"hello", "meta"})
+"""Ops that are recognised in lower case only."""
+
+_NUMBERS: Final = frozenset({float, int})
 
 T = TypeVar("T")
 
@@ -83,10 +78,6 @@ def need(request: Request[Any], value: T, field: str) -> T:
     return value
 
 
-class _Nameless(Struct, tag_field="op", tag=""):
-    """Second member of the decoder's union: a single struct would accept requests without an op."""
-
-
 class RequestReader:
     """Decodes frames into requests. Stateless, so any thread may use it."""
 
@@ -97,31 +88,21 @@ class RequestReader:
         structs: Mapping[str, type[Request[Any]]] = types.MappingProxyType({}),
         limits: Limits = _DEFAULT_LIMITS,
     ) -> None:
-        """Create the decoders.
+        """Create the reader of a server.
 
         Args:
             ops: All ops by name.
             structs: Struct with more fields than the declared one, from which it must derive, by op name.
             limits: Limits on requests.
         """
+        for name, struct in structs.items():
+            if not issubclass(struct, OPS[name].request):
+                raise TypeError(f"{struct.__name__} does not derive from {OPS[name].request.__name__}")
+        self._ops = ops
+        self._structs = structs
         self._limits = limits
-        self._exact: dict[type, Op] = {}
-        self._loose: dict[str, _LooseOp] = {}
-        strict: list[type[Struct]] = [_Nameless]
-        for op in ops.values():
-            struct = structs.get(op.name, op.request)
-            if not issubclass(struct, op.request):
-                raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")
-            self._loose[op.name] = _LooseOp(op, struct)
-            if op.hot:
-                exact = strict_struct(struct)
-                self._exact[exact] = op
-                strict.append(exact)
-        with building():
-            self._decoder: msgspec.msgpack.Decoder[Request[Any] | _Nameless] = msgspec.msgpack.Decoder(
-                Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
-                dec_hook=strict_array,
-            )
+        self._decode = _strict_decoder().decode
+        self._hot: dict[type, Op] = {op.request: op for op in ops.values() if op.hot}
 
     def read(self, frame: bytes) -> Incoming:
         """Decode one frame.
@@ -129,72 +110,98 @@ class RequestReader:
         Raises:
             Refusal: `bad_request` if the frame is neither a msgpack map nor a JSON object, or exceeds a limit.
         """
+        most = self._limits.request_bytes
+        if len(frame) > most:
+            raise bad_request(f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
         try:
-            request = self._decoder.decode(frame)
+            request = self._decode(frame)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return self._read_loosely(frame)
-        if isinstance(request, _Nameless):
-            return self._read_loosely(frame)
-        kind = type(request)
-        collides = collision_test_of(kind)
-        if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
-            return self._read_loosely(frame)
-        op = self._exact[kind]
-        self._check_strings(op, request, frame, exact=True)
+            return self._read_leniently(frame)
+        op = self._hot.get(type(request))
+        if op is None or _names_collide(request):
+            return self._read_leniently(frame)
+        self._check_strings(op, request, frame)
         return Incoming(op.name, op, request.session_id, request)
 
-    def _check_strings(self, op: Op, request: Request[Any], frame: bytes, *, exact: bool) -> None:
+    def _read_leniently(self, frame: bytes) -> Incoming:
+        fields = fold_keys(read_plain(frame, self._limits.request_depth))
+        name, session_id = as_text(fields.get("op")), as_text(fields.get("session_id"))
+        if name is ABSENT:
+            return Incoming(None)
+        session_id = "" if session_id is ABSENT else session_id
+        op = self._ops.get(name.lower())
+        if op is None or (op.name in _EXACT_NAMES and name != op.name):
+            return Incoming(name, session_id=session_id)
+        missing = tuple(field for field in op.declared_required if field.lower() not in fields)
+        request = fill(self._structs.get(op.name, op.request), fields)
+        self._check_strings(op, request, frame)
+        return Incoming(name, op, session_id, request, missing)
+
+    def _check_strings(self, op: Op, request: Request[Any], frame: bytes) -> None:
         most = self._limits.string_chars
         if len(frame) <= most:  # true for nearly every request, so that no search is needed
             return
-        anything = ((name, longest_string) for name in request.__struct_fields__)
-        for name, measure in string_measures_of(type(request)) if exact else anything:
-            longest = measure(getattr(request, name))
+        for name, sent_as in zip(request.__struct_fields__, request.__struct_encode_fields__, strict=True):
+            longest = _longest_string(getattr(request, name))
             if longest > most:
-                field = next(field for field in msgspec.structs.fields(request) if field.name == name)
                 raise bad_request(
-                    f"{op.name}: field '{field.encode_name}' holds a string of {longest} characters, more than the "
+                    f"{op.name}: field '{sent_as}' holds a string of {longest} characters, more than the "
                     f"limit string_chars, {most}"
                 )
 
-    def _read_loosely(self, frame: bytes) -> Incoming:
-        limits = self._limits
-        if len(frame) > limits.request_bytes:
-            raise bad_request(
-                f"a request of {len(frame)} bytes exceeds the limit request_bytes, {limits.request_bytes}"
-            )
-        fields = fold_keys(decode_plain(frame, limits.request_depth))
-        name = as_text(fields.get("op"))
-        if name is ABSENT:
-            return Incoming(None)
-        loose = self._loose.get(name.lower())
-        if loose is None or (loose.exact and name != loose.op.name):
-            return Incoming(name, session_id=_session_id(fields))
-        missing = tuple(field for field in loose.declared if field.lower() not in fields)
-        request = loose.convert(fields)
-        self._check_strings(loose.op, request, frame, exact=False)
-        return Incoming(name, loose.op, _session_id(fields), request, missing)
+
+@cache
+def _strict_decoder() -> msgspec.msgpack.Decoder[Request[Any]]:
+    """Return the decoder of the hot ops. Their structs forbid unknown fields, which may be others in another case."""
+    hot = tuple(op.request for op in OPS.values() if op.hot)
+    with building():
+        return msgspec.msgpack.Decoder(Union[hot], dec_hook=_strict_array)  # noqa: UP007 - a union of a run-time list
 
 
-def _session_id(fields: Mapping[str, Plain]) -> str:
-    value = as_text(fields.get("session_id"))
-    return "" if value is ABSENT else value
+def _strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Decode an array; its elements must be numbers."""
+    del kind
+    return np.array(msgspec.convert(value, list[float]), dtype=np.float64)
 
 
-class _LooseOp:
-    """What field-by-field decoding needs to know about an op."""
+def _names_collide(value: object) -> bool:
+    """Return whether a map has keys that differ only in case, of which only the last one counts."""
+    if isinstance(value, dict):
+        entries = cast("dict[str, object]", value)
+        if len(entries) > 1 and len({*map(str.lower, entries)}) < len(entries):
+            return True
+        return any(map(_names_collide, entries.values()))
+    if isinstance(value, Struct):
+        for name in _maps_of(type(value)):
+            inside = getattr(value, name)
+            if inside and _names_collide(inside):
+                return True
+    return False
 
-    def __init__(self, op: Op, struct: type[Request[Any]]) -> None:
-        self.op = op
-        self.exact = op.name in ("hello", "meta")
-        self._struct = struct
 
-    # Computed on first use, so that a server starts faster.
+@cache
+def _maps_of(struct: type[Struct]) -> tuple[str, ...]:
+    """Return the names of the fields that can hold a map."""
+    return tuple(
+        field.name
+        for field in msgspec.structs.fields(struct)
+        if isinstance(kind := bare(inspect.type_info(field.type)), inspect.UnionType)
+        and any(isinstance(member, inspect.DictType) for member in kind.types)
+    )
 
-    @cached_property
-    def declared(self) -> tuple[str, ...]:
-        return self.op.declared_required
 
-    @cached_property
-    def convert(self) -> Callable[[dict[str, Plain]], Any]:
-        return struct_converter(self._struct)
+def _longest_string(value: object) -> int:
+    """Return the length of the longest string in a value of a request."""
+    if isinstance(value, str):
+        return len(value)
+    if isinstance(value, (list, tuple)):
+        inside = cast("list[object]", value)
+    elif isinstance(value, dict):
+        entries = cast("dict[object, object]", value)
+        inside = [*entries, *entries.values()]
+    elif isinstance(value, Struct):
+        inside = [item for name in value.__struct_fields__ if (item := getattr(value, name)) is not None]
+    else:
+        return 0
+    # Most values are numbers in long lists, and the set of their types is small.
+    return 0 if _NUMBERS.issuperset(map(type, inside)) else max(map(_longest_string, inside))

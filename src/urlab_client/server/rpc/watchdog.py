@@ -13,8 +13,7 @@ from typing import Final
 
 from urlab_client.server.core import ServerCore
 from urlab_client.server.rpc.dispatch import Dispatcher
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.health import Health, ended
 
 __all__ = ["Watchdog"]
 

@@ -23,7 +23,7 @@ from urlab_client.protocol.messages.session import ArticulationState, Clock, Ent
 from urlab_client.protocol.topics import STATE_FULL, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
-from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
+from urlab_client.server.physics.observe import Observer, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
@@ -165,14 +165,11 @@ class Broadcast:
 
     def _state_full(self, tick: Tick) -> bytes:
         snapshot = StateFull(
-            time=tick.time,
-            step=tick.step,
-            sim_time=sim_clock(tick.time),
-            wall_time=tick.wall_time,
-            per_articulation=self._observer.articulations(ObservationLevel.STANDARD),
+            **self._observer.state(ObservationLevel.STANDARD, tick.time, tick.step),
             entities=self._observer.entities(),
             user=self._observer.scene_channels() or None,
         )
+        snapshot.wall_time = tick.wall_time
         return encode_reply(self._dialect.shaped(snapshot))
 
     def info_messages(

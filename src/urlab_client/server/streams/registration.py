@@ -12,8 +12,7 @@ from pathlib import Path
 from urlab_client._whole_files import write_whole
 from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.health import Health, ended
 
 __all__ = ["Registration"]
 

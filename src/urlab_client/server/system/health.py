@@ -1,4 +1,4 @@
-"""Health of a server's threads, and callbacks for when one dies.
+"""Health of a server's threads, callbacks for when one dies, and waiting for threads to end.
 
 `Health.thread` makes all threads of a server, and reports their unexpected end here. The dispatcher then refuses every
 request, and `SimulatedServer` calls the user's callbacks.
@@ -7,17 +7,44 @@ request, and `SimulatedServer` calls the user's callbacks.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable
-from typing import TypeVarTuple
+from typing import Final, TypeVarTuple
 
 from urlab_client._background import daemon
 
-__all__ = ["Health"]
+__all__ = ["Health", "ended", "within"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Ts = TypeVarTuple("Ts")
+
+
+SLICE_S: Final = 0.1
+
+
+def within(timeout: float, attempt: Callable[[float], bool]) -> bool:
+    """Try for `timeout` seconds, in at least two slices, and return whether it succeeded.
+
+    After a process was stopped or got no processor time, its deadline may have passed although no other thread has run.
+    With slices, such a pause uses up one of them, and another follows.
+
+    Args:
+        timeout: Seconds.
+        attempt: Waits for up to the given seconds, and returns whether it succeeded.
+    """
+    return any(attempt(SLICE_S) for _ in range(max(2, math.ceil(timeout / SLICE_S))))
+
+
+def ended(thread: threading.Thread, timeout: float) -> bool:
+    """Wait until a thread has ended, for `timeout` seconds, and return whether it has."""
+
+    def joined(seconds: float) -> bool:
+        thread.join(seconds)
+        return not thread.is_alive()
+
+    return within(timeout, joined)
 
 
 class Health:

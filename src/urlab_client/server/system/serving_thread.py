@@ -9,8 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.health import Health, ended
 
 __all__ = ["ServingThread"]
 
