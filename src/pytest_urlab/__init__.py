@@ -34,7 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
         "are those of SimulatedServer; step_mode is that of the clients. Files may be relative to the test's folder.",
     )
     if config.pluginmanager.hasplugin("asyncio"):
-        from pytest_urlab import asyncio_fixtures  # noqa: PLC0415
+        from pytest_urlab import asyncio_fixtures
 
         config.pluginmanager.register(asyncio_fixtures, "urlab_asyncio_fixtures")
 
@@ -47,7 +47,7 @@ def urlab_default() -> pytest.MarkDecorator:
 
 @pytest.fixture(scope="session")
 def _urlab_pool() -> Iterator[ServerPool]:
-    from pytest_urlab.pool import ServerPool  # noqa: PLC0415
+    from pytest_urlab.pool import ServerPool
 
     with ServerPool() as pool:
         yield pool
@@ -94,7 +94,7 @@ def _urlab_client_options(urlab_server: SimulatedServer, _urlab_mark: pytest.Mar
 @pytest.fixture
 def urlab_client(_urlab_client_options: dict[str, Any]) -> Iterator[URLabClient]:
     """A blocking client of the server, after `discover()`."""
-    from urlab_client import URLabClient  # noqa: PLC0415
+    from urlab_client import URLabClient
 
     with URLabClient(**_urlab_client_options) as client:
         client.discover()
@@ -127,7 +127,7 @@ def urlab_aio_client(request: pytest.FixtureRequest) -> AsyncURLabClient:
 async def _urlab_aio_client_anyio(
     anyio_backend_name: str, _urlab_client_options: dict[str, Any]
 ) -> AsyncIterator[AsyncURLabClient]:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     if anyio_backend_name != "asyncio":
         pytest.fail(f"the async client runs on asyncio, not on {anyio_backend_name}: set anyio_backend to asyncio")

@@ -28,7 +28,7 @@ def loop_scope(request: pytest.FixtureRequest) -> str:
 def _on_loop_of(scope: Literal["function", "class", "module", "package", "session"]) -> Any:
     @pytest_asyncio.fixture(name=f"_urlab_aio_client_{scope}", loop_scope=scope)
     async def client(_urlab_client_options: dict[str, Any]) -> AsyncIterator[URLabClient]:
-        from urlab_client.aio import URLabClient  # noqa: PLC0415
+        from urlab_client.aio import URLabClient
 
         async with URLabClient(**_urlab_client_options) as client:
             await client.discover()
@@ -49,7 +49,7 @@ def _urlab_aio_client_beside_anyio(
     request: pytest.FixtureRequest, _urlab_client_options: dict[str, Any]
 ) -> Iterator[URLabClient]:
     """The client on the loop of the test. An async fixture would be run by anyio's plugin, on another loop."""
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     runner: asyncio.Runner = request.getfixturevalue(f"_{loop_scope(request)}_scoped_runner")
     client = URLabClient(**_urlab_client_options)

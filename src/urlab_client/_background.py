@@ -6,8 +6,6 @@ import threading
 from collections.abc import Callable
 from typing import TypeVarTuple
 
-__all__ = ["daemon"]
-
 Ts = TypeVarTuple("Ts")
 
 

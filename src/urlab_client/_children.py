@@ -6,8 +6,6 @@ import subprocess
 import sys
 from typing import Final, TypedDict
 
-__all__ = ["APART"]
-
 
 class _Options(TypedDict):
     start_new_session: bool

@@ -6,8 +6,6 @@ import contextlib
 import sys
 from pathlib import Path
 
-__all__ = ["forbid_opening", "limit_process"]
-
 
 def limit_process(memory_bytes: int, cpu_s: int) -> None:
     """Limit additional memory and processor time of this process permanently, as far as the system supports it.
@@ -16,7 +14,7 @@ def limit_process(memory_bytes: int, cpu_s: int) -> None:
     """
     if sys.platform == "win32":
         return
-    import resource  # noqa: PLC0415 - not on Windows
+    import resource  # not on Windows
 
     present = 0
     with contextlib.suppress(OSError):
@@ -37,7 +35,7 @@ def forbid_opening() -> bool:
     """
     if sys.platform == "win32":
         return False
-    import resource  # noqa: PLC0415 - not on Windows
+    import resource  # not on Windows
 
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
     return True

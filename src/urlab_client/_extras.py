@@ -6,8 +6,6 @@ import importlib.util
 
 from urlab_client._installation import install_command
 
-__all__ = ["MissingExtra", "need"]
-
 
 class MissingExtra(ImportError):
     """An optional library is not installed; the message gives the command that installs its extra."""

@@ -12,8 +12,6 @@ from importlib.metadata import PackageNotFoundError, distribution, packages_dist
 from typing import Any
 from urllib.parse import urlsplit
 
-__all__ = ["conflict", "install_command"]
-
 _PACKAGE = "urlab_client"
 _OWN = "urlab-client"
 
@@ -49,7 +47,7 @@ def _source(extra: str) -> str:
     if "dir_info" not in recorded:  # PEP 610: installed from a folder
         return shlex.quote(f"{_OWN}[{extra}]")
     url: str = recorded["url"]
-    from urllib.request import url2pathname  # noqa: PLC0415 - would import HTTP and e-mail at every server start
+    from urllib.request import url2pathname  # would import HTTP and e-mail at every server start
 
     folder = url2pathname(urlsplit(url).path)
     editable = "-e " if recorded["dir_info"].get("editable") else ""

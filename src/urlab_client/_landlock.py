@@ -15,8 +15,6 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-__all__ = ["confine_files", "is_available"]
-
 _CREATE_RULESET: Final = 444  # these numbers are the same on all of CPython's Linux platforms
 _ADD_RULE: Final = 445
 _RESTRICT_SELF: Final = 446

@@ -7,8 +7,6 @@ import re
 from dataclasses import dataclass, field
 from typing import Final, Self
 
-__all__ = ["NamedFiles", "named_files"]
-
 # The grammar is that of MuJoCo's parser, which is laxer than XML: text may precede and follow the root, blanks are
 # those of C, comments may contain anything. Quantifiers are possessive, so that parsing takes linear time.
 _BLANKS: Final = rb"[ \t\n\v\f\r]*+"

@@ -27,32 +27,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = [
-    "MODEL_FILE",
-    "acting_kind",
-    "actuator_count",
-    "actuator_kind",
-    "asset_bytes",
-    "batch_class",
-    "check_copy",
-    "compiled_file",
-    "control_counts",
-    "control_starts",
-    "copy_options",
-    "export_model",
-    "force_counts",
-    "force_starts",
-    "forget_last_document",
-    "merge_assets",
-    "mujoco_version",
-    "reset_controls",
-    "servo_damping",
-    "set_threads",
-    "thread_limit",
-    "without_newer_attributes",
-    "write_model",
-]
-
 T = TypeVar("T")
 Indices = NDArray[np.int32]
 
@@ -96,7 +70,7 @@ def _per_actuator(model: mujoco.MjModel, field: str) -> Indices:
 
 def reset_controls(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Set controls to neutral values: zero, except for quaternion inputs, which exist since 3.11."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if hasattr(mujoco, "mj_resetCtrl"):
         mujoco.mj_resetCtrl(model, data)
@@ -119,7 +93,7 @@ def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
 
     A `general` with those of a servo counts as a servo, because `MjSpec.to_xml()` writes servos that way.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     element = model.actuator(actuator)
     return _kind_by_parameters(
@@ -133,7 +107,7 @@ def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
 
 def servo_damping(model: mujoco.MjModel, actuator: int) -> float:
     """Return the velocity gain of an actuator: from an affine bias, otherwise from its gain."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
         return -float(model.actuator_biasprm[actuator][2]) + 0.0  # no negative zero
@@ -162,14 +136,14 @@ def _constant(value: Any) -> str:
 
 def thread_limit(processors: int) -> int:
     """Return the number of threads that one simulation can use: 0 before 3.10, whose bindings have no thread pool."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     return processors if hasattr(mujoco, "mju_threadpool") else 0
 
 
 def set_threads(data: mujoco.MjData, threads: int) -> None:
     """Let one simulation use `threads` threads, at most `thread_limit`."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if hasattr(mujoco, "mju_threadpool"):
         mujoco.mju_threadpool(data, threads)
@@ -181,7 +155,7 @@ def compiled_file(path: Path) -> mujoco.MjModel:
     Raises:
         ValueError, mujoco.FatalError: MuJoCo rejects the model.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(path))
     forget_last_document()
@@ -193,7 +167,7 @@ def forget_last_document() -> None:
 
     It is larger than the model.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     mujoco.MjModel.from_xml_string("<mujoco/>")
 
@@ -262,7 +236,7 @@ def _write_without_packing(spec: mujoco.MjSpec, folder: Path) -> bool:
     Returns:
         False if a file is ambiguous or anything fails; then nothing is written.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     sources = _plain_files(spec)
     mark = uuid.uuid4().hex
@@ -391,7 +365,7 @@ def check_copy(original: Path, copy: mujoco.MjModel) -> None:
     Raises:
         ValueError: Meshes, textures or height fields differ from those of the original.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if _writes_archives(mujoco.MjSpec()):
         return
@@ -469,7 +443,7 @@ def _without_one_attribute(texts: list[str], problem: str, word: str, element: s
 
 def mujoco_version() -> str:
     """Return the version of the installed MuJoCo."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     return mujoco.mj_versionString()
 
@@ -495,7 +469,7 @@ def asset_bytes(model: mujoco.MjModel) -> int:
 
     Before 3.17 nothing is shared, and this is 0.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if not hasattr(mujoco.MjSpec, "dedup_assets"):
         return 0

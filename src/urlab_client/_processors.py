@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import time
 
-__all__ = ["crowded"]
-
 # With a higher load per processor, busy polling would take time from other programs.
 _CROWDED_LOAD = 1.5
 _KNOWN_S = 1.0

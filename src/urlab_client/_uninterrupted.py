@@ -7,8 +7,6 @@ import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 
-__all__ = ["uninterrupted"]
-
 
 @contextmanager
 def uninterrupted() -> Generator[None]:

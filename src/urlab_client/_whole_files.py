@@ -9,8 +9,6 @@ import sys
 from collections.abc import Generator
 from pathlib import Path
 
-__all__ = ["replaced", "write_whole"]
-
 
 @contextlib.contextmanager
 def replaced(path: Path, *, ending: str | None = None, durable: bool = True) -> Generator[Path]:

@@ -15,8 +15,6 @@ from typing import Any
 if sys.platform == "win32":
     import msvcrt
 
-__all__ = ["NamedEvent", "NamedLock", "read_aside"]
-
 _SYNCHRONIZE = 0x00100000
 _EVENT_MODIFY_STATE = 0x0002
 _ALREADY_EXISTS = 183

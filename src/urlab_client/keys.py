@@ -46,7 +46,7 @@ class KeyPair:
     @staticmethod
     def new() -> KeyPair:
         """Generate a new key pair."""
-        import zmq  # noqa: PLC0415 - importing the package opens nothing
+        import zmq  # importing the package opens nothing
 
         return KeyPair(*zmq.curve_keypair())
 

@@ -9,8 +9,6 @@ from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.zmq import ZmqTransport
 
-__all__ = ["transport_to"]
-
 _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
 _LAST_PORT = 65535
 

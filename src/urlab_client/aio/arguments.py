@@ -6,8 +6,6 @@ import operator
 from collections.abc import Collection, Iterable, Mapping
 from typing import TypeVar
 
-__all__ = ["collection", "integer", "mapping", "numbers", "require", "text"]
-
 V = TypeVar("V")
 
 

@@ -32,8 +32,6 @@ from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rotation import rotate
 
-__all__ = ["URLabArticulation", "URLabEntity"]
-
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 

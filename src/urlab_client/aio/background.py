@@ -16,8 +16,6 @@ from urlab_client._background import daemon
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.streams import ClientEvent, TaskFailed
 
-__all__ = ["Tell", "background_task", "background_thread", "kept_running"]
-
 log: logging.Logger = logging.getLogger("urlab_client.background")
 
 Ts = TypeVarTuple("Ts")

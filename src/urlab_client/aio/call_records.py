@@ -15,8 +15,6 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.client_types import CallOutcome, CallRecord
 from urlab_client.protocol.errors import URLabConnectionError, URLabRPCError, URLabTimeoutError
 
-__all__ = ["CallRecords", "Observe"]
-
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
 T = TypeVar("T")

@@ -52,8 +52,6 @@ from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
-__all__ = ["URLabClient"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 R = TypeVar("R", bound=Reply)

@@ -26,8 +26,6 @@ from urlab_client.protocol.observer import ClientObserver
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
-__all__ = ["ClientState"]
-
 
 class ClientState:
     """The attributes of a client. Reading them sends nothing and does not block."""

@@ -33,8 +33,6 @@ from urlab_client.protocol.messages.control import (
 from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
 from urlab_client.protocol.messages.session import Step
 
-__all__ = ["CLAIM_S", "Control", "process_owner"]
-
 log: logging.Logger = logging.getLogger("urlab_client.control")
 
 R = TypeVar("R", bound=Reply)

@@ -17,8 +17,6 @@ from urlab_client.protocol.messages.session import ControllerInfo
 if TYPE_CHECKING:
     from urlab_client.aio.session import Session, Turn
 
-__all__ = ["URLabController", "URLabPDController", "check_controller", "make_controller"]
-
 _GAINS = ("kp", "kv", "torque_limit")
 
 

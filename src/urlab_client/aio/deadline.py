@@ -5,8 +5,6 @@ from __future__ import annotations
 import enum
 from typing import Final, Literal, TypeAlias
 
-__all__ = ["DEFAULT", "Default", "Timeout"]
-
 
 class Default(enum.Enum):
     """Type of `DEFAULT`."""

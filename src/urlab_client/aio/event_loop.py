@@ -8,8 +8,6 @@ from typing import Any
 
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["running_loop"]
-
 
 def running_loop(
     bound: asyncio.AbstractEventLoop | None = None, owner: str = "This client"

@@ -24,8 +24,6 @@ from urlab_client.protocol.errors import RPC_ERRORS, SessionTakenOver, URLabErro
 from urlab_client.protocol.messages.session import Meta
 from urlab_client.protocol.messages.sim import PieStatus
 
-__all__ = ["diagnose", "watched"]
-
 _CONNECT_S = 2.0
 _POLLS = 5
 _POLL_S = 0.05
@@ -213,7 +211,7 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
 
 def _physics(session: Session, state: SimState) -> Iterator[Finding]:
     if state.mirror.model is not None:
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         options = state.mirror.model.opt
         integrator = mujoco.mjtIntegrator(options.integrator).name.removeprefix("mjINT_").lower()

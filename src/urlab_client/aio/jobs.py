@@ -23,8 +23,6 @@ from urlab_client.protocol.errors import (
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus, OpStatusOk
 from urlab_client.protocol.types import JobStatus
 
-__all__ = ["OnProgress", "finish"]
-
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)

@@ -34,17 +34,6 @@ from urlab_client.protocol.errors import ClientClosed, ServerUnreachable, URLabE
 from urlab_client.protocol.messages.session import Hello, HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = [
-    "SCHEME",
-    "LaunchedTransport",
-    "check_address",
-    "serve_arguments",
-    "start_seconds",
-    "with_model_options",
-    "with_option",
-    "with_start_timeout",
-]
-
 log: logging.Logger = logging.getLogger("urlab_client.launch")
 
 Ts = TypeVarTuple("Ts")

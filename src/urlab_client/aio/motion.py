@@ -27,15 +27,13 @@ from urlab_client.protocol.names import NameMap
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Motion"]
-
 _CHECK_S = 0.01  # simulation time between two checks of a predicate
 _SLICE_S = 0.1  # simulation time per request without a predicate: a slow scene still finishes it within its deadline
 _MOVING = 0.01  # rad/s or m/s: a joint that is slower than this is stuck
 _AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for this long
 
 
-class Simulation(Protocol):
+class _Simulation(Protocol):
     """The part of a client that `Motion` needs."""
 
     @property
@@ -49,7 +47,7 @@ class Simulation(Protocol):
     async def explain(self) -> Diagnosis: ...
 
 
-class Movable(Protocol):
+class _Movable(Protocol):
     """The part of an articulation that `Motion` needs."""
 
     @property
@@ -73,7 +71,7 @@ class Motion:
 
     def __init__(
         self,
-        simulation: Simulation,
+        simulation: _Simulation,
         *,
         driven: Callable[[], bool],
         locate: Callable[[], Awaitable[None]],
@@ -118,7 +116,7 @@ class Motion:
         return passed
 
     async def move_to(
-        self, articulation: Movable, targets: Mapping[str, float], tolerance: float, timeout: float
+        self, articulation: _Movable, targets: Mapping[str, float], tolerance: float, timeout: float
     ) -> float:
         """See `URLabArticulation.move_to`."""
         tolerance, limit = _positive("move_to: tolerance", tolerance), _positive("move_to: timeout", timeout)
@@ -222,7 +220,7 @@ class Motion:
 class _Aim:
     """One joint on its way to its target."""
 
-    def __init__(self, articulation: Movable, name: str, target: float) -> None:
+    def __init__(self, articulation: _Movable, name: str, target: float) -> None:
         driven = None if name in articulation.joints else articulation.actuators.get(name)
         if driven is not None and driven.joint is not None:
             raise KeyError(f"move_to takes joints; {name!r} is an actuator, which moves the joint {driven.joint!r}.")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
-__all__ = ["Mutex"]
-
 
 class Mutex:
     """Mutual exclusion of tasks, first come, first served.

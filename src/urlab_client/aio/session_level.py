@@ -7,8 +7,6 @@ from typing import Final
 
 from urlab_client.protocol.enums import ObservationLevel
 
-__all__ = ["SESSION_LEVEL", "SessionLevel"]
-
 
 class SessionLevel(enum.Enum):
     """Type of `SESSION_LEVEL`. Its value is the level of a session that was opened without naming one."""

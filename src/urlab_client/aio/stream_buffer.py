@@ -8,8 +8,6 @@ from typing import Any
 from urlab_client.aio.arguments import integer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
-__all__ = ["BufferedMessage", "StreamBuffer"]
-
 
 class BufferedMessage:
     """A message on its way to the reader.

@@ -27,8 +27,6 @@ from urlab_client.protocol.errors import (
 from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
 
-__all__ = ["BUFFER_BYTES", "BUFFER_ITEMS", "Stream"]
-
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T", bound=StreamItem)

@@ -15,8 +15,6 @@ from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.jobs import OpStarted
 
-__all__ = ["Limits", "Settle", "Turn", "require_reply"]
-
 R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
@@ -25,7 +23,7 @@ Limits: TypeAlias = tuple[float | None, float | None]
 """Loop times of two deadlines, for the reply and for the connection; None waits without limit."""
 
 
-class TurnSession(Protocol):
+class _TurnSession(Protocol):
     """The part of `Session` that a turn needs; see there."""
 
     line: Mutex
@@ -55,7 +53,7 @@ class Turn:
 
     __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
 
-    def __init__(self, session: TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
+    def __init__(self, session: _TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
         self._session = session
         self._op = op
         self._timeout: Timeout = timeout

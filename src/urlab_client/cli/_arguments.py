@@ -12,33 +12,6 @@ from urlab_client.cli._common import CommandError
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import did_you_mean
 
-__all__ = [
-    "ADDRESSES",
-    "Commands",
-    "Example",
-    "Parser",
-    "ServerArguments",
-    "add_address",
-    "add_cameras",
-    "add_dialect",
-    "add_handshake",
-    "add_keys",
-    "add_mjcf_options",
-    "add_ports",
-    "add_step_mode",
-    "cameras",
-    "count",
-    "handshake",
-    "hertz",
-    "image_size",
-    "index",
-    "make_client",
-    "one_of",
-    "port",
-    "running_address",
-    "seconds",
-]
-
 ADDRESSES = (
     "HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command"
 )
@@ -297,7 +270,7 @@ def address(text: str) -> str:
     """Parse the address of a server; a host without a scheme is reached over TCP."""
     if "://" in text:
         return text
-    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models
 
     if text in bundled_models() or text.endswith((".xml", ".json")):
         raise argparse.ArgumentTypeError(f"{text!r} is a model, not an address; write sim://{text} to start a server")

@@ -70,8 +70,8 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
     if not sys.stderr.isatty():
         yield lambda _: None
         return
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
@@ -81,7 +81,7 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
 
 def output() -> Console:
     """Return a console that writes tables to standard output, with brackets and colons in names as they are."""
-    from rich.console import Console  # noqa: PLC0415
+    from rich.console import Console
 
     console = Console(markup=False, emoji=False)
     if not console.is_terminal:
@@ -91,7 +91,7 @@ def output() -> Console:
 
 def json_line(value: object) -> str:
     """Return a value as JSON in ASCII, which every terminal and locale can encode; NaN is null."""
-    import msgspec  # noqa: PLC0415
+    import msgspec
 
     return json.dumps(msgspec.json.decode(msgspec.json.encode(value, enc_hook=str)))
 
@@ -113,7 +113,7 @@ def import_mujoco() -> None:
     chosen = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = "disable"
     try:
-        import mujoco  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # for its effect
+        import mujoco  # noqa: F401  # pyright: ignore[reportUnusedImport]  # for its effect
     finally:
         if chosen is None:
             del os.environ[_VARIABLE]

@@ -7,8 +7,6 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["bounded_connections"]
-
 
 def bounded_connections(head_s: float, body_s: float, most: int) -> type[H11Protocol]:
     """Return the protocol of the connections of one server.

@@ -8,8 +8,6 @@ from pathlib import Path
 from urlab_client.cli._arguments import ServerArguments, add_handshake, port
 from urlab_client.cli._common import CommandError
 
-__all__ = ["PageArguments", "add_page", "check_page", "host_names", "page_url"]
-
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 

@@ -16,8 +16,6 @@ from urlab_client.cli._common import in_background, sigterm_interrupts
 from urlab_client.cli._connections import bounded_connections
 from urlab_client.cli._requests import RunningRequests
 
-__all__ = ["bound", "graceful_exit", "serve"]
-
 _FINISHING_S = 0.2  # for requests to finish before they are cancelled
 _GRACE_S = 10.0  # for cancelled requests to clean up
 _HEAD_S = 10.0

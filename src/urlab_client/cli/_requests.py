@@ -13,8 +13,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from urlab_client.web.route_group import JOB
 
-__all__ = ["RunningRequests"]
-
 log: logging.Logger = logging.getLogger("urlab_client.web")
 
 

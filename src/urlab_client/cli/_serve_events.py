@@ -20,8 +20,6 @@ from urlab_client.cli._common import in_background
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
 
-__all__ = ["Event", "Events", "Starter", "next_event", "stop_on_signals", "watch_input"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 # Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.

@@ -13,8 +13,6 @@ from typing import Any
 
 from urlab_client.cli._common import CommandError
 
-__all__ = ["terminal_keys"]
-
 _MOST = 1024
 
 

@@ -16,8 +16,6 @@ from urlab_client.protocol.messages.streams import ClientEvent, PlayEnded, Serve
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
 
-__all__ = ["interruptible", "run_session"]
-
 _LOOK_S = 0.05
 _AWAY_S = 5.0
 """How long a server may be unreachable."""

@@ -16,8 +16,6 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 
-__all__ = ["PAGE_PORT", "add_parser", "run"]
-
 PAGE_PORT = 8355
 
 
@@ -51,15 +49,15 @@ def run(arguments: PageArguments) -> int:
         OSError: The port is in use.
     """
     try:
-        import prometheus_client  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
-        import uvicorn  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+        import prometheus_client  # noqa: F401  # pyright: ignore[reportUnusedImport]
+        import uvicorn  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
-        from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+        from urlab_client.web import Access  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise CommandError(f"{error.name or error} is not installed; run: {install_command('web')}") from None
     check_page(arguments)
     import_mujoco()
-    from urlab_client.cli._pages import graceful_exit  # noqa: PLC0415
+    from urlab_client.cli._pages import graceful_exit
 
     with graceful_exit():
         asyncio.run(_serve(arguments))
@@ -67,12 +65,12 @@ def run(arguments: PageArguments) -> int:
 
 
 async def _serve(arguments: PageArguments) -> None:
-    from prometheus_client import REGISTRY  # noqa: PLC0415
+    from prometheus_client import REGISTRY
 
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
-    from urlab_client.integrations.telemetry import PrometheusObserver  # noqa: PLC0415
-    from urlab_client.web import Access, app  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.cli._pages import bound, serve
+    from urlab_client.integrations.telemetry import PrometheusObserver
+    from urlab_client.web import Access, app
 
     access = Access(hosts=host_names(arguments))
     # Each camera is streamed while a browser shows it.

@@ -14,8 +14,6 @@ from urlab_client.cli._common import CommandError, progress_bar, sigterm_interru
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Episodes, Run
 
-__all__ = ["add_parser", "run"]
-
 _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
 
 
@@ -107,7 +105,7 @@ def run(arguments: ConvertArguments) -> int:
         advice = "name a folder that does not" if kind == "lerobot" else "--overwrite replaces it"
         raise CommandError(f"{arguments.output} exists; {advice}")
     try:
-        from urlab_client.integrations.record import read_run  # noqa: PLC0415
+        from urlab_client.integrations.record import read_run
 
         recording = read_run(arguments.recording)
         write, what = _writer(kind, recording, arguments)
@@ -125,7 +123,7 @@ def run(arguments: ConvertArguments) -> int:
 
 
 def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Callable[..., int], str]:
-    from urlab_client.integrations.record import export  # noqa: PLC0415
+    from urlab_client.integrations.record import export
 
     cameras = arguments.camera
     match kind:

@@ -24,8 +24,6 @@ from urlab_client.protocol.client_types import Diagnosis
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["add_parser", "run"]
-
 _UNHEALTHY = 1
 
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
@@ -81,7 +79,7 @@ def run(arguments: DoctorArguments) -> int:
 
 
 async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     client = make_client(
         URLabClient,

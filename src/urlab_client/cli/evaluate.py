@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.policy import Evaluation, Outcome
     from urlab_client.randomise import Randomisation
 
-__all__ = ["add_parser", "run"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _MODEST: Final = ""
@@ -131,7 +129,7 @@ def run(arguments: EvaluateArguments) -> int:
 
 
 def _declared(given: str | None) -> Randomisation | None:
-    from urlab_client.randomise.declaration import MODEST, Randomisation  # noqa: PLC0415
+    from urlab_client.randomise.declaration import MODEST, Randomisation
 
     if given is None or given == _MODEST:
         return None if given is None else MODEST
@@ -147,10 +145,10 @@ def _in_task(
     for name in ("robot", "declaration", "seconds"):
         if getattr(arguments, name) is not None:
             raise CommandError(f"--{name} cannot be combined with --task, which determines it")
-    from gymnasium.vector import AutoresetMode  # noqa: PLC0415
+    from gymnasium.vector import AutoresetMode
 
-    from urlab_client.integrations.gym import TASKS, URLabBatchEnv  # noqa: PLC0415
-    from urlab_client.integrations.policy import (  # noqa: PLC0415
+    from urlab_client.integrations.gym import TASKS, URLabBatchEnv
+    from urlab_client.integrations.policy import (
         OnnxDictNetwork,
         OnnxNetwork,
         PolicyFileError,
@@ -187,8 +185,8 @@ def _in_task(
 async def _on_robot(
     arguments: EvaluateArguments, declared: Randomisation | None, show: Callable[[Outcome], None]
 ) -> Evaluation:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.integrations.policy import evaluate_on, load  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.policy import evaluate_on, load
 
     policy = load(arguments.policy, arguments.declaration)
     model = arguments.robot or policy.spec.robot
@@ -213,8 +211,8 @@ async def _on_robot(
 
 
 def _print(arguments: EvaluateArguments, found: Evaluation) -> None:
-    from rich import box  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
+    from rich import box
+    from rich.table import Table
 
     table = Table(
         title=f"{arguments.policy.name}, {len(found.outcomes)} episodes, seed {arguments.seed}",

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from urlab_client._whole_files import replaced
 
-__all__ = ["Quantity", "Trace", "plot_trace"]
-
 _PER_PANEL = 6  # more lines in one panel cannot be told apart
 _DPI = 150
 _COVERS = 0.003  # of the axis: less than the width of a line
@@ -56,8 +54,8 @@ class Trace:
 def plot_trace(trace: Trace, path: Path) -> None:
     """Write the plot as PNG."""
     # The figure's own canvas, not pyplot: no display, no global state.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
     panels = [panel for quantity in trace.quantities for panel in _panels(quantity)]
     figure: Any = Figure(figsize=(10, 0.9 + 2.3 * len(panels)), layout="constrained")

@@ -13,8 +13,6 @@ from urlab_client.cli._common import counted, json_line, output, progress_bar
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary
 
-__all__ = ["add_parser", "run"]
-
 _UNFINISHED = 1
 
 
@@ -58,7 +56,7 @@ def run(arguments: InfoArguments) -> int:
     Raises:
         MissingExtra: A library is missing.
     """
-    from urlab_client.integrations.record import read_run  # noqa: PLC0415
+    from urlab_client.integrations.record import read_run
 
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
@@ -71,8 +69,8 @@ def run(arguments: InfoArguments) -> int:
 
 
 def _print(summary: Summary) -> None:
-    from rich import box  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
+    from rich import box
+    from rich.table import Table
 
     about = summary.about
     print(f"{summary.path}  {summary.path.stat().st_size / 2**20:.1f} MiB")

@@ -8,8 +8,6 @@ from pathlib import Path
 from urlab_client.cli._arguments import Commands
 from urlab_client.keys import SECRET_SUFFIX, KeyPair, public_key
 
-__all__ = ["add_parser", "run"]
-
 
 class KeysArguments(argparse.Namespace):
     """The parsed command line."""

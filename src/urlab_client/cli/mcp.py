@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from urlab_client.mcp import Agent
     from urlab_client.web import Access
 
-__all__ = ["AGENT_PORT", "McpArguments", "add_parser", "run"]
-
 AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
@@ -123,14 +121,14 @@ def run(arguments: McpArguments) -> int:
         CommandError: An option cannot be honoured.
         OSError: The port is in use.
     """
-    import urlab_client.mcp  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # reports a missing extra
+    import urlab_client.mcp  # noqa: F401  # pyright: ignore[reportUnusedImport]  # reports a missing extra
 
     check_page(arguments)
     _check_permissions(arguments)
     if arguments.models is not None and not arguments.models.is_dir():
         raise CommandError(f"--models {arguments.models}: no such folder")
     import_mujoco()
-    from urlab_client.cli._pages import graceful_exit  # noqa: PLC0415
+    from urlab_client.cli._pages import graceful_exit
 
     with graceful_exit():
         asyncio.run(_serve(arguments))
@@ -154,9 +152,9 @@ def _check_permissions(arguments: McpArguments) -> None:
 
 
 async def _serve(arguments: McpArguments) -> None:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.mcp import Agent, Limits  # noqa: PLC0415
-    from urlab_client.web import Access, app  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.mcp import Agent, Limits
+    from urlab_client.web import Access, app
 
     access = Access(hosts=host_names(arguments))
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
@@ -185,8 +183,8 @@ async def _serve(arguments: McpArguments) -> None:
 
 
 async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
-    from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
-    from urlab_client.mcp.transports import serve_stdio  # noqa: PLC0415
+    from urlab_client.cli._pages import bound, serve
+    from urlab_client.mcp.transports import serve_stdio
 
     if not arguments.console:
         await serve_stdio(agent)
@@ -211,9 +209,9 @@ def _console_port(arguments: McpArguments) -> int:
 
 
 async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
-    from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
-    from urlab_client.mcp.transports import http_application  # noqa: PLC0415
-    from urlab_client.web import Access  # noqa: PLC0415
+    from urlab_client.cli._pages import bound, serve
+    from urlab_client.mcp.transports import http_application
+    from urlab_client.web import Access
 
     given = os.environ.get(_TOKEN, "").split()
     tokens = given or [secrets.token_urlsafe(32) for _ in range(arguments.agents)]
@@ -240,7 +238,7 @@ def _print_link(arguments: McpArguments, url: str, access: Access) -> None:
 
 def _models(folder: Path | None) -> dict[str, Path]:
     """Return the models that can be imported by name: those in the folder, and the bundled robots."""
-    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models
 
     own = {} if folder is None else {file.stem: file.resolve() for file in sorted(folder.glob("*.xml"))}
     return {**bundled_models(), **own}

@@ -37,8 +37,6 @@ from urlab_client.protocol.messages.runtime import SetMode
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
-__all__ = ["add_parser", "run"]
-
 REGISTRY_CLIENTS = 16
 
 
@@ -197,7 +195,7 @@ async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
 
 
 async def _answers(address: str, step_port: int, timeout: float) -> bool:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     timeout_ms = max(1, round(timeout * 1000))
     async with URLabClient(address, step_port=step_port, rcv_timeout_ms=timeout_ms, local_model=False) as client:
@@ -245,7 +243,7 @@ async def _ping(arguments: PingArguments) -> Report:
 
 
 def _client(arguments: PingArguments, *, local_model: bool) -> URLabClient:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     timeout_ms = max(1, round(arguments.timeout * 1000))
     return make_client(URLabClient, arguments.address, arguments, rcv_timeout_ms=timeout_ms, local_model=local_model)
@@ -262,7 +260,7 @@ async def _round_trips(client: URLabClient, arguments: PingArguments) -> RoundTr
 
 
 async def _identity(client: URLabClient) -> Identity:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     local = mujoco.mj_versionString()
     return Identity(

@@ -17,8 +17,6 @@ from urlab_client.protocol.names import did_you_mean
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Table
 
-__all__ = ["add_parser", "run"]
-
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
 
@@ -72,8 +70,8 @@ def run(arguments: PlotArguments) -> int:
         MissingExtra: A library is missing.
     """
     need("matplotlib", extra="demo")
-    from urlab_client.cli.figures import Quantity, Trace, plot_trace  # noqa: PLC0415
-    from urlab_client.integrations.record import read_run  # noqa: PLC0415
+    from urlab_client.cli.figures import Quantity, Trace, plot_trace
+    from urlab_client.integrations.record import read_run
 
     target = arguments.output or arguments.recording.with_suffix(".png")
     check_ending(target, ".png", ".pdf", ".svg")
@@ -99,7 +97,7 @@ def run(arguments: PlotArguments) -> int:
 
 
 def _chosen(table: Table, arguments: PlotArguments) -> dict[str, list[str]]:
-    from urlab_client.integrations._feed.scene import joint_columns  # noqa: PLC0415
+    from urlab_client.integrations._feed.scene import joint_columns
 
     chosen: dict[str, list[str]] = {}
     there: list[str] = []

@@ -26,8 +26,6 @@ from urlab_client.protocol.enums import StepMode
 if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder
 
-__all__ = ["add_parser", "run"]
-
 _INCOMPLETE = 1
 
 
@@ -98,10 +96,10 @@ def run(arguments: RecordArguments) -> int:
         raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
+    import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # fail early
 
     if arguments.camera and arguments.address.startswith("sim://"):
-        from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
+        from urlab_client.server.render.opengl import need_backend
 
         need_backend()  # the server that this command starts renders on this machine
     try:
@@ -121,8 +119,8 @@ def run(arguments: RecordArguments) -> int:
 
 
 async def _record(arguments: RecordArguments) -> AsyncRecorder:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.integrations.record import record  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.record import record
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:

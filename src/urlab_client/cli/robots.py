@@ -10,8 +10,6 @@ from msgspec import Struct
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._common import import_mujoco, json_line
 
-__all__ = ["add_parser", "run"]
-
 
 class RobotsArguments(argparse.Namespace):
     """The parsed command line."""
@@ -51,7 +49,7 @@ def add_parser(commands: Commands) -> None:
 def run(arguments: RobotsArguments) -> int:
     """Print the table."""
     import_mujoco()
-    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models
 
     robots = [_read(name, path) for name, path in bundled_models().items()]
     print(json_line(robots) if arguments.json else _table(robots))
@@ -59,10 +57,10 @@ def run(arguments: RobotsArguments) -> int:
 
 
 def _read(name: str, path: Path) -> Robot:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
-    from urlab_client._mujoco import actuator_count  # noqa: PLC0415
-    from urlab_client.server.assets.importer import mujoco_messages  # noqa: PLC0415
+    from urlab_client._mujoco import actuator_count
+    from urlab_client.server.assets.importer import mujoco_messages
 
     with mujoco_messages():
         model = mujoco.MjModel.from_xml_path(str(path))

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.policy import Policy, PolicyRun
     from urlab_client.protocol.base import Floats
 
-__all__ = ["add_parser", "run"]
-
 _FELL = 1
 _SEED = 0
 
@@ -137,7 +135,7 @@ def run(arguments: RunPolicyArguments) -> int:
     """
     import_mujoco()
     _check_record(arguments)
-    from urlab_client.integrations.policy import load  # noqa: PLC0415
+    from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
     if arguments.twist is not None:
@@ -166,14 +164,14 @@ def _check_record(arguments: RunPolicyArguments) -> None:
     check_ending(arguments.record, ".mcap")
     if arguments.record.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.record} exists; --overwrite replaces it")
-    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
+    import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # fail early
 
 
 async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, PolicyRun]:
     """Return the result of each run, by the name of its actor."""
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.integrations.policy import require  # noqa: PLC0415
-    from urlab_client.integrations.policy import run as run_policy  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.policy import require
+    from urlab_client.integrations.policy import run as run_policy
 
     address, articulation = _where(arguments, policy)
     step_mode = arguments.step_mode or policy.spec.step_modes[0]
@@ -207,7 +205,7 @@ def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | No
 
 def _baselines(policy: Policy) -> dict[str, Policy]:
     """Return policies to compare with: the same declaration and command, with zero and random outputs."""
-    from urlab_client.integrations.policy import Policy  # noqa: PLC0415
+    from urlab_client.integrations.policy import Policy
 
     low, high = policy.spec.action.clip
     size = len(policy.spec.action.joints)
@@ -236,7 +234,7 @@ async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -
     if arguments is None or arguments.record is None:
         yield
         return
-    from urlab_client.integrations.record import record  # noqa: PLC0415
+    from urlab_client.integrations.record import record
 
     try:
         async with record(client, arguments.record, cameras=cameras(arguments.camera), overwrite=arguments.overwrite):
@@ -246,8 +244,8 @@ async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -
 
 
 def _print(runs: dict[str, PolicyRun]) -> None:
-    from rich import box  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
+    from rich import box
+    from rich.table import Table
 
     last = runs["policy"]
     table = Table(

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
     from urlab_client.server.transport.curve_authentication import CurveServer
 
-__all__ = ["add_parser", "run"]
-
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
 _SILENT_S = 10.0  # for a request for metrics
@@ -267,8 +265,8 @@ def run(arguments: ServeArguments) -> int:
         watch_input(events)
     import_mujoco()
     _check_paths(arguments)
-    from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
-    from urlab_client.server.system.temporary_folder import TemporaryFolder  # noqa: PLC0415
+    from urlab_client.server.system.allocator import limit_arenas
+    from urlab_client.server.system.temporary_folder import TemporaryFolder
 
     limit_arenas()
 
@@ -297,9 +295,9 @@ def run(arguments: ServeArguments) -> int:
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
-    from urlab_client.server.limits import Limits  # noqa: PLC0415
-    from urlab_client.server.physics.controllers import ControllerConfig  # noqa: PLC0415
-    from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
+    from urlab_client.server.limits import Limits
+    from urlab_client.server.physics.controllers import ControllerConfig
+    from urlab_client.server.simulated import SimulatedServer
 
     try:
         return SimulatedServer(
@@ -337,7 +335,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
-    from urlab_client.server.transport.curve_authentication import CurveServer  # noqa: PLC0415
+    from urlab_client.server.transport.curve_authentication import CurveServer
 
     if arguments.server_key is None:
         if arguments.allow_client or arguments.allow_any_client:
@@ -356,9 +354,9 @@ def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[in
     if arguments.metrics_port is None:
         yield None
         return
-    from prometheus_client import start_http_server  # noqa: PLC0415
+    from prometheus_client import start_http_server
 
-    from urlab_client.integrations.telemetry import PrometheusServerMetrics  # noqa: PLC0415
+    from urlab_client.integrations.telemetry import PrometheusServerMetrics
 
     PrometheusServerMetrics(server)
     try:
@@ -402,7 +400,7 @@ def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: 
 
 def _settle_ports(arguments: ServeArguments) -> None:
     """Fill in the ports that were not given: the plugin's defaults, or 0 to derive them from the instance index."""
-    from urlab_client.protocol.dialects import DIALECTS  # noqa: PLC0415
+    from urlab_client.protocol.dialects import DIALECTS
 
     defaults = {**_PORTS, "camera": DIALECTS[arguments.dialect].first_camera_port}
     if arguments.instance_index is not None:
@@ -422,7 +420,7 @@ def _check_ports(arguments: ServeArguments) -> None:
 
 
 def _check_paths(arguments: ServeArguments) -> None:
-    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 
     bundled = bundled_models()
     for model in arguments.models:

@@ -30,8 +30,6 @@ from urlab_client.protocol.names import did_you_mean
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient
 
-__all__ = ["add_parser", "run"]
-
 _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
@@ -155,9 +153,9 @@ def _check_mode(arguments: SnapshotArguments) -> None:
 
 
 def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
-    from urlab_client import URLabClient  # noqa: PLC0415
-    from urlab_client.server import SimulatedServer  # noqa: PLC0415
-    from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
+    from urlab_client import URLabClient
+    from urlab_client.server import SimulatedServer
+    from urlab_client.server.render.opengl import need_backend
 
     if arguments.handshake is not None:
         raise CommandError("--handshake is for the address of a running server")
@@ -194,7 +192,7 @@ def _simulate(client: URLabClient, duration: float) -> None:
 
 
 def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
-    from urlab_client import URLabClient  # noqa: PLC0415
+    from urlab_client import URLabClient
 
     if len(arguments.sources) > 1:
         raise CommandError("give one address or models, not both")
@@ -256,7 +254,7 @@ def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image
 
     kind = _FORMATS[path.suffix.lower()]
     picture = Image.fromarray(image)

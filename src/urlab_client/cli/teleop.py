@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder
     from urlab_client.integrations.teleop import TeleopCommand, TeleopTally, TeleopView
 
-__all__ = ["add_parser", "run"]
-
 _SHOWN_S = 0.1
 
 
@@ -126,12 +124,12 @@ def run(arguments: TeleopArguments) -> int:
         check_ending(arguments.output, ".mcap")
         if arguments.output.exists() and not arguments.overwrite:
             raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
-        import urlab_client.integrations.record  # noqa: PLC0415  # pyright: ignore[reportUnusedImport]  # fail early
+        import urlab_client.integrations.record  # pyright: ignore[reportUnusedImport]  # fail early
     elif arguments.camera or arguments.overwrite:
         raise CommandError("--camera and --overwrite require --record")
     if arguments.seed < 0:
         raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
-    import urlab_client.integrations.teleop  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+    import urlab_client.integrations.teleop  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
     task = None if arguments.task is None else _task(arguments.task)
     try:
@@ -147,10 +145,10 @@ def run(arguments: TeleopArguments) -> int:
 
 
 def _task(name: str) -> Task:
-    from urlab_client._extras import need  # noqa: PLC0415
+    from urlab_client._extras import need
 
     need("gymnasium", extra="gym")
-    from urlab_client.integrations.gym import TASKS  # noqa: PLC0415
+    from urlab_client.integrations.gym import TASKS
 
     if name not in TASKS:
         raise CommandError(f"{name!r} is not a task.{did_you_mean(name, TASKS)} There are: {', '.join(TASKS)}")
@@ -158,8 +156,8 @@ def _task(name: str) -> Task:
 
 
 async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Callable[[], str]) -> TeleopTally:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.integrations.teleop import HandControl, KeyboardOperator, TeleopCommand, teleoperate  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.teleop import HandControl, KeyboardOperator, TeleopCommand, teleoperate
 
     address = arguments.address
     if address is None:
@@ -205,7 +203,7 @@ async def _recorded(client: URLabClient, arguments: TeleopArguments) -> AsyncGen
     if arguments.output is None:
         yield None
         return
-    from urlab_client.integrations.record import record  # noqa: PLC0415
+    from urlab_client.integrations.record import record
 
     wanted = cameras(arguments.camera)
     async with record(
@@ -215,7 +213,7 @@ async def _recorded(client: URLabClient, arguments: TeleopArguments) -> AsyncGen
 
 
 def _print_keys() -> None:
-    from urlab_client.integrations.teleop.keyboard import HELP  # noqa: PLC0415
+    from urlab_client.integrations.teleop.keyboard import HELP
 
     for key, what in HELP:
         print(f"{key:>14}  {what}", flush=True)

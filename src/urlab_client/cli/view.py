@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
     from urlab_client.integrations.view import AsyncView
 
-__all__ = ["add_parser", "run"]
-
 _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
@@ -117,7 +115,7 @@ def run(arguments: ViewArguments) -> int:
     if arguments.where == "web":
         return console.run(_console_arguments(arguments))
     if arguments.where == "viewer":
-        from urlab_client.integrations.view.window import missing_for_window  # noqa: PLC0415
+        from urlab_client.integrations.view.window import missing_for_window
 
         missing = missing_for_window()
         if missing:
@@ -155,7 +153,7 @@ def _console_arguments(arguments: ViewArguments) -> PageArguments:
 
 
 async def _view(arguments: ViewArguments) -> None:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.aio import URLabClient
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
@@ -174,7 +172,7 @@ async def _view(arguments: ViewArguments) -> None:
 
 
 def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
-    from urlab_client.integrations.view import foxglove_view, rerun_view, window_view  # noqa: PLC0415
+    from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 
     chosen = cameras(arguments.camera)
     if arguments.where == "viewer":

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["Episode", "Job", "Policy", "RolloutError", "Setup", "seed_of"]
-
 Policy = Callable[[Any, np.random.Generator], Any]
 """`(observation, rng) -> action`, in the spaces of the environment: flat arrays, or dictionaries of arrays with
 `space_mode="dict"`. Each episode gets its own copy of the policy as it was sent.

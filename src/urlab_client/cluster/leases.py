@@ -12,8 +12,6 @@ from typing import Any, Final
 from urlab_client.protocol.errors import LeaseBusy, URLabError
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["Lease", "LeaseLost", "LeasePool"]
-
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 _REPLY_S: Final = 10.0
 _SERVER_LEASE_S: Final = 30.0  # without a request

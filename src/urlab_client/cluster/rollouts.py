@@ -19,8 +19,6 @@ from urlab_client.cluster.leases import LeasePool
 from urlab_client.cluster.worker_pool import WorkerPool
 from urlab_client.protocol.errors import URLabError, refused_for_good
 
-__all__ = ["Rollouts", "rollouts"]
-
 log: logging.Logger = logging.getLogger("urlab_client.cluster")
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from urlab_client._whole_files import replaced
 from urlab_client.cluster.episodes import Episode, seed_of
 
-__all__ = ["load_episodes", "missing_ids", "save_episode"]
-
 _ARRAYS: Final = ("observations", "actions", "rewards")
 _ABOUT: Final = "about"
 _DAMAGED: Final = (

@@ -16,8 +16,6 @@ from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
 from urlab_client.protocol.errors import refused_for_good
 
-__all__ = ["Worker", "run_episode"]
-
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 
 

@@ -11,8 +11,6 @@ from typing import Any, Self
 from urlab_client.cluster.worker import Worker
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["WorkerPool"]
-
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 
 

@@ -47,7 +47,7 @@ def variation_of(
         model: The client's model.
         layouts: Layouts of the articulations in the model, by key.
     """
-    from urlab_client.randomise.variation import Variation, declared_in  # noqa: PLC0415
+    from urlab_client.randomise.variation import Variation, declared_in
 
     declared = declared_in(model)
     if declared is None:

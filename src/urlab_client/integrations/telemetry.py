@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from urlab_client.server import ServedRequest, SimulatedServer
 
-__all__ = ["OpenTelemetryObserver", "PrometheusObserver", "PrometheusServerMetrics"]
-
 _SCOPE: Final = "urlab_client"
 _SYSTEM: Final = "urlab"
 _DURATIONS_S: Final = (
@@ -49,7 +47,7 @@ class OpenTelemetryObserver:
         self, *, tracer_provider: TracerProvider | None = None, meter_provider: MeterProvider | None = None
     ) -> None:
         need("opentelemetry", extra="opentelemetry")
-        from opentelemetry import metrics, trace  # noqa: PLC0415
+        from opentelemetry import metrics, trace
 
         self._trace = trace
         self._tracer = trace.get_tracer(_SCOPE, tracer_provider=tracer_provider)
@@ -130,7 +128,7 @@ class PrometheusObserver:
 
     def __init__(self, registry: CollectorRegistry | None = None) -> None:
         need("prometheus_client", extra="prometheus")
-        from prometheus_client import REGISTRY, Counter, Histogram  # noqa: PLC0415
+        from prometheus_client import REGISTRY, Counter, Histogram
 
         into = registry or REGISTRY
         prefix = "urlab_client"
@@ -174,7 +172,7 @@ class PrometheusServerMetrics:
 
     def __init__(self, server: SimulatedServer, registry: CollectorRegistry | None = None) -> None:
         need("prometheus_client", extra="prometheus")
-        from prometheus_client import REGISTRY, Counter, Gauge, Histogram  # noqa: PLC0415
+        from prometheus_client import REGISTRY, Counter, Gauge, Histogram
 
         into = registry or REGISTRY
         prefix = "urlab_server"

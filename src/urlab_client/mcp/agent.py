@@ -31,8 +31,6 @@ from urlab_client.web.ops import encode
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
-__all__ = ["Agent"]
-
 _INSTRUCTIONS = """\
 Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, joints, actuators, cameras,
 units and limits. Angles are in radians, lengths in metres, the z axis points up. In mode direct time passes only while

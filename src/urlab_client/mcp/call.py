@@ -21,8 +21,6 @@ from urlab_client.web.driving_lease import NotDriving, Viewer
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation
 
-__all__ = ["RESTARTED", "TAKEN_OVER", "Call", "Caller", "Limits", "Progress", "Stopped"]
-
 T = TypeVar("T")
 Progress = Callable[[float, float], Awaitable[None]]
 """Progress callback: simulation time passed, and its limit."""

@@ -17,8 +17,6 @@ from msgspec import Struct
 from urlab_client.mcp.results import Moment
 from urlab_client.protocol.schemas import prose, schemas
 
-__all__ = ["Declared", "Needs", "declared", "tool"]
-
 _Function = Callable[..., Awaitable[Any]]
 
 

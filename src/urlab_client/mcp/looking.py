@@ -13,8 +13,6 @@ from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.results import Contacts, Log, Picture, RobotState, World
 from urlab_client.protocol.client_types import Diagnosis
 
-__all__ = ["Robot"]
-
 Robot = Annotated[str, Meta(description="Name or actor id of a robot, as `look` lists it.")]
 
 

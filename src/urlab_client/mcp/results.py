@@ -8,8 +8,6 @@ from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.types import Contact
 from urlab_client.web.messages import LogEntry
 
-__all__ = ["Contacts", "Done", "Edited", "Log", "Moment", "Picture", "Recorded", "RobotState", "World"]
-
 
 class Moment(Struct):
     """Time of a result; every result also has these fields.

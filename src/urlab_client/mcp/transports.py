@@ -19,8 +19,6 @@ from urlab_client.mcp.agent import Agent
 from urlab_client.protocol.errors import URLabError
 from urlab_client.web.access import Access, Guarded
 
-__all__ = ["http_application", "serve_stdio"]
-
 _PATH = "/mcp"
 _CHUNK_BYTES = 65536
 

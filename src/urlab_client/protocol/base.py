@@ -18,32 +18,6 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "EDITOR_TIMEOUT_S",
-    "INT32_MAX",
-    "INT32_MIN",
-    "ActorId",
-    "ActorTarget",
-    "Color",
-    "ControlRequest",
-    "DialectName",
-    "Effect",
-    "EulerDeg",
-    "Floats",
-    "Int32",
-    "Needs",
-    "Op",
-    "Quat",
-    "QuatWXYZ",
-    "QuatXYZW",
-    "Reply",
-    "Request",
-    "RequiresPieRestart",
-    "TargetBy",
-    "Vec3",
-    "doc",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 """A vector of numbers on the wire; here an array of shape `(n,)`."""
 

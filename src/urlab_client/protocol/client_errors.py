@@ -4,25 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = [
-    "AuthenticationFailed",
-    "ClientClosed",
-    "ConcurrentReadError",
-    "ConnectionLost",
-    "ForkedError",
-    "NotSettled",
-    "OutcomeUnknown",
-    "PictureTimeout",
-    "ProtocolError",
-    "ReadOnlyClient",
-    "ServerUnreachable",
-    "StreamOverflow",
-    "URLabConnectionError",
-    "URLabError",
-    "URLabTimeoutError",
-    "URLabVersionMismatch",
-]
-
 
 def _rebuild(cls: type[URLabError], args: tuple[Any, ...], state: dict[str, Any]) -> URLabError:
     error = cls.__new__(cls)

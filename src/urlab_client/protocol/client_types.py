@@ -14,19 +14,6 @@ from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "STATE_PORT",
-    "CallOutcome",
-    "CallRecord",
-    "ClientConfig",
-    "DefaultPort",
-    "Diagnosis",
-    "Finding",
-    "Resync",
-    "ServerInfo",
-    "Verdict",
-]
-
 
 class Verdict(StrEnum):
     """Severity of a finding."""

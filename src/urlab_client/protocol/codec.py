@@ -29,22 +29,6 @@ from urlab_client.protocol.messages.jobs import OpStarted, OpStatusOk
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS
 
-__all__ = [
-    "MAX_REPLY_BYTES",
-    "MAX_REQUEST_BYTES",
-    "building",
-    "check_finite",
-    "check_request",
-    "decode_answer",
-    "decode_job",
-    "decode_reply",
-    "encode_message",
-    "encode_reply",
-    "encode_request",
-    "from_wire_array",
-    "op_of",
-]
-
 MAX_REQUEST_BYTES = 64 * 1024 * 1024
 MAX_REPLY_BYTES = 2 * 1024 * 1024 * 1024
 

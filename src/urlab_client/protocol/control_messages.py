@@ -12,16 +12,6 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.layouts import INT32, BytesLike, damaged, floats32, vector
 
-__all__ = [
-    "ActuatorInfo",
-    "CameraEndpoint",
-    "ControlPayload",
-    "JointGains",
-    "decode_gains",
-    "encode_gains",
-    "gains_by_parameter",
-]
-
 _BAD_JSON = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 _SETPOINT = np.dtype([("id", "<i4"), ("value", "<f4")])
 

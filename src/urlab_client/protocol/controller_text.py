@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 
 from urlab_client.protocol.enums import ControllerKind
 
-__all__ = ["CUSTOM_TEXT", "ControllerText"]
-
 CUSTOM_TEXT: Final = "urlab_controller"
 """Name of the custom text element that names a model's controller."""
 

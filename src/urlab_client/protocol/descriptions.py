@@ -9,20 +9,6 @@ from msgspec import Struct
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "ActuatorDescription",
-    "ArticulationDescription",
-    "CameraDescription",
-    "ControllerDescription",
-    "EntityDescription",
-    "JointDescription",
-    "JointKind",
-    "Pose",
-    "SceneDescription",
-    "SensorDescription",
-    "SetPointMeaning",
-]
-
 JointKind = Literal["free", "ball", "slide", "hinge"]
 """Kind of a joint: six degrees of freedom, three rotations, one translation, or one rotation."""
 

@@ -21,8 +21,6 @@ from urlab_client.protocol.messages.session import ForwardOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import dialect_ops
 
-__all__ = ["ALPHA", "BETA", "DIALECTS", "Dialect", "cleaned_name"]
-
 _NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
 
 

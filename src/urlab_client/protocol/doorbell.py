@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["CAMERA", "FILE", "MAX_PATH_BYTES", "REPLY", "REQUEST", "STATE", "WANT_CAMERAS", "WANT_STATE"]
-
 FILE: Final = "doorbell.sock"
 """Name of the socket in the session directory."""
 

@@ -10,21 +10,6 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, TypeVar
 
-__all__ = [
-    "LATER_MODE_NAMES",
-    "ActuatorType",
-    "CameraMode",
-    "CameraTiming",
-    "ControlMode",
-    "ControllerKind",
-    "ObservationLevel",
-    "OutOfRange",
-    "PIEState",
-    "StepMode",
-    "Transport",
-    "known",
-]
-
 E = TypeVar("E", bound=StrEnum)
 
 

@@ -170,7 +170,7 @@ class URLabRPCError(URLabError):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error as JSON-compatible data; in addition to the common fields, `details`."""
-        from urlab_client.protocol.serializable import plain  # noqa: PLC0415  # errors alone need no NumPy
+        from urlab_client.protocol.serializable import plain  # errors alone need no NumPy
 
         return {**super().to_dict(), "details": plain(self.details, "list")}
 

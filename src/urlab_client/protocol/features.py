@@ -17,8 +17,6 @@ from urlab_client.protocol.messages.control import ClaimControlOk
 from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = ["Features"]
-
 
 class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):
     """What a server can do.

@@ -13,8 +13,6 @@ from functools import cache
 
 from urlab_client.protocol.shm import Fence, no_fence
 
-__all__ = ["processor_fence"]
-
 _ORDERED = frozenset({"x86_64", "amd64", "i386", "i686", "x86"})
 _SEQ_CST = 5
 

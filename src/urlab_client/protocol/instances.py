@@ -18,16 +18,6 @@ import msgspec
 from urlab_client.protocol.base import doc
 from urlab_client.protocol.messages.session import InstanceInfo
 
-__all__ = [
-    "REWRITE_S",
-    "STALE_S",
-    "RegisteredInstance",
-    "decode",
-    "encode",
-    "import_directory",
-    "registry_directory",
-]
-
 REWRITE_S: Final = 10.0
 """Seconds after which a server renews its file."""
 

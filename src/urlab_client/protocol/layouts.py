@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from urlab_client.protocol.errors import ProtocolError
 
-__all__ = ["INT32", "BytesLike", "check_size", "damaged", "floats32", "vector"]
-
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 """A received frame; a memoryview must be one of bytes (format `B`)."""
 

@@ -11,18 +11,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
-__all__ = [
-    "WINDOWS_DEVICES",
-    "NameMap",
-    "UnknownName",
-    "compiled_names",
-    "did_you_mean",
-    "is_file_name",
-    "owner_of",
-    "split_prefix",
-    "unknown_name",
-]
-
 T = TypeVar("T")
 D = TypeVar("D")
 

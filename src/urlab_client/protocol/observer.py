@@ -8,8 +8,6 @@ from urlab_client.protocol.enums import CameraTiming
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
 
-__all__ = ["ClientObserver"]
-
 
 class ClientObserver:
     """Base class for observers of a client. Override the methods that you need, and pass it to `client.add_observer()`.

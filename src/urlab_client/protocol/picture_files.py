@@ -17,8 +17,6 @@ from urlab_client.protocol.pixels import Pixels, grey
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["JPEG_QUALITY", "encoded", "jpeg", "pillow_image", "png"]
-
 JPEG_QUALITY: Final = 85
 """Default quality of a JPEG, of 100."""
 
@@ -85,7 +83,7 @@ def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False)
         MissingExtra: Pillow is not installed.
     """
     need("PIL", extra="pillow")
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image
 
     height, width = pixels.shape[:2]
     channels = "RGB" if mode == CameraMode.REAL else "BGR"
@@ -96,7 +94,7 @@ def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False)
 def _in_place(pixels: Pixels) -> Image.Image:
     """Return a colour picture as a Pillow image that shares its memory. JPEG supports this; PNG does not."""
     need("PIL", extra="pillow")
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image
 
     height, width, channels = pixels.shape
     kind = "RGB" if channels == 3 else "RGBX"
@@ -105,7 +103,7 @@ def _in_place(pixels: Pixels) -> Image.Image:
 
 def _image(array: NDArray[Any]) -> Image.Image:
     need("PIL", extra="pillow")
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image
 
     return Image.fromarray(array)
 

@@ -7,8 +7,6 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PictureMemory"]
-
 # For a stream's reader: one picture in use, the stream's latest, and one being converted.
 _KEPT = 2
 

@@ -14,21 +14,6 @@ from urlab_client.protocol.layouts import BytesLike, damaged
 from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "CameraImage",
-    "PictureStamp",
-    "Pixels",
-    "camera_header",
-    "check_picture_size",
-    "decode_camera",
-    "encode_camera",
-    "grey",
-    "observed_pixels",
-    "picture_stamp",
-    "to_rgb",
-    "without_alpha",
-]
-
 Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
 _FRAME_MAGIC = 0x314D4355

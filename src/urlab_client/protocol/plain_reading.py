@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.names import did_you_mean
 
-__all__ = ["kinds_of", "read", "read_array", "read_bytes"]
-
 
 def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for each kind of type
     """Create a value of a type from plain data.

@@ -19,8 +19,6 @@ from urlab_client.protocol.plain_reading import kinds_of, read_array, read_bytes
 from urlab_client.protocol.schemas import field_notes, prose
 from urlab_client.protocol.serializable import plain
 
-__all__ = ["core_schema", "json_schema"]
-
 Schema = dict[str, Any]
 
 _UNDER_WAY: ContextVar[frozenset[str]] = ContextVar("structs that are being described")

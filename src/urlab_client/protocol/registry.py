@@ -24,8 +24,6 @@ from urlab_client.protocol.messages import (
     viewport,
 )
 
-__all__ = ["ENVELOPE_ERRORS", "OPS", "dialect_ops", "registry"]
-
 ENVELOPE_ERRORS = (
     "not_ready",
     "wrong_transport",

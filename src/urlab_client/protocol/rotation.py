@@ -15,17 +15,6 @@ from typing import Final
 
 from urlab_client.protocol.base import Quat, Vec3
 
-__all__ = [
-    "IDENTITY",
-    "euler_to_quat",
-    "normalized",
-    "quat_to_euler",
-    "rotate",
-    "swap_frame",
-    "wxyz",
-    "xyzw",
-]
-
 IDENTITY: Final[Quat] = (0.0, 0.0, 0.0, 1.0)
 
 _UNIT: Final = 1e-14

@@ -21,8 +21,6 @@ from urlab_client.protocol.layouts import INT32, BytesLike, check_size, damaged,
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.topics import SCENE_SIZES, StreamTopic, TopicKind
 
-__all__ = ["ActionsRow", "BaseStateRow", "JointRow", "Row", "SceneRow", "SensorRow", "TwistRow", "decode_row"]
-
 _JOINT = Layout("<ifff")
 _SENSOR = Layout("<ii")
 _TWIST = Layout("<fff")

@@ -10,20 +10,6 @@ from msgspec import Struct
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "ActorBounds",
-    "ActorHierarchyNode",
-    "ActorInfo",
-    "BlueprintInfo",
-    "SceneActor",
-    "SceneSnapshot",
-    "URLabAsset",
-    "URLabBlueprint",
-    "URLabLightHandle",
-    "URLabSpawnHandle",
-]
-
-
 A_co = TypeVar("A_co", covariant=True)
 
 
@@ -31,7 +17,9 @@ class HasArticulations(Protocol[A_co]):
     """A client of either flavour."""
 
     @property
-    def articulations_by_id(self) -> Mapping[str, A_co]: ...
+    def articulations_by_id(self) -> Mapping[str, A_co]:
+        """Articulations by id."""
+        ...
 
 
 class URLabAsset(Serializable, Struct):

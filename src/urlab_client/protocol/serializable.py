@@ -20,8 +20,6 @@ from msgspec import Struct
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["ArrayForm", "Serializable", "plain"]
-
 ArrayForm: TypeAlias = Literal["list", "base64"]
 """Form of arrays in plain data: lists, nested by dimension, or `{"dtype": …, "shape": […], "base64": …}`."""
 
@@ -59,7 +57,7 @@ class Serializable:
         Raises:
             ValueError: A field is missing, unknown or of the wrong type; the message names it.
         """
-        from urlab_client.protocol.plain_reading import read  # noqa: PLC0415  # which few programs need
+        from urlab_client.protocol.plain_reading import read  # which few programs need
 
         return cast("Self", read(cls, data, cls.__name__))
 
@@ -87,13 +85,13 @@ class Serializable:
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
         # Only pydantic calls this. The code below builds plain dictionaries and does not import pydantic.
-        from urlab_client.protocol.pydantic_schema import core_schema  # noqa: PLC0415
+        from urlab_client.protocol.pydantic_schema import core_schema
 
         return core_schema(cast("type[Struct]", cls), handler)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
-        from urlab_client.protocol.pydantic_schema import json_schema  # noqa: PLC0415
+        from urlab_client.protocol.pydantic_schema import json_schema
 
         return json_schema(cast("type[Struct]", cls), schema, handler)
 

@@ -31,35 +31,6 @@ from msgspec import Struct
 
 from urlab_client.protocol.errors import ProtocolError
 
-__all__ = [
-    "HEADER_SIZE",
-    "LAYOUT_SIZE",
-    "LIVE_DIRECTORY",
-    "MAGIC",
-    "MAX_BUFFERS",
-    "REPLY_FILE",
-    "REQUEST_FILE",
-    "RPC_STRIDE",
-    "SIZE_PREFIX",
-    "STATE_FILE",
-    "VERSION",
-    "Fence",
-    "Header",
-    "Publication",
-    "Region",
-    "RegionNotReady",
-    "attach",
-    "camera_file",
-    "camera_stride",
-    "create",
-    "no_fence",
-    "parse_header",
-    "region_directories",
-    "region_size",
-    "safe_name",
-    "state_stride",
-]
-
 MAGIC = 0x424C5255
 VERSION = 1
 HEADER_SIZE = 64

@@ -13,8 +13,6 @@ from msgspec.structs import replace
 
 from urlab_client.protocol.types import SimOptions
 
-__all__ = ["ITERATIONS", "RANGED_OPTIONS", "check_sim_options", "in_small_letters", "option_problem"]
-
 _POSITIVE: Final = ("timestep", "impratio")
 _NOT_NEGATIVE: Final = (
     "density",

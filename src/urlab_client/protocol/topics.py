@@ -11,17 +11,6 @@ from msgspec import Struct
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.layouts import BytesLike
 
-__all__ = [
-    "SCENE_SIZES",
-    "STATE_FULL",
-    "StreamTopic",
-    "TopicKind",
-    "articulation_filter",
-    "camera_filter",
-    "resolve_endpoint",
-    "scene_filter",
-]
-
 
 class TopicKind(StrEnum):
     """What a topic carries; the value is the topic's fixed part."""

@@ -10,23 +10,6 @@ from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "CameraPose",
-    "Contact",
-    "ContactsResult",
-    "JobStatus",
-    "KeyframeInfo",
-    "MocapPose",
-    "PIEStartResult",
-    "PIEStatus",
-    "RecordingHandle",
-    "RecordingSummary",
-    "ReplaySession",
-    "ReplayStatus",
-    "SimOptions",
-    "UploadProgress",
-]
-
 
 class PIEStartResult(Serializable, Struct):
     """How `sim.start()` ended.

@@ -13,24 +13,6 @@ from msgspec import Struct
 
 from urlab_client.protocol.errors import URLabError
 
-__all__ = [
-    "MODEL_TEXT",
-    "MODEST",
-    "QUANTITIES",
-    "CameraLatency",
-    "Delay",
-    "Field",
-    "Noise",
-    "Push",
-    "Quantity",
-    "Randomisation",
-    "Range",
-    "UnsupportedRandomisation",
-    "Vary",
-    "Vector",
-    "steps_range",
-]
-
 MODEL_TEXT: Final = "urlab_randomise"
 """Name of the custom text element of a server's compiled model that contains its declaration as JSON."""
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Vary
 
-__all__ = ["FIELDS", "START", "Elements", "elements_of", "write"]
-
 Ints = NDArray[np.intp]
 Fields = Callable[[str], NDArray[Any]]
 """Returns the array of a model's field, to be written in place; options are called `opt.NAME`."""

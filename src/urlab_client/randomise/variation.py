@@ -15,8 +15,6 @@ from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation, Range, Vary
 from urlab_client.randomise.quantities import DERIVED_FROM, FIELDS, START, Elements, Fields, elements_of, write
 
-__all__ = ["EpisodeDraws", "Variation", "declared_in", "draw_range", "field_of", "model_text", "stream"]
-
 MODEL_STREAM: Final = 0
 """First part of the seed of the random streams for `Vary`; other parts of a declaration use other values."""
 

@@ -17,8 +17,6 @@ from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.transport.curve_authentication import CurveServer
 
-__all__ = ["ServerConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ServerConfig:

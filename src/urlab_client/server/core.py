@@ -43,8 +43,6 @@ from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
 
-__all__ = ["ServerCore"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)

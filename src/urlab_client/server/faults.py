@@ -23,20 +23,6 @@ import zmq
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.transport.endpoint import RpcEndpoint
 
-__all__ = [
-    "ActiveFault",
-    "Corrupt",
-    "Cut",
-    "Delay",
-    "Drop",
-    "Fault",
-    "Faults",
-    "FaultyEndpoint",
-    "Injector",
-    "Loss",
-    "Refuse",
-]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _KINDS: Final = "a Delay, Drop, Cut, Corrupt or Refuse"

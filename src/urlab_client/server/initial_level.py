@@ -10,8 +10,6 @@ from urlab_client.protocol.errors import URLabError
 from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.editor.world import EditorWorld
 
-__all__ = ["ModelError", "is_level", "populate"]
-
 GAP_M: Final = 1.0
 """Free space between the models placed side by side, metres."""
 

@@ -10,8 +10,6 @@ from typing import Any
 
 from urlab_client.protocol import sim_options
 
-__all__ = ["Limits", "option_problem", "options_problem"]
-
 _MIB = 2**20
 
 

@@ -45,8 +45,6 @@ from urlab_client.server.transport.curve_authentication import CurveKeys, Unprot
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
 
-__all__ = ["OpenServer", "open_server"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 

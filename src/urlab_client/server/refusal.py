@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CompileFailed", "Refusal"]
-
 
 class Refusal(Exception):
     """A request cannot be served; the dispatcher turns this into an error reply.

@@ -14,8 +14,6 @@ from collections.abc import Callable
 from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["DriverLease", "ServerSession"]
-
 
 class ServerSession:
     """State that the server keeps between requests, apart from the world.

@@ -35,8 +35,6 @@ from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
 
-__all__ = ["SimulatedServer"]
-
 _FIRST_PORT: Final = 5559
 _PORTS_EACH: Final = 10
 _LAST_INDEX: Final = 5000

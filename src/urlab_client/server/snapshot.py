@@ -18,8 +18,6 @@ from urlab_client.server.render.opengl import RenderingUnavailable, need_backend
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.rpc.dispatch import Dispatcher
 
-__all__ = ["LARGEST_PIXELS", "take_snapshot"]
-
 LARGEST_PIXELS: Final = 16384
 """Longest side in pixels, the maximum of common drivers."""
 

@@ -17,8 +17,6 @@ from collections.abc import Callable, Mapping
 from contextvars import Context
 from typing import Any, TypeVarTuple
 
-__all__ = ["CallerLoop"]
-
 Ts = TypeVarTuple("Ts")
 
 # Consecutive rounds of callbacks after which sockets are polled even if more callbacks are ready.

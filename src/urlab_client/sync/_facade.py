@@ -13,8 +13,6 @@ from typing import Any, Protocol, TypeVar, cast, overload
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._portal import Portal
 
-__all__ = ["Facade", "FacadeRoot", "aio_of", "portal_of", "wrap"]
-
 A_co = TypeVar("A_co", covariant=True)
 F = TypeVar("F", bound="Facade")
 

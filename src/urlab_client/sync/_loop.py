@@ -34,8 +34,6 @@ from urlab_client.protocol.errors import ClientClosed, URLabError
 from urlab_client.sync._caller_loop import CallerLoop
 from urlab_client.sync._signals import DeferredSignals
 
-__all__ = ["GRACE", "CallerDrivenLoop", "Job", "client_closed"]
-
 T = TypeVar("T")
 
 GRACE = 1.0

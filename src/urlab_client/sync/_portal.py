@@ -15,8 +15,6 @@ from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, 
 from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed
 from urlab_client.sync._signals import DeferredSignals
 
-__all__ = ["Portal"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 A = TypeVar("A")

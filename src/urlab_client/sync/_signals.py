@@ -12,8 +12,6 @@ from operator import itemgetter
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-__all__ = ["DeferredSignals"]
-
 _SIGNALS = sorted(int(number) for number in signal.valid_signals())
 # The module behind `signal`, whose own functions convert all values to enumerations and take ten times as long.
 _signal: Any = importlib.import_module("_signal")

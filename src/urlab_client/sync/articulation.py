@@ -19,8 +19,6 @@ from urlab_client.sync._facade import Facade
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.controllers import URLabController
 
-__all__ = ["URLabArticulation", "URLabEntity"]
-
 
 class URLabEntity(Facade, twin=aio.URLabEntity):
     """A dynamic body, or the root of an articulation.

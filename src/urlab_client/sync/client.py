@@ -29,8 +29,6 @@ from urlab_client.sync.namespaces.scene import SceneNamespace
 from urlab_client.sync.namespaces.sim import SimNamespace
 from urlab_client.sync.streams import Stream
 
-__all__ = ["URLabClient"]
-
 R = TypeVar("R", bound=Reply)
 
 

@@ -22,8 +22,6 @@ from urlab_client.sync.cameras import URLabCameraView
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
-__all__ = ["ClientState"]
-
 
 class ClientState(Facade, twin=aio.ClientState):
     """The attributes of a client. Reading them sends nothing and does not block."""

@@ -12,8 +12,6 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.sync._facade import Facade
 
-__all__ = ["URLabController", "URLabPDController"]
-
 
 class URLabController(Facade, twin=aio.URLabController):
     """The controller attached to an articulation."""

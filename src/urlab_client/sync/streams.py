@@ -12,8 +12,6 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.protocol.messages.streams import StreamItem, StreamStats
 from urlab_client.sync._facade import Facade
 
-__all__ = ["Stream"]
-
 T = TypeVar("T", bound=StreamItem)
 
 

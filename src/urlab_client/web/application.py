@@ -480,7 +480,7 @@ def _error(status: int, code: str, message: str, hint: str = "") -> Response:
 
 def showing(registry: CollectorRegistry) -> Callable[[Request], Response]:
     """Return a handler that serves the metrics of a registry in the requested format."""
-    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
+    from prometheus_client.exposition import choose_encoder
 
     def show(request: Request) -> Response:
         encode_all, media_type = choose_encoder(request.headers.get("accept", ""))

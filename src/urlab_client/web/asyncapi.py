@@ -25,8 +25,6 @@ from urlab_client.web.messages import (
 )
 from urlab_client.web.ops import encode
 
-__all__ = ["asyncapi"]
-
 _TOLD: tuple[type[Struct], ...] = (You, World, State, Status, Log, Refused, Pong)
 _SAID: tuple[type[Struct], ...] = (Ack, Ctrl, Ping, Name)
 _PICTURE = {

@@ -22,8 +22,6 @@ from urlab_client.web.replay import Replay
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
-__all__ = ["BodyList", "BodyPushing", "BodyView", "Pick", "Picked", "Push"]
-
 _HELD_S = 0.6
 _VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 
@@ -117,7 +115,7 @@ class BodyPushing:
         Raises:
             ValueError: The ray has no direction or is not finite, or no model or state has arrived.
         """
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         shown = await self._now()
         origin, direction = np.array(ray.origin, np.float64), np.array(ray.direction, np.float64)
@@ -166,7 +164,7 @@ class BodyPushing:
 
     def apply(self) -> None:
         """Add the force of the push to the next step of direct mode."""
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         viewer = self._console.mujoco_viewer
         if self._push is None or time.monotonic() > self._until or (shown := viewer.latest()) is None:

@@ -13,8 +13,6 @@ from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import Handler
 
-__all__ = ["BodyRoutes"]
-
 
 class BodyRoutes:
     """Handlers of `/api/bodies`, `/api/pick` and `/api/push`.

@@ -48,8 +48,6 @@ from urlab_client.web.replay import Replay
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["Audience", "ConsoleSession"]
-
 log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _PERIOD_S = 1 / 60

@@ -27,8 +27,6 @@ from urlab_client.web.ops import encode, perform
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
-__all__ = ["Console", "Controls"]
-
 _PERIOD_S = 1 / 60
 
 

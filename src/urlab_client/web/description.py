@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from urlab_client.aio import Actuator, URLabArticulation, URLabCameraView, URLabClient
 
-__all__ = ["WorldDescription", "describe"]
-
 
 class ActuatorView(Struct):
     """One actuator; `index` is its place in `ctrl`.

@@ -10,8 +10,6 @@ import anyio
 
 from urlab_client.aio.background import background_task
 
-__all__ = ["DrivingLease", "NotDriving", "Viewer"]
-
 _LOOK_S = 0.1
 
 

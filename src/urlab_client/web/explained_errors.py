@@ -13,8 +13,6 @@ from urlab_client.protocol.errors import (
 )
 from urlab_client.web.driving_lease import NotDriving
 
-__all__ = ["explain_error"]
-
 
 def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:
     """Return the HTTP status and the description of an error."""

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.teleop import HandControl
     from urlab_client.web.controls import Controls
 
-__all__ = ["HandDriving"]
-
 _PERIOD_S = 0.02
 _LASTS_S = 0.25
 _FAR_M = 0.15  # from the target: something else has moved the hand
@@ -122,7 +120,7 @@ class HandDriving:
         hand = self._hands.get(f"{key}/{site}")
         if hand is None:
             try:
-                from urlab_client.integrations.teleop import HandControl  # noqa: PLC0415
+                from urlab_client.integrations.teleop import HandControl
 
                 self._console.controls.set_points(viewer, {key: {}})  # before it holds the joints: holds the others
                 hand = self._hands[f"{key}/{site}"] = HandControl(client, key, site=site or None)

@@ -31,8 +31,6 @@ from urlab_client.web.stoppable import stoppable
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
 
-__all__ = ["ModelRoutes", "WouldReplace", "import_model", "received_model"]
-
 _LARGEST_FILE = 256 << 20
 _NAME_CHARACTERS: Final = 64
 _PREFIX: Final = "urlab-model-"

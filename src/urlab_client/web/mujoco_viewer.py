@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from urlab_client.aio import URLabClient
 
-__all__ = ["LAYOUT", "SHOWN", "SPECTATOR", "TAKEN", "Files", "MujocoViewer", "Shown", "files"]
-
 SPECTATOR = "viewers=1;role=spectator;queue_pos=0;queue_len=0;max_spectators=0"
 """Tells a page that it watches."""
 
@@ -130,7 +128,7 @@ class MujocoViewer:
     def missing(self) -> str:
         """The reason why there is no view; empty if there is one."""
         if files() is None:
-            import mujoco  # noqa: PLC0415
+            import mujoco
 
             return f"MuJoCo {mujoco.__version__} has no web viewer here. Wheels for Linux and macOS have one since 4.0."
         return self.no_model
@@ -161,7 +159,7 @@ class MujocoViewer:
 
     def latest(self) -> Shown | None:
         """Return the model with the newest state in its data and bodies placed; None without one of them."""
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         shown, snapshot = self._shown, self._snapshot
         if shown is None or snapshot is None or shown.model is not self._client.model:
@@ -201,7 +199,7 @@ class MujocoViewer:
                 data.qpos[entity.qpos_offset : entity.qpos_offset + 7] = pose.qpos
 
     def _write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         self._place(shown, snapshot)
         return _serialize(
@@ -214,7 +212,7 @@ class MujocoViewer:
 
 
 def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     viewed = files() is not None
     bundle: bytes = _payload().serialize_model_bundle(model) if viewed else b""
@@ -235,7 +233,7 @@ def _serialize(
     flags: list[int],
     crc: int = 0,
 ) -> bytes:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     what = int(mujoco.mjtState.mjSTATE_INTEGRATION)
     state = np.empty(mujoco.mj_stateSize(model, what))
@@ -255,7 +253,7 @@ def _layout(model: mujoco.MjModel) -> str:
 
     MuJoCo does not document the format. It is found by writing values that occur nowhere else.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     data = mujoco.MjData(model)
     places: dict[str, Any] = {"fovy": float(model.vis.global_.fovy)}

@@ -33,8 +33,6 @@ from urlab_client.protocol.schemas import schemas
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient, URLabController
 
-__all__ = ["encode", "openapi", "parse", "perform", "served"]
-
 _UNSERVED = frozenset({Hello})  # the application holds the session
 
 # Without the handshake, which belongs to the application as well.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient
     from urlab_client.integrations.record.pictures import RecordedPicture
 
-__all__ = ["EncodedPicture", "Feed", "PictureRecording"]
-
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
 _CAPTURE_S = 5.0

@@ -15,8 +15,6 @@ from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import Handler, RouteGroup
 
-__all__ = ["ReadingRoutes"]
-
 _FLOWING_S = 5.0
 _ALIVE_S = 15.0
 """How long an event stream may be silent, seconds: proxies close connections that are silent for longer."""

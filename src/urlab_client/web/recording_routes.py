@@ -19,8 +19,6 @@ from urlab_client.web.messages import state_message
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import JOB, Handler, RouteGroup
 
-__all__ = ["RecordingRoutes"]
-
 _T = TypeVar("_T")
 
 

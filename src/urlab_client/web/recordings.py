@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record.reader import Run
     from urlab_client.integrations.record.recorder import AsyncRecorder
 
-__all__ = ["KINDS", "Conversion", "RecordingView", "Recordings", "RunningRecording"]
-
 KINDS = ("csv", "mp4", "npz")
 """What a recording is converted to for download, besides what it is."""
 
@@ -113,7 +111,7 @@ class Recordings:
         """
         if self._task is not None:
             raise ValueError("a recording runs already: stop it first")
-        from urlab_client.integrations.record import record  # noqa: PLC0415
+        from urlab_client.integrations.record import record
 
         if not self._client.manager_present:
             raise URLabError("There is nothing to record.", hint="Begin play first.")
@@ -302,7 +300,7 @@ def open_run(file: Path) -> Run:
     Raises:
         URLabError: The file is not a recording.
     """
-    from urlab_client.integrations.record import read_run  # noqa: PLC0415
+    from urlab_client.integrations.record import read_run
 
     return read_run(file)
 
@@ -332,7 +330,7 @@ def _unavailable() -> dict[str, str]:
 
 
 def _convert(file: Path, target: Path, kind: str, camera: str, progress: Progress) -> None:
-    from urlab_client.integrations.record import export  # noqa: PLC0415
+    from urlab_client.integrations.record import export
 
     run = open_run(file)
     try:

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-__all__ = ["Replay", "ReplayView"]
-
 _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
 _OF_SCENE = "-/"

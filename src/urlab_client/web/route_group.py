@@ -11,8 +11,6 @@ from starlette.responses import Response
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import Viewer
 
-__all__ = ["JOB", "Handler", "RouteGroup"]
-
 JOB = "urlab_job"
 """Key in the scope of a long request: its description, for the warning if the server ends meanwhile."""
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from urlab_client.aio import URLabClient
 
-__all__ = ["apps"]
-
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _TAKEN = frozenset({"api", "metrics"})
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">

@@ -9,8 +9,6 @@ from typing import TypeAlias, TypeVar
 
 import anyio.to_thread
 
-__all__ = ["Progress", "stoppable"]
-
 Progress: TypeAlias = Callable[[int], None]
 
 _T = TypeVar("_T")

@@ -21,8 +21,6 @@ from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 
-__all__ = ["CameraSource", "HasCamera"]
-
 FIRST_PICTURE_S = 30.0
 """Seconds that a server may take for its first picture, because it initialises OpenGL first."""
 

@@ -21,8 +21,6 @@ from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraStreaming, CameraTransports, SetCameraStreaming
 from urlab_client.protocol.messages.session import CameraInfo
 
-__all__ = ["CameraSwitch"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OFF_S = 1.0

@@ -18,8 +18,6 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, Row, SceneRow, SensorRow, TwistRow
 from urlab_client.protocol.topics import StreamTopic, TopicKind
 
-__all__ = ["DerivedRowSource", "HasRows"]
-
 _FREE = 0  # mjJNT_FREE
 
 

@@ -28,8 +28,6 @@ from urlab_client.protocol.messages.streams import (
 )
 from urlab_client.protocol.names import did_you_mean
 
-__all__ = ["EventBus"]
-
 _Event = (
     ServerConnected
     | ServerLost

@@ -17,8 +17,6 @@ from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.pixels import Pixels
 
-__all__ = ["LatestPicture", "LiveState", "LiveStats"]
-
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 _RETRY_S = 0.002

@@ -24,8 +24,6 @@ from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.topics import TopicKind
 
-__all__ = ["Publishers", "SharedFrame"]
-
 
 class SharedFrame:
     """A zero-copy view of the newest picture of a camera in the server's shared memory.

@@ -16,8 +16,6 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
 
-__all__ = ["RowSource"]
-
 _OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
 _OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
 _OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKind.QVEL})

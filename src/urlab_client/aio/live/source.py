@@ -10,8 +10,6 @@ from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, 
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.layouts import BytesLike
 
-__all__ = ["PublishedSource"]
-
 
 class PublishedSource(ABC):
     """A `Source` of published messages; see `urlab_client.aio.streams`.

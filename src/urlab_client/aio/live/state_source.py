@@ -18,9 +18,6 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.protocol.shm import STATE_FILE
 from urlab_client.protocol.topics import STATE_FULL
 
-__all__ = ["OwnSteps", "StateSource"]
-
-
 _ONLY_OWN = (
     "This server publishes state only in live mode: call client.runtime.set_mode('live'). In the other modes, "
     "snapshots come only from this client's own steps."

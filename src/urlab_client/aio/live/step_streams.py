@@ -22,8 +22,6 @@ from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.protocol.messages.streams import StreamPolicy
 from urlab_client.protocol.pixels import PictureStamp, picture_stamp
 
-__all__ = ["StepStreams"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OPENING_S: Final = 2.0

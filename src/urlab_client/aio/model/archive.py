@@ -15,8 +15,6 @@ from typing import Final
 from urlab_client.protocol.messages.uploads import MAX_ASSETS
 from urlab_client.protocol.names import is_file_name
 
-__all__ = ["unpacked"]
-
 _MAX_BYTES: Final = 1 << 30
 _MAX_PATH_BYTES: Final = 1000
 _CHUNK_BYTES: Final = 1 << 20

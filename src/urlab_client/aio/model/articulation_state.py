@@ -29,8 +29,6 @@ from urlab_client.protocol.messages.session import (
     TwistState,
 )
 
-__all__ = ["Carried", "MirroredArticulation", "MirroredEntity", "SetPoints", "Wrenches", "give_back"]
-
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
 

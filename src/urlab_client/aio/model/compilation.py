@@ -29,8 +29,6 @@ from urlab_client._mjcf_files import NamedFiles, named_files
 from urlab_client.aio.model.archive import unpacked
 from urlab_client.aio.model.upload import FlatModel, flatten
 
-__all__ = ["compile_confined", "flatten_confined"]
-
 log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
 _MEMORY_BYTES: Final = 2 * 2**30
@@ -162,8 +160,8 @@ def _main(folder: str) -> None:
 
 
 def _compile(job: _CompileJob, folder: str) -> bytes:
-    import mujoco  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
+    import mujoco
+    import numpy as np
 
     os.chdir(folder)  # empty, and deleted together with MuJoCo's log
     limit_process(job.memory_bytes, job.cpu_s)

@@ -28,8 +28,6 @@ from urlab_client.protocol.names import NameMap
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Actuator", "ArticulationElements", "Body", "Joint", "Sensor", "make_elements"]
-
 _UNSPECIFIC = {"motor", "general"}  # what servers report for a `<general>`
 
 

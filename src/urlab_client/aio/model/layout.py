@@ -16,16 +16,6 @@ from urlab_client.protocol.names import split_prefix
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = [
-    "FREE",
-    "JOINT_TRANSMISSIONS",
-    "QPOS_WIDTH",
-    "QVEL_WIDTH",
-    "ArticulationLayout",
-    "Ints",
-    "articulation_layouts",
-]
-
 FREE = 0  # mjJNT_FREE
 JOINT_TRANSMISSIONS = (0, 1)  # mjTRN_JOINT, mjTRN_JOINTINPARENT
 QPOS_WIDTH = np.array([7, 4, 1, 1])  # by mjtJoint: free, ball, slide, hinge

@@ -24,8 +24,6 @@ from urlab_client.protocol.types import SimOptions
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Loaded", "Mirror", "model_names", "write_options"]
-
 log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
 _CHOICES = {
@@ -55,7 +53,7 @@ def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
 
 def binary_model(model: mujoco.MjModel) -> bytes:
     """Return a model in MuJoCo's binary format."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -65,7 +63,7 @@ def binary_model(model: mujoco.MjModel) -> bytes:
 @cache
 def _mjb_header() -> bytes:
     """Return the header of every model saved by this MuJoCo: magic, number size, layout and version."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     return binary_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
 
@@ -78,7 +76,7 @@ def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
     Raises:
         ValueError: An integrator, cone or solver is unknown.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     values: dict[str, Any] = {}
     for name in SimOptions.__struct_fields__:
@@ -97,7 +95,7 @@ def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
 
 def _choice(name: str, value: str) -> int:
     """Return the number of an integrator, cone or solver. The wire carries the number of one without a name."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     enum, prefix = _CHOICES[name]
     members = getattr(mujoco, enum).__members__
@@ -109,19 +107,19 @@ def _choice(name: str, value: str) -> int:
 
 
 def _from_binary(mjb: bytes) -> mujoco.MjModel:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": mjb})
 
 
 def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco.MjModel:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     if trusted:
         model = mujoco.MjModel.from_xml_string(xml, dict(assets))
         forget_last_document()
         return model
-    from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - also run as a program
+    from urlab_client.aio.model.compilation import compile_confined  # also run as a program
 
     try:
         return _from_binary(compile_confined(xml, assets))
@@ -169,7 +167,7 @@ class Mirror:
 
         Development builds with different models share version numbers, so this also compares the model's header.
         """
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         client = mujoco.mj_versionString()
         same = hello.mujoco_version == client and hello.mujoco_version_int == mujoco.mj_version()
@@ -188,7 +186,7 @@ class Mirror:
         Raises:
             ProtocolError: This MuJoCo cannot load the model.
         """
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         mismatch = cls.check_version(hello)
         try:
@@ -236,7 +234,7 @@ class Mirror:
             keep: Whether to keep the state; `holds` must have been true.
         """
         if keep and loaded is not None and self.model is not None and self.data is not None:
-            import mujoco  # noqa: PLC0415
+            import mujoco
 
             kept = mujoco.mjtState.mjSTATE_INTEGRATION
             state = np.empty(mujoco.mj_stateSize(self.model, kept))
@@ -250,7 +248,7 @@ class Mirror:
         """Return whether a loaded model has the same elements as the present one, so that its state fits."""
         if loaded is None or self.model is None:
             return loaded is None and self.model is None
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         before, after = self.model, loaded.model
         whole = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -268,7 +266,7 @@ class Mirror:
         """
         if self.model is None or self.data is None:
             return
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         key = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_KEY, keyframe) if keyframe else -1
         if key >= 0:
@@ -320,7 +318,7 @@ class Mirror:
         if self.model is None or self.data is None:
             return None
         if self._stale:
-            import mujoco  # noqa: PLC0415
+            import mujoco
 
             mujoco.mj_kinematics(self.model, self.data)
             mujoco.mj_comPos(self.model, self.data)
@@ -335,7 +333,7 @@ class Mirror:
             pair = self.derived()
             if pair is None:
                 return None
-            import mujoco  # noqa: PLC0415
+            import mujoco
 
             velocity = np.zeros(6)
             mujoco.mj_objectVelocity(*pair, mujoco.mjtObj.mjOBJ_XBODY, body_id, velocity, 0)

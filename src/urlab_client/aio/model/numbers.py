@@ -10,8 +10,6 @@ import numpy as np
 
 from urlab_client.protocol.base import Floats
 
-__all__ = ["finite", "finite_array", "first_not_finite", "is_array"]
-
 
 def is_array(value: object) -> TypeGuard[Iterable[float]]:
     """Return whether a value holds several numbers: a sequence or an array of any library."""

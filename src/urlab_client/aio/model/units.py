@@ -10,8 +10,6 @@ from urlab_client.protocol.descriptions import JointKind, SetPointMeaning
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["JOINT_KINDS", "driven_joint", "joint_unit", "sensor_kind", "sensor_unit", "set_point_meaning"]
-
 JOINT_KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # by mjtJoint
 
 _JOINT_UNITS = {"slide": "m", "hinge": "rad"}
@@ -77,7 +75,7 @@ def set_point_meaning(model: mujoco.MjModel, actuator: int) -> tuple[SetPointMea
 
     An actuator with affine bias is a position or velocity servo. One without bias turns the set-point into a force.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     joint = driven_joint(model, actuator)
     kind = None if joint is None else JOINT_KINDS[int(model.jnt_type[joint])]
@@ -107,7 +105,7 @@ def driven_joint(model: mujoco.MjModel, actuator: int) -> int | None:
 
 
 def _sensor(model: mujoco.MjModel, sensor: int) -> str:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     return mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
 

@@ -33,8 +33,6 @@ from urlab_client.protocol.types import UploadProgress
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["FlatModel", "OnUpload", "flatten", "upload"]
-
 R = TypeVar("R", bound=Reply)
 
 OnUpload = Callable[[UploadProgress], object]
@@ -82,9 +80,9 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
         FileNotFoundError: The file does not exist.
         ValueError: MuJoCo rejects the model, or it is larger than servers accept.
     """
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
-    from urlab_client._mujoco import flat_model  # noqa: PLC0415
+    from urlab_client._mujoco import flat_model
 
     given = cast("Any", model)
     if not isinstance(model, (str, os.PathLike, mujoco.MjSpec)):

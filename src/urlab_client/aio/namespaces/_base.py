@@ -13,8 +13,6 @@ from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Quat, Reply, Request, Vec3
 
-__all__ = ["Namespace", "Vector", "as_quat", "as_vec3", "fill", "target_by"]
-
 R = TypeVar("R", bound=Reply)
 S = TypeVar("S", bound=Struct)
 

@@ -12,8 +12,6 @@ from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
-__all__ = ["Playing", "SceneEdit"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 

@@ -7,8 +7,6 @@ from urlab_client.aio.namespaces._ops import OutlinerOps
 from urlab_client.protocol.messages.outliner import ActorRow, FindActors, ListActors
 from urlab_client.protocol.scene_types import ActorInfo
 
-__all__ = ["OutlinerNamespace"]
-
 _LIGHTS = frozenset({"DirectionalLight", "PointLight", "SpotLight", "RectLight", "SkyLight"})
 
 

@@ -25,8 +25,6 @@ from urlab_client.protocol.messages.recording import (
 )
 from urlab_client.protocol.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
 
-__all__ = ["RecordingNamespace", "ReplayNamespace"]
-
 _RECORDING = "recording"
 _FRAMES = "recorded frames"
 _SESSION = "replay session"

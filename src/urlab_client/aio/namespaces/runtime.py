@@ -43,8 +43,6 @@ from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.sim_options import check_sim_options, in_small_letters
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
-__all__ = ["RuntimeNamespace"]
-
 R = TypeVar("R", bound=Reply)
 
 _NUMPY = (np.ndarray, np.generic)

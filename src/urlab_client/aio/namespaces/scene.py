@@ -48,8 +48,6 @@ from urlab_client.protocol.types import JobStatus, UploadProgress
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["SceneNamespace"]
-
 R = TypeVar("R", bound=Reply)
 
 

@@ -19,8 +19,6 @@ from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
-__all__ = ["SimNamespace"]
-
 _POLL_S = 0.25
 _SLICE_S = 2.0
 _STOP_POLL_S = 0.05

@@ -36,8 +36,6 @@ from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.pixels import decode_camera, picture_stamp
 
-__all__ = ["Capturing"]
-
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05
 _MOVES_S: Final = 0.25

@@ -21,8 +21,6 @@ from urlab_client.protocol.messages.runtime import ListKeyframes
 from urlab_client.protocol.messages.streams import ClientEvent, PlayStarted, ServerLost, ServerReconnected
 from urlab_client.protocol.topics import STATE_FULL
 
-__all__ = ["ConnectionMonitor"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _PROBE_S = 2.0

@@ -31,8 +31,6 @@ from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
 from urlab_client.protocol.messages.streams import PlayStarted, StateSnapshot, StreamPolicy
 
-__all__ = ["Discovery", "look"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _PUBLISHED_S: Final = 1.0  # wait for a snapshot of a server that publishes ten per second, or more, in every mode

@@ -22,8 +22,6 @@ from urlab_client.protocol.pixels import check_picture_size
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Examined", "examine"]
-
 _LAST_PORT = 65535
 
 

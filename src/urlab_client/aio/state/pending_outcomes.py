@@ -11,8 +11,6 @@ from urlab_client.aio.session import Session, leaves_open
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ModeLocked, StepTimeout
 
-__all__ = ["PendingOutcomes"]
-
 
 class Counters(Protocol):
     """The part of the client's state that locates it in the simulation."""

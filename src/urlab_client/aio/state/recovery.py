@@ -16,8 +16,6 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import NoSession, SessionTakenOver, URLabRPCError
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 
-__all__ = ["resync"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 

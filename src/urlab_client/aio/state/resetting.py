@@ -13,8 +13,6 @@ from urlab_client.protocol.errors import UnknownKeyframe
 from urlab_client.protocol.messages.session import Reset, ResetOk
 from urlab_client.protocol.names import compiled_names
 
-__all__ = ["take_reset"]
-
 
 async def take_reset(
     state: SimState, turn: Turn, keyframe: str | None, seed: int | None, qpos: Mapping[str, Mapping[str, float]]

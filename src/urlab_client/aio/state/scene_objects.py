@@ -20,8 +20,6 @@ from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, CameraInfo, HelloOk, StepOk
 from urlab_client.protocol.names import NameMap, UnknownName, unknown_name
 
-__all__ = ["SceneObjects"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 # Unreal's actor names: class, then a number or a generated id.

@@ -28,8 +28,6 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicy,
 )
 
-__all__ = ["SessionKeeper"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _LOOK_S: Final = 5.0  # interval between checks that this client still holds the session

@@ -47,8 +47,6 @@ from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
-__all__ = ["SimState"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 # By the server's clock. A larger difference means that the clock was set, not that messages were reordered.

@@ -8,8 +8,6 @@ from urlab_client.aio.model.articulation_state import Carried, MirroredArticulat
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.messages.session import ArticulationCommand
 
-__all__ = ["direct_commands", "live_commands", "take_wrenches"]
-
 
 def direct_commands(state: SimState, carried: Carried) -> dict[str, ArticulationCommand]:
     """Return the commands of a step, including its wrenches."""

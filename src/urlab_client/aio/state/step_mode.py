@@ -14,9 +14,6 @@ from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.protocol.errors import BadMode, ModeLocked
 from urlab_client.protocol.messages.runtime import SetMode, SetModeOk, SetPaused
 
-__all__ = ["ask_mode", "learn_mode", "promote", "settle_mode", "stopped_live"]
-
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 

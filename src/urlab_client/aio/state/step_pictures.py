@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from urlab_client.aio.state.sim_state import SimState
     from urlab_client.aio.turn import Turn
 
-__all__ = ["StepPictures", "first_picture_s"]
-
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _BLOCKING_S: Final = 3.0  # an alpha waits up to 2 s + 1 s for each picture

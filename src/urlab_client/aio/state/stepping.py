@@ -17,8 +17,6 @@ from urlab_client.protocol.enums import CameraTiming, StepMode
 from urlab_client.protocol.errors import StepTimeout, URLabError
 from urlab_client.protocol.messages.session import Step, StepOk
 
-__all__ = ["send_step", "take_steps"]
-
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
 
@@ -137,7 +135,7 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
             record.write_set_points()
         mirror.check_finite()
         if n_steps > 0:
-            import mujoco  # noqa: PLC0415
+            import mujoco
 
             mujoco.mj_step(model, data, n_steps)
         return Step(qpos=data.qpos.copy(), qvel=data.qvel.copy(), ctrl=data.ctrl.copy(), time=data.time), {}

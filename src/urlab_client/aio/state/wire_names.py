@@ -27,8 +27,6 @@ from urlab_client.protocol.names import UnknownName, compiled_names
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["as_written", "for_the_server"]
-
 Q = TypeVar("Q", bound=Request[Any])
 R = TypeVar("R", bound=Reply)
 
@@ -73,7 +71,7 @@ def as_written(reply: R, request: Request[Any]) -> R:
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
     if model is None:
         return name
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     number = mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
 

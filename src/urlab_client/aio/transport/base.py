@@ -12,8 +12,6 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["LateReply", "RequestTransport", "TransportStats"]
-
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
 """Callback invoked with a future when the caller abandons a request that was sent. The future receives the late reply,
 or is cancelled if none can arrive.

@@ -15,8 +15,6 @@ from typing import Any
 
 from urlab_client._processors import crowded
 
-__all__ = ["BusyPoll"]
-
 _MISSES = 4
 _FIRST = 8  # requests of an op before the first trial of sleeping
 _OFTEN, _RARELY = 64, 1024  # interval of trials of the alternative, which grows while the alternative is no better

@@ -13,20 +13,6 @@ from typing import Final
 
 import zmq
 
-__all__ = [
-    "FAILED_HANDSHAKES",
-    "NOTICED_S",
-    "OBSTACLES",
-    "RETRYING",
-    "RETRY_S",
-    "REVIVE_S",
-    "UNANSWERED",
-    "WATCHED",
-    "Attempts",
-    "configure",
-    "reconnect",
-]
-
 HEARTBEAT_MS = 1000
 SILENCE_MS = 3000
 # The system's own limits are minutes, which would delay the detection of a restored cable as long.

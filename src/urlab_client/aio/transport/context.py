@@ -14,8 +14,6 @@ import zmq
 
 from urlab_client._uninterrupted import uninterrupted
 
-__all__ = ["borrow", "give_back"]
-
 Context = zmq.Context[zmq.Socket[bytes]]
 
 _MOST_SOCKETS: Final = 16_384

@@ -10,8 +10,6 @@ import zmq
 
 from urlab_client.keys import KeyPair, public_key, read_pair
 
-__all__ = ["SERVER_KEY_HINT", "ClientKeys", "client_keys", "is_local"]
-
 SERVER_KEY_HINT = "If the server requires CURVE keys, pass server_key=…, and client_key=… if it knows its clients."
 
 _SERVER_VARIABLE = "URLAB_SERVER_KEY"

@@ -22,8 +22,6 @@ from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, Region, RegionNo
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["MappedRegion", "RegionInUse"]
-
 _BLOCK = 512  # bytes; unit of `st_blocks`
 
 

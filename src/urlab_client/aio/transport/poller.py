@@ -23,8 +23,6 @@ from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["Doorbell", "Poller", "RegionPoll", "ReplyPoll", "StreamPoll"]
-
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 _LINGER_S = 1.0

@@ -19,8 +19,6 @@ import zmq
 from urlab_client.aio.background import Tell, background_thread
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["Readiness", "Watchable", "watch_socket"]
-
 # Interval of the thread's checks whether the loop was closed while clients were open.
 _CHECK_MS: Final = 1000
 _JOIN_S: Final = 1.0

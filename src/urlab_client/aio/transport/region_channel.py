@@ -16,8 +16,6 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.messages.runtime import ReadMocapPose
 
-__all__ = ["SYNC_PREFIX", "Envelope", "RegionChannel", "envelope_of", "opening_of"]
-
 SYNC_PREFIX: Final = "sync-"
 """Prefix of session ids that no server knows; their rejection completes the exchange."""
 

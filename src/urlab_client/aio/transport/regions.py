@@ -31,8 +31,6 @@ from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.shm import Publication
 
-__all__ = ["Place", "Regions", "SharedPicture"]
-
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T")

@@ -15,8 +15,6 @@ from urlab_client.protocol.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, region_directories
 
-__all__ = ["SharedMemoryRegions"]
-
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 

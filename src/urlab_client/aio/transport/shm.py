@@ -40,8 +40,6 @@ from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
-__all__ = ["ShmTransport"]
-
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # A reply may be this many times larger than the largest one of its kind seen before.

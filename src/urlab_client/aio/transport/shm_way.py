@@ -8,8 +8,6 @@ from typing import Final, NamedTuple
 from urlab_client.protocol.base import Needs, Op
 from urlab_client.protocol.messages.session import StateReply
 
-__all__ = ["Way", "way_of"]
-
 # Ops whose replies grow with the scene, regardless of their earlier size.
 _UNBOUNDED: Final = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
 # Chunks are larger than slots, and a chunk that was executed without a reply must not be sent again.

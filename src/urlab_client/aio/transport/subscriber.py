@@ -29,8 +29,6 @@ from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.layouts import BytesLike
 
-__all__ = ["ConnectionStatus", "MessageGone", "MessageHandler", "Subscription", "Subscriptions", "client_closed"]
-
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Set before connecting. These queues fill only while the loop is blocked. Streams that need all messages use a backlog

@@ -47,8 +47,6 @@ from urlab_client.protocol.messages.streams import (
     ServerSilent,
 )
 
-__all__ = ["ZmqTransport"]
-
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Plain numbers: each operation on the enumerations costs about a microsecond, and a request takes a dozen.

@@ -136,7 +136,7 @@ class Simulation:
     """
 
     def __init__(self, scene: FollowedScene, model: mujoco.MjModel) -> None:
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         self._scene = scene
         self._model = model
@@ -177,7 +177,7 @@ class Simulation:
         self._compute(forces)
 
     def _compute(self, forces: bool) -> None:
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         if forces:
             mujoco.mj_forward(self._model, self._data)
@@ -218,7 +218,7 @@ class Simulation:
 
     def contacts(self) -> list[ContactMessage]:
         """Return the contacts of a state that was set with forces."""
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         model, data = self._model, self._data
         found: list[ContactMessage] = []
@@ -247,7 +247,7 @@ class Simulation:
         return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
 
     def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         looking, turned = np.zeros(4), np.zeros(4)
         mujoco.mju_mat2Quat(looking, self._data.cam_xmat[camera])
@@ -314,7 +314,7 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
 
 def sensor_kinds() -> dict[int, str]:
     """Return the MJCF name of each number in `model.sensor_type`."""
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     members = mujoco.mjtSensor.__members__
     return {int(member): name.removeprefix("mjSENS_").lower() for name, member in members.items()}

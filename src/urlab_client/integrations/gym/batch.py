@@ -59,8 +59,6 @@ from urlab_client.server.physics.controllers import (
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["URLabBatchEnv"]
-
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 
 

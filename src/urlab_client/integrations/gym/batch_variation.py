@@ -14,8 +14,6 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation
 from urlab_client.server.physics.controllers import Controller, PDController
 
-__all__ = ["BatchVariation"]
-
 Indices = NDArray[np.intp]
 
 

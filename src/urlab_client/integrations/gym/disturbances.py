@@ -18,8 +18,6 @@ from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
 from urlab_client.randomise.variation import draw_range, stream
 
-__all__ = ["Disturbances"]
-
 _NOISE, _PUSH, _LATE, _DROP = 1, 2, 3, 4
 """Keys of the random streams, besides `MODEL_STREAM`."""
 

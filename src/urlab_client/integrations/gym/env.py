@@ -26,8 +26,6 @@ from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]
-
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""
 

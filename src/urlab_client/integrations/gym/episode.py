@@ -38,8 +38,6 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
 
-__all__ = ["EnvEpisode", "client_camera", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
-
 
 def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return client options with the defaults of environments filled in.

@@ -11,8 +11,6 @@ from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.render.latency import Instant, Latency
 
-__all__ = ["LateCameras"]
-
 _UNSEEN: Final = 0
 """Snapshot number; unused here."""
 

@@ -32,8 +32,6 @@ from urlab_client.server.render.drawing import Stage
 from urlab_client.server.render.opengl import Backend, need_backend
 from urlab_client.server.render.tints import Tints
 
-__all__ = ["VISIBLE", "BatchPictures", "PictureScene", "Visible"]
-
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""
 

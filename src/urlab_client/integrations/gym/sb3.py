@@ -16,8 +16,6 @@ from urlab_client.integrations.gym.vectorized import Vectorized
 
 need("stable_baselines3", extra="sb3")
 
-__all__ = ["Sb3VecEnv"]
-
 if TYPE_CHECKING:
 
     class _VecEnv:

@@ -13,8 +13,6 @@ from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import Start, States, Task
 from urlab_client.protocol.base import Floats
 
-__all__ = ["FixedReach", "Push", "PushPictures", "Reach", "Run", "Walk"]
-
 Bools = NDArray[np.bool_]
 
 FALLEN_M: Final = 0.15

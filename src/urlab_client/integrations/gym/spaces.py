@@ -17,19 +17,6 @@ from urlab_client.protocol.enums import CameraMode
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = [
-    "FIELDS",
-    "LEVELS",
-    "Field",
-    "Observation",
-    "Space",
-    "SpaceMapping",
-    "SpaceMode",
-    "camera_space",
-    "dict_space",
-    "with_cameras",
-]
-
 SpaceMode = Literal["flat", "dict"]
 Field = Literal["qpos", "qvel", "ctrl", "act", "sensors"]
 Space = spaces.Space[Any]

@@ -15,8 +15,6 @@ from urlab_client.protocol.base import Floats
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["ResetNoise", "noise_of"]
-
 _SLIDE: Final = 2
 """`mjJNT_SLIDE`."""
 

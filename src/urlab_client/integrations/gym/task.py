@@ -19,18 +19,6 @@ from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.names import unknown_name
 
-__all__ = [
-    "EpisodeSettings",
-    "Start",
-    "States",
-    "Task",
-    "TaskScene",
-    "add_observed",
-    "check_alone",
-    "joined",
-    "with_task",
-]
-
 Bools = NDArray[np.bool_]
 
 

@@ -13,8 +13,6 @@ from urlab_client.integrations.gym.shipped_tasks import FixedReach, Push, PushPi
 from urlab_client.integrations.gym.task import Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 
-__all__ = ["TASKS", "make", "make_endless", "make_vec", "register"]
-
 TASKS: Final[dict[str, type[Task]]] = {
     "urlab/Arm-v0": FixedReach,
     "urlab/Quadruped-v0": Run,

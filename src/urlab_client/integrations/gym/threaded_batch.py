@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from urlab_client.randomise.variation import field_of
 
-__all__ = ["ThreadedBatch"]
-
 Indices = NDArray[np.intp]
 
 _STATE = ("qpos", "qvel", "act", "ctrl", "xfrc_applied")

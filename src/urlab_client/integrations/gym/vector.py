@@ -30,8 +30,6 @@ from urlab_client.protocol.errors import URLabError, refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
-__all__ = ["URLabVectorEnv"]
-
 T = TypeVar("T")
 
 

@@ -19,8 +19,6 @@ from urlab_client.integrations.gym.task import States, Task
 from urlab_client.protocol.errors import refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 
-__all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
-
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from urlab_client._extras import need
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["WarpBatch"]
-
 Indices = NDArray[np.intp]
 
 _STATE: Final = (

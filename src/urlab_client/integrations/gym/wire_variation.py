@@ -21,8 +21,6 @@ from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["WireVariation"]
-
 _GAINS: Final[frozenset[Quantity]] = frozenset({"kp", "kv"})
 _SETTABLE: Final[frozenset[Quantity]] = START | frozenset[Quantity]({"gravity"})
 

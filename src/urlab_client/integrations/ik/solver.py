@@ -24,8 +24,6 @@ from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["IkSolution", "InverseKinematics", "UnreachableTarget"]
-
 Vector = Sequence[float] | Floats
 
 _ITERATIONS: Final = 60

@@ -431,7 +431,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
         OSError: The file cannot be read.
         RecordingError: The file is neither.
     """
-    from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states  # noqa: PLC0415
+    from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states
 
     file = Path(path)
     if is_joint_states(file):

@@ -15,8 +15,6 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["HandControl"]
-
 _MAX_LEAD_M: Final = 0.1
 """Largest distance of the target from the hand, so that the target stays close when the hand meets an obstacle."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from urlab_client.integrations.teleop.session import TeleopCommand, TeleopView, Verdict
 
-__all__ = ["HELP", "KeyboardOperator"]
-
 _HELD_S: Final = 0.12
 """Duration of the motion per key press: a little longer than the repeat interval of a held key."""
 

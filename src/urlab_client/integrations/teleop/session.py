@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
     from urlab_client.integrations.record import AsyncRecorder, Recorder
 
-__all__ = ["Operator", "TeleopCommand", "TeleopTally", "TeleopView", "teleoperate", "teleoperate_blocking"]
-
 Verdict = EpisodeOutcome | Literal["quit"]
 
 
@@ -285,8 +283,8 @@ class _TaskStart(_Start):
     """Episodes of a task."""
 
     def __init__(self, client: AsyncClient, task: Task) -> None:
-        from urlab_client.integrations.gym.episode import EnvEpisode  # noqa: PLC0415
-        from urlab_client.integrations.gym.task import EpisodeSettings  # noqa: PLC0415
+        from urlab_client.integrations.gym.episode import EnvEpisode
+        from urlab_client.integrations.gym.task import EpisodeSettings
 
         super().__init__(client)
         settings = EpisodeSettings.of(

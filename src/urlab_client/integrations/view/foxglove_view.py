@@ -66,9 +66,9 @@ class _Foxglove:
 
     def open(self) -> None:
         """See `ViewBackend`."""
-        import foxglove  # noqa: PLC0415
-        from foxglove.channels import SceneUpdateChannel  # noqa: PLC0415
-        from foxglove.websocket import ServerListener  # noqa: PLC0415
+        import foxglove
+        from foxglove.channels import SceneUpdateChannel
+        from foxglove.websocket import ServerListener
 
         backend = self
 
@@ -144,7 +144,7 @@ class _Foxglove:
 
     def _send(self, topic: str, make: Callable[[], Struct], ns: int, metadata: dict[str, str] | None = None) -> None:
         """Send the result of `make`, which is called only if there is a subscriber, and once for the topic's schema."""
-        import foxglove  # noqa: PLC0415
+        import foxglove
 
         key = topic, (metadata or {}).get("layout", "")
         channel = self._channels.get(key)
@@ -172,7 +172,7 @@ class _Foxglove:
             self._send(f"/state/{key}", make, moment.ns, to_metadata(names) if names else {})
 
     def _send_geometry(self, ns: int) -> None:
-        from foxglove import messages as fox  # noqa: PLC0415
+        from foxglove import messages as fox
 
         by_body: dict[str, list[Shape]] = {}
         for shape in self._shapes:
@@ -185,7 +185,7 @@ class _Foxglove:
             self._scene_channel.log(update, log_time=ns)
 
     def _send_contacts(self, moment: Moment) -> None:
-        from foxglove import messages as fox  # noqa: PLC0415
+        from foxglove import messages as fox
 
         contacts = moment.simulation.contacts()
         self._send("/contacts", lambda: ContactsMessage(Time.of(moment.ns), contacts), moment.ns)
@@ -218,7 +218,7 @@ class _Foxglove:
 
 def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quaternion:
     """Return the shortest rotation of the x axis, along which arrows point, to a unit vector."""
-    from foxglove import messages as fox  # noqa: PLC0415
+    from foxglove import messages as fox
 
     x, y, z = direction.tolist()
     if x < -1 + 1e-9:
@@ -228,7 +228,7 @@ def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quate
 
 
 def _entity(body: str, shapes: Sequence[Shape]) -> fox.SceneEntity:
-    from foxglove import messages as fox  # noqa: PLC0415
+    from foxglove import messages as fox
 
     cubes: list[fox.CubePrimitive] = []
     spheres: list[fox.SpherePrimitive] = []
@@ -277,7 +277,7 @@ def _entity(body: str, shapes: Sequence[Shape]) -> fox.SceneEntity:
 
 def _pose(shape: Shape, along_z: float = 0.0) -> fox.Pose:
     """Return a shape's pose in its body's frame, or that of a point on the shape's z axis."""
-    from foxglove import messages as fox  # noqa: PLC0415
+    from foxglove import messages as fox
 
     w, x, y, z = shape.orientation
     axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

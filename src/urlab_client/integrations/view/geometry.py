@@ -101,7 +101,7 @@ _Outline = tuple[Kind, tuple[float, float, float], NDArray[np.float32] | None, N
 
 
 def _outline(model: mujoco.MjModel, geom: int) -> _Outline | None:
-    import mujoco  # noqa: PLC0415
+    import mujoco
 
     x, y, z = model.geom_size[geom].tolist()
     types, data = mujoco.mjtGeom, int(model.geom_dataid[geom])

@@ -54,7 +54,7 @@ class _Rerun:
 
     def open(self) -> None:
         """See `ViewBackend`."""
-        import rerun as rr  # noqa: PLC0415
+        import rerun as rr
 
         recording = rr.RecordingStream("urlab")
         if self._save is not None:
@@ -71,7 +71,7 @@ class _Rerun:
 
     def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
-        import rerun as rr  # noqa: PLC0415
+        import rerun as rr
 
         recording = self._recording
         before, self._static = self._static, {}
@@ -89,7 +89,7 @@ class _Rerun:
 
     def show(self, moment: Moment) -> None:
         """See `ViewBackend`."""
-        import rerun as rr  # noqa: PLC0415
+        import rerun as rr
 
         recording = self._recording
         self._set_times(moment.ns, moment.wall_ns)
@@ -109,7 +109,7 @@ class _Rerun:
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """See `ViewBackend`."""
-        import rerun as rr  # noqa: PLC0415
+        import rerun as rr
 
         recording, camera = self._recording, picture.camera
         where = _camera(camera.name)
@@ -151,7 +151,7 @@ class _Rerun:
         return _camera(name) if any(camera.name == name for camera in scene.cameras.values()) else _body(name)
 
     def _show_values(self, state: State, scene: FollowedScene) -> None:
-        import rerun as rr  # noqa: PLC0415
+        import rerun as rr
 
         recording = self._recording
         part = rr.escape_entity_path_part
@@ -166,19 +166,19 @@ class _Rerun:
 
 
 def _body(name: str) -> str:
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     return f"world/{rr.escape_entity_path_part(name)}"
 
 
 def _camera(name: str) -> str:
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     return "world/cameras/" + "/".join(rr.escape_entity_path_part(part) for part in name.split("/"))
 
 
 def _transform(frame: FrameTransform) -> rerun.Transform3D:
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     at, turned = frame.translation, frame.rotation
     return rr.Transform3D(
@@ -187,7 +187,7 @@ def _transform(frame: FrameTransform) -> rerun.Transform3D:
 
 
 def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
-    import rerun as rr  # noqa: PLC0415
+    import rerun as rr
 
     solid = rr.components.FillMode.Solid
     x, y, z = shape.size

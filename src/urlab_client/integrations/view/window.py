@@ -49,7 +49,7 @@ class _Window:
 
     def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """See `ViewBackend`."""
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         viewer: Any = import_module("mujoco.viewer")
         self.close()
@@ -59,7 +59,7 @@ class _Window:
 
     def show(self, moment: Moment) -> None:
         """See `ViewBackend`."""
-        import mujoco  # noqa: PLC0415
+        import mujoco
 
         if self._data is None or not self._viewer.is_running():
             return

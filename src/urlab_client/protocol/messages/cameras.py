@@ -9,18 +9,6 @@ from msgspec import Struct
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "OPS",
-    "CameraDelay",
-    "CameraDelayInForce",
-    "CameraStreaming",
-    "CameraTransports",
-    "SetCameraDelay",
-    "SetCameraDelayOk",
-    "SetCameraStreaming",
-    "SetCameraStreamingOk",
-]
-
 
 class CameraTransports(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Transports that a camera should use. Those not mentioned are switched off, unless none is mentioned."""

@@ -8,24 +8,6 @@ from msgspec import field
 
 from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Color, EulerDeg, Op, Quat, Reply, Request, Vec3, doc
 
-__all__ = [
-    "OPS",
-    "ClearMarkers",
-    "ClearMarkersOk",
-    "DrawArrow",
-    "DrawArrowOk",
-    "DrawAxes",
-    "DrawAxesOk",
-    "DrawBox",
-    "DrawBoxOk",
-    "DrawLine",
-    "DrawLineOk",
-    "DrawMarker",
-    "DrawMarkerOk",
-    "SetOverlayText",
-    "SetOverlayTextOk",
-]
-
 Ttl = Annotated[float, doc("Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.")]
 Tag = Annotated[str | None, doc("Accepted but not used; markers cannot be cleared by tag.")]
 UnrealQuat = Annotated[

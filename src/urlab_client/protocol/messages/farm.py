@@ -6,8 +6,6 @@ from typing import Annotated, Final
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
 
-__all__ = ["OPS", "AcquireLease", "AcquireLeaseOk", "ReleaseLease", "ReleaseLeaseOk"]
-
 
 class AcquireLeaseOk(Reply, tag="acquire_lease_ok", kw_only=True):
     """The lease."""

@@ -6,8 +6,6 @@ from typing import Annotated, Any, Final
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
 
-__all__ = ["OPS", "OpStarted", "OpStatus", "OpStatusOk"]
-
 
 class OpStarted(Reply, tag="op_started", kw_only=True):
     """The op has started; `op_status` returns its reply."""

@@ -24,26 +24,6 @@ from urlab_client.protocol.base import (
 from urlab_client.protocol.scene_types import ActorBounds, BlueprintInfo
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "OPS",
-    "ActorRow",
-    "AddQuickConvert",
-    "AddQuickConvertOk",
-    "FindActors",
-    "FindActorsOk",
-    "GetActorBounds",
-    "GetActorBoundsOk",
-    "ListActors",
-    "ListActorsOk",
-    "ListBlueprints",
-    "ListBlueprintsOk",
-    "QuickConvert",
-    "RemoveQuickConvert",
-    "RemoveQuickConvertOk",
-    "SelectActor",
-    "SelectActorOk",
-]
-
 
 class QuickConvert(Serializable, Struct, kw_only=True):
     """Settings that make a static mesh a MuJoCo body."""

@@ -7,28 +7,6 @@ from typing import Annotated, Final
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request, doc
 from urlab_client.protocol.types import RecordingSummary, ReplayStatus
 
-__all__ = [
-    "OPS",
-    "RecordingClear",
-    "RecordingClearOk",
-    "RecordingSave",
-    "RecordingSaveOk",
-    "RecordingStart",
-    "RecordingStartOk",
-    "RecordingStop",
-    "RecordingStopOk",
-    "ReplayListSessions",
-    "ReplayListSessionsOk",
-    "ReplayLoad",
-    "ReplayLoadOk",
-    "ReplaySetActive",
-    "ReplaySetActiveOk",
-    "ReplayStart",
-    "ReplayStartOk",
-    "ReplayStop",
-    "ReplayStopOk",
-]
-
 
 class RecordingStartOk(Reply, tag="recording_start_ok", kw_only=True):
     """The running recording."""

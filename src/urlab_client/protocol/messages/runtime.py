@@ -23,37 +23,6 @@ from urlab_client.protocol.base import (
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
-__all__ = [
-    "OPS",
-    "ConfigureController",
-    "ConfigureControllerOk",
-    "ContactFilter",
-    "GetContacts",
-    "GetContactsOk",
-    "ListKeyframes",
-    "ListKeyframesOk",
-    "ReadMocapPose",
-    "ReadMocapPoseOk",
-    "SetControlSource",
-    "SetControlSourceOk",
-    "SetMocapPose",
-    "SetMocapPoseOk",
-    "SetMode",
-    "SetModeOk",
-    "SetPaused",
-    "SetPausedOk",
-    "SetQpos",
-    "SetQposOk",
-    "SetSimOptions",
-    "SetSimOptionsOk",
-    "SetSimSpeed",
-    "SetSimSpeedOk",
-    "SetTwist",
-    "SetTwistOk",
-    "SetUserChannels",
-    "SetUserChannelsOk",
-]
-
 
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
     """The mode before and after."""

@@ -26,45 +26,6 @@ from urlab_client.protocol.base import (
 from urlab_client.protocol.scene_types import ActorHierarchyNode
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "OPS",
-    "ActorHierarchy",
-    "ActorHierarchyOk",
-    "CreateLevel",
-    "CreateLevelOk",
-    "CurrentLevel",
-    "CurrentLevelOk",
-    "DestroyActor",
-    "DestroyActorOk",
-    "DestroyAsset",
-    "DestroyAssetOk",
-    "DuplicateActor",
-    "DuplicateActorOk",
-    "EnsureManager",
-    "EnsureManagerOk",
-    "GridCell",
-    "ImportXml",
-    "ImportXmlOk",
-    "LoadLevel",
-    "LoadLevelOk",
-    "RemoveActor",
-    "RemoveActorOk",
-    "SaveLevel",
-    "SaveLevelOk",
-    "SetActorTransform",
-    "SetActorTransformOk",
-    "Snapshot",
-    "SnapshotOk",
-    "SnapshotRow",
-    "SpawnActor",
-    "SpawnActorOk",
-    "SpawnGrid",
-    "SpawnGridOk",
-    "SpawnLight",
-    "SpawnLightOk",
-    "UrlabBlock",
-]
-
 
 class LevelReply(Reply, kw_only=True):
     """Reply of the ops that name a level."""

@@ -23,43 +23,6 @@ from urlab_client.protocol.base import (
 )
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "NOT_SENT",
-    "OPS",
-    "ArticulationCommand",
-    "ArticulationInfo",
-    "ArticulationState",
-    "BodyPose",
-    "CameraChoice",
-    "CameraFrame",
-    "CameraInfo",
-    "Clock",
-    "ControllerInfo",
-    "EntityInfo",
-    "EntityState",
-    "ErrorReply",
-    "Forward",
-    "ForwardOk",
-    "Hello",
-    "HelloOk",
-    "InstanceInfo",
-    "Meta",
-    "MetaOk",
-    "OpInfo",
-    "OriginalNames",
-    "Perturbation",
-    "ReplayProgress",
-    "Reset",
-    "ResetOk",
-    "RobotEntry",
-    "ShmRpcInfo",
-    "StateReply",
-    "Step",
-    "StepOk",
-    "TwistState",
-]
-
-
 NOT_SENT: Final = msgspec.Raw()
 """Value of an undecoded field that is absent; encoding omits a field that holds this very object."""
 

@@ -8,8 +8,6 @@ from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Effect, Op, Reply, Requ
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.session import HelloOk
 
-__all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
-
 
 class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
     """Result of the start."""

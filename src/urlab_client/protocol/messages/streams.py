@@ -20,26 +20,6 @@ from urlab_client.protocol.rows import Row
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.topics import TopicKind
 
-__all__ = [
-    "CameraSample",
-    "ClientEvent",
-    "PlayEnded",
-    "PlayStarted",
-    "RowSample",
-    "ServerAnswers",
-    "ServerConnected",
-    "ServerLost",
-    "ServerReconnected",
-    "ServerSilent",
-    "SessionLost",
-    "SessionOpened",
-    "StateSnapshot",
-    "StreamItem",
-    "StreamPolicy",
-    "StreamStats",
-    "TaskFailed",
-]
-
 
 class StreamPolicy(StrEnum):
     """Which messages a stream keeps for a busy reader."""

@@ -9,21 +9,6 @@ from msgspec import Struct, field
 from urlab_client.protocol.base import Int32, Needs, Op, Reply, Request, doc
 from urlab_client.protocol.serializable import Serializable
 
-__all__ = [
-    "MAX_ASSETS",
-    "MAX_BLOB_BYTES",
-    "MAX_CHUNK_BYTES",
-    "MAX_MODEL_BYTES",
-    "OPS",
-    "AssetDigest",
-    "UploadModelChunk",
-    "UploadModelChunkOk",
-    "UploadModelCommit",
-    "UploadModelCommitOk",
-    "UploadModelManifest",
-    "UploadModelManifestOk",
-]
-
 MAX_BLOB_BYTES: Final = 64 << 20
 MAX_MODEL_BYTES: Final = 512 << 20
 MAX_ASSETS: Final = 4096

@@ -21,22 +21,6 @@ from urlab_client.protocol.base import (
 )
 from urlab_client.protocol.types import CameraPose
 
-__all__ = [
-    "OPS",
-    "FrameActor",
-    "FrameActorOk",
-    "GetCamera",
-    "GetCameraOk",
-    "SetCamera",
-    "SetCameraOk",
-    "SetViewportMode",
-    "SetViewportModeOk",
-    "TrackActor",
-    "TrackActorOk",
-    "Untrack",
-    "UntrackOk",
-]
-
 
 class CameraReply(Reply, kw_only=True):
     """Pose of the viewport's camera: local +x points forward, +z up."""

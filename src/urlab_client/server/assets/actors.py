@@ -18,8 +18,6 @@ from urlab_client.protocol.rotation import IDENTITY
 from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.limits import Limits
 
-__all__ = ["ORIGIN", "UNIT_SCALE", "Actor", "ActorKind", "ConversionSettings", "Light", "Mesh", "scene_problem"]
-
 ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 UNIT_SCALE: Final[Vec3] = (1.0, 1.0, 1.0)
 

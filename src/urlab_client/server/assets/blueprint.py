@@ -16,16 +16,6 @@ import mujoco
 
 from urlab_client.server.assets.importer import mujoco_messages, named_kinds
 
-__all__ = [
-    "IMPORTS",
-    "PARENT_CLASS",
-    "Blueprint",
-    "BlueprintRecord",
-    "from_record",
-    "load_blueprint",
-    "sanitized",
-    "to_record",
-]
 IMPORTS: Final = "MuJoCoImports"
 PARENT_CLASS: Final = "MjArticulation"
 

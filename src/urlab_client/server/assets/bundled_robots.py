@@ -8,8 +8,6 @@ from typing import Final
 
 from urlab_client.protocol.names import did_you_mean
 
-__all__ = ["BUNDLED_PREFIX", "bundled_models", "bundled_root", "unknown_model"]
-
 BUNDLED_PREFIX: Final = "bundled:"
 """How a saved level names a bundled model, whose path differs from machine to machine."""
 

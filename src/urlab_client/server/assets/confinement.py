@@ -14,8 +14,6 @@ from pathlib import Path
 from urlab_client._mjcf_files import NamedFiles, named_files
 from urlab_client.server.limits import Limits
 
-__all__ = ["Outside", "check_references"]
-
 _MAX_COMBINATIONS = 1_000_000
 
 

@@ -46,8 +46,6 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
 
-__all__ = ["ContentRoot"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 UPLOADED: Final = "uploaded"

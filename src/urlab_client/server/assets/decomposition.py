@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from urlab_client._installation import install_command
 
-__all__ = ["Part", "advice", "convex_parts", "is_available"]
-
 Part = tuple[NDArray[np.float64], NDArray[np.int32]]
 """Vertices, shape (n, 3), and triangles, shape (m, 3), of one convex part, in the frame of the file."""
 

@@ -29,17 +29,6 @@ from urlab_client._mujoco import (
 )
 from urlab_client.server.limits import Limits, options_problem
 
-__all__ = [
-    "Compiled",
-    "Written",
-    "build_snapshot",
-    "compile_snapshot",
-    "mujoco_messages",
-    "named_kinds",
-    "one_line",
-    "write_snapshot",
-]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})

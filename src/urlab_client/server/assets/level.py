@@ -27,8 +27,6 @@ from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["LevelError", "read_level", "write_level"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 FORMAT: Final = "urlab-level"

@@ -34,8 +34,6 @@ from urlab_client.server.assets.importer import Compiled, build_snapshot, mujoco
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["build_confined"]
-
 _GRACE_S: Final = 5.0 if hasattr(os, "fork") else 30.0
 """Extra time for the child's answer, seconds. Without `fork` it includes the start of the child."""
 

@@ -32,8 +32,6 @@ from urlab_client.protocol.names import is_file_name
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
 
-__all__ = ["DOCUMENT", "UPLOADS", "Uploads"]
-
 DOCUMENT: Final = "model.xml"
 """Name of the document when it is imported; no other file may have it."""
 

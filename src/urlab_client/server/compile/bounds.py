@@ -18,8 +18,6 @@ from urlab_client.server.assets.importer import mujoco_messages, one_line
 from urlab_client.server.compile.static_meshes import add_mesh
 from urlab_client.server.refusal import CompileFailed
 
-__all__ = ["Box", "actor_bounds", "box_around"]
-
 Floats = NDArray[np.float64]
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -14,8 +14,6 @@ from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
 from urlab_client.server.compile.static_meshes import add_light, add_static_mesh
 
-__all__ = ["aims_at_world", "attachable", "compose", "empty_scene", "populate"]
-
 
 def compose(
     actors: Sequence[Actor],

@@ -8,8 +8,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["coinciding_planes", "draw_once", "floor_warning"]
-
 Floats = NDArray[np.float64]
 _SAME: Final = 1e-6
 

@@ -16,8 +16,6 @@ from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.refusal import CompileFailed
 
-__all__ = ["OptionPolicy", "adopt_options", "copy_options", "ignored_options"]
-
 OptionPolicy: TypeAlias = Literal["ignored", "first", "merged"]
 """Which `<option>` the scene gets: none, that of the first articulation, or all of them merged."""
 

@@ -30,8 +30,6 @@ from urlab_client.server.compile.static_meshes import unique_name
 from urlab_client.server.limits import Limits, options_problem
 from urlab_client.server.refusal import CompileFailed
 
-__all__ = ["CompiledScene", "compile_scene", "saved_model"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _DEFAULT_LIMITS: Final = Limits()

@@ -20,8 +20,6 @@ from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.compile.composition import aims_at_world, attachable, empty_scene, populate
 from urlab_client.server.compile.mjcf_options import copy_options
 
-__all__ = ["attached_scene"]
-
 _FILE: Final = re.compile(r'\b(file\w*)="([^"]*)"')
 
 

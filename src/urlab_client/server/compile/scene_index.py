@@ -22,8 +22,6 @@ from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.refusal import CompileFailed
 
-__all__ = ["ArticulationIndex", "EntityIndex", "SceneCamera", "index_articulation", "index_entity"]
-
 Ints = NDArray[np.int32]
 DEFAULT_CAMERA_SIZE: Final = (640, 480)
 

@@ -11,7 +11,6 @@ from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh
 from urlab_client.server.assets.decomposition import convex_parts
 
-__all__ = ["add_light", "add_mesh", "add_static_mesh", "unique_name"]
 FULL_BRIGHTNESS: Final = 5000.0
 """Intensity that corresponds to MuJoCo's full diffuse colour; the engine's default."""
 

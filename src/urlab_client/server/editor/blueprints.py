@@ -12,8 +12,6 @@ from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.editor.levels import Levels
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Blueprints"]
-
 
 class Blueprints:
     """The imported blueprints, and the actors of the open level that use them."""

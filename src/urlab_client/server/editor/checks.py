@@ -11,8 +11,6 @@ from urlab_client.protocol.rotation import euler_to_quat, normalized
 from urlab_client.server.assets.actors import UNIT_SCALE
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["float32", "pose", "refuse_infinite", "refuse_scale", "require", "rotation"]
-
 
 def require(value: str, name: str) -> None:
     """Refuse with `missing_field` if a name is empty."""

@@ -15,8 +15,6 @@ from typing import Any, Final
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
 
-__all__ = ["EditorJobs"]
-
 _MOST: Final = 4096
 """Maximum number of jobs that wait, and of results that nobody has fetched; beyond it the oldest results go."""
 

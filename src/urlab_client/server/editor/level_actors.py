@@ -12,8 +12,6 @@ from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.editor import checks
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["ActorNames", "LevelActors", "match_actor"]
-
 ActorNames = Literal["model", "plugin"]
 
 

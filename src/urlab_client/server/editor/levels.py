@@ -16,8 +16,6 @@ from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Levels", "level_package"]
-
 UNTITLED: Final = "/Temp/Untitled_1"
 
 

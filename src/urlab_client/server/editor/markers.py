@@ -19,8 +19,6 @@ from typing import Final, TypeAlias
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.server.limits import Limits
 
-__all__ = ["MARKER_RADIUS_M", "Arrow", "Box", "DebugLine", "Drawings", "Primitive", "Sphere", "Text"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MARKER_RADIUS_M: Final = 0.05

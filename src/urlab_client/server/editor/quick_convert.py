@@ -11,8 +11,6 @@ from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["QuickConvert"]
-
 
 class QuickConvert:
     """The Quick Convert settings of the actors of the open level."""

@@ -15,8 +15,6 @@ from typing import Final
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import euler_to_quat, normalized, quat_to_euler, rotate, swap_frame
 
-__all__ = ["ASPECT", "DEFAULT_OFFSET", "Track", "ViewMode", "Viewport", "ViewportCamera", "rotator"]
-
 ASPECT: Final = 16.0 / 9.0
 """Width by height of the viewport."""
 

@@ -1,7 +1,5 @@
 """Handlers of the ops that switch and delay cameras."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import math

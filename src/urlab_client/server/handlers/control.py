@@ -16,8 +16,6 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need, usable
 
-__all__ = ["check_all_owners", "check_owner"]
-
 
 def _owner(request: ControlRequest[Any]) -> str:
     return request.control_owner or request.session_id

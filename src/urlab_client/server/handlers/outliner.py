@@ -1,7 +1,5 @@
 """Handlers of the `outliner` ops: inspecting the world."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import msgspec

@@ -1,7 +1,5 @@
 """Handlers of the `recording` and `replay` ops."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import os

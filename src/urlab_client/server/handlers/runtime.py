@@ -1,7 +1,5 @@
 """Handlers of the `runtime` ops: live changes to the running simulation."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import math

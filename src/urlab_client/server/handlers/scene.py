@@ -1,7 +1,5 @@
 """Handlers of the `scene` ops: authoring levels and actors."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 from urlab_client.protocol.messages.scene import (

@@ -1,7 +1,5 @@
 """Handlers of the ops without a namespace, and the handshake that `begin_pie` also sends."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import base64

@@ -1,7 +1,5 @@
 """Handlers of the `sim` ops: the life cycle of a play session."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 from urlab_client.protocol.enums import PIEState

@@ -1,7 +1,5 @@
 """Handlers of the ops that upload a model."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 from urlab_client.protocol.messages.uploads import (

@@ -1,7 +1,5 @@
 """Handlers of the `viewport` ops: the camera of the editor's perspective view."""
 
-# ruff: noqa: D103 - the request struct documents the op
-
 from __future__ import annotations
 
 import math

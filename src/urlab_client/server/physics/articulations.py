@@ -18,8 +18,6 @@ from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Articulations"]
-
 
 class Articulations:
     """The articulations of a scene. The caller holds the engine's lock, except to look names up.

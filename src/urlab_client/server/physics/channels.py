@@ -7,8 +7,6 @@ import threading
 from collections.abc import Mapping
 from typing import Any, Final, cast
 
-__all__ = ["SCENE", "UserChannels", "channel_problem"]
-
 SCENE: Final = "scene"
 """Stands for the robot's name in channels of the scene."""
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["ControlClaims"]
-
 
 @dataclass(slots=True)
 class _Claim:

@@ -22,19 +22,6 @@ from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.server.compile.scene_index import ArticulationIndex
 
-__all__ = [
-    "Actuated",
-    "ArticulationControl",
-    "ControlSource",
-    "Controller",
-    "ControllerConfig",
-    "PDController",
-    "PassthroughController",
-    "SetPoints",
-    "Twist",
-    "float32",
-]
-
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 

@@ -12,9 +12,6 @@ from typing import Final
 
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["DataLock", "MujocoCall", "Overdue", "busy"]
-
-
 MIN_TIMEOUT_S: Final = 1.0
 """Shortest duration of an overdue MuJoCo call; a slice of a long request may take a while on a busy machine."""
 

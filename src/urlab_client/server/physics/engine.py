@@ -34,8 +34,6 @@ from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
 
-__all__ = ["Engine"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")

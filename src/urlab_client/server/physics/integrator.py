@@ -19,8 +19,6 @@ from urlab_client.server.physics.data_lock import MujocoCall
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["Hook", "Integrator", "Snapshots", "call_hooks", "shutting_down"]
-
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
 

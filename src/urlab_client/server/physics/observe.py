@@ -22,8 +22,6 @@ from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.physics.channels import SCENE, UserChannels
 from urlab_client.server.physics.controllers import ArticulationControl
 
-__all__ = ["Observer", "StateFields", "sim_clock", "sim_seconds", "wall_clock", "wall_seconds"]
-
 
 def sim_seconds(seconds: float) -> tuple[int, int]:
     """Split a time in seconds into whole ones and nanoseconds, truncating.

@@ -21,8 +21,6 @@ from urlab_client.server.limits import Limits, option_problem
 from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["OptionOverrides"]
-
 CHOICES: Final[Mapping[str, Mapping[str, Any]]] = {
     "integrator": {
         "euler": mujoco.mjtIntegrator.mjINT_EULER,

@@ -10,8 +10,6 @@ import mujoco
 
 from urlab_client.server.physics.controllers import float32
 
-__all__ = ["GIVE_WAY_S", "IDLE_S", "LivePacing"]
-
 MIN_SPEED: Final = 5.0
 MAX_SPEED: Final = 100.0
 

@@ -17,8 +17,6 @@ from urlab_client.server.physics.integrator import shutting_down
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health, ended, within
 
-__all__ = ["PhysicsThread"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 

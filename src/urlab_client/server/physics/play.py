@@ -30,8 +30,6 @@ from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.health import Health
 
-__all__ = ["Play", "Running"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MAX_WAIT_S: Final = 86400.0

@@ -10,8 +10,6 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import Step
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["QueuedStep"]
-
 T = TypeVar("T")
 
 

@@ -23,18 +23,6 @@ from numpy.typing import NDArray
 
 from urlab_client.server.compile.scene import CompiledScene
 
-__all__ = [
-    "LIVE_SESSION",
-    "Frame",
-    "JointLayout",
-    "LiveRecording",
-    "decode_csv",
-    "decode_json",
-    "duration",
-    "encode_json",
-    "joint_name",
-]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats = NDArray[np.float64]

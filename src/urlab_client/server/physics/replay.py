@@ -27,8 +27,6 @@ from urlab_client.server.physics.recording import (
     joint_name,
 )
 
-__all__ = ["Player", "ReplaySessions", "recordings", "replay_folder"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _DEFAULT_LIMITS: Final = Limits()

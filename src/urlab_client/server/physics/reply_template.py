@@ -25,8 +25,6 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_seconds, wall_seconds
 
-__all__ = ["StepReplies"]
-
 _FLOAT64: Final = 0xCB
 """What precedes a number in msgpack."""
 

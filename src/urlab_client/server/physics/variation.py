@@ -18,8 +18,6 @@ from urlab_client.server.compile.scene import CompiledScene, saved_model
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import PDController
 
-__all__ = ["SceneVariation"]
-
 
 class SceneVariation:
     """Varies a scene's model in place.

@@ -13,8 +13,6 @@ from msgspec import Struct
 
 from urlab_client.randomise.variation import model_text
 
-__all__ = ["APPEARANCE_TEXT", "Appearance", "RenderQuality"]
-
 APPEARANCE_TEXT: Final = "urlab_pictures"
 """Name of the custom text element of a compiled model that holds, as JSON, what differs from the default."""
 

@@ -36,8 +36,6 @@ from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.system.health import Health, ended
 
-__all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]

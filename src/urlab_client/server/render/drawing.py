@@ -30,8 +30,6 @@ from urlab_client.server.render.viewport_picture import (
     showing,
 )
 
-__all__ = ["NO_HIT_CM", "Stage", "simplify_textures"]
-
 Bytes = NDArray[np.uint8]
 
 

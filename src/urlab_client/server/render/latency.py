@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraFrame
 
-__all__ = ["Instant", "Latency", "Past"]
-
 CAPACITY: Final = 1000
 """Approximate number of past states kept per camera; at higher rates, states are skipped."""
 

@@ -17,18 +17,6 @@ from typing import Any, Final
 from urlab_client._children import APART
 from urlab_client.protocol.errors import URLabError
 
-__all__ = [
-    "ADVICE",
-    "Backend",
-    "RenderingUnavailable",
-    "find_backend",
-    "free_context",
-    "make_context",
-    "need_backend",
-    "search_backend",
-    "why_it_failed",
-]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 

@@ -12,8 +12,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["follow_subject", "moving_geoms", "shadow_clip"]
-
 _WIDER: Final = 8.0
 _WIDE_M: Final = 5.0
 

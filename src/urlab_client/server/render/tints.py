@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode
 
-__all__ = ["Tints", "tint"]
-
 Bytes = NDArray[np.uint8]
 
 

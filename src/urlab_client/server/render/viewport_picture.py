@@ -23,19 +23,6 @@ from urlab_client.server.compile.bounds import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
 
-__all__ = [
-    "SELECTED",
-    "Bounds",
-    "ViewportPicture",
-    "add_primitives",
-    "aim",
-    "ascii_text",
-    "bounds_of",
-    "light_evenly",
-    "outline",
-    "showing",
-]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 SELECTED: Final[Vec3] = (1.0, 0.55, 0.05)

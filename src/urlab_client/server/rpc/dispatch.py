@@ -26,8 +26,6 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
 from urlab_client.server.system.serving_thread import ServingThread
 
-__all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "ServedRequest", "handles"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Q = TypeVar("Q", bound=Request[Any])

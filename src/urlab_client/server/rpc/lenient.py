@@ -24,8 +24,6 @@ from msgspec import NODEFAULT, UNSET, Struct, inspect
 from urlab_client.protocol.base import INT32_MAX, INT32_MIN
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["ABSENT", "Plain", "as_text", "bad_request", "bare", "fill", "fold_keys", "read_plain"]
-
 Plain: TypeAlias = Any
 """Contents of a frame: None, bool, int, float, str, list, or dict with str keys."""
 

@@ -24,8 +24,6 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.lenient import ABSENT, as_text, bad_request, bare, fill, fold_keys, read_plain
 
-__all__ = ["Incoming", "RequestReader", "need", "usable"]
-
 _DEFAULT_LIMITS: Final = Limits()
 
 _EXACT_NAMES: Final = frozenset({"hello", "meta"})

@@ -15,8 +15,6 @@ from urlab_client.server.core import ServerCore
 from urlab_client.server.rpc.dispatch import Dispatcher
 from urlab_client.server.system.health import Health, ended
 
-__all__ = ["Watchdog"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 INTERVAL_S: Final = 0.25

@@ -30,8 +30,6 @@ from urlab_client.server.streams.state_rows import PublishedRow, published_rows,
 from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
-__all__ = ["Broadcast", "Tick", "next_info"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats: TypeAlias = NDArray[np.float64]

@@ -30,8 +30,6 @@ from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAut
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
-__all__ = ["CameraStreams"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _Sent: TypeAlias = dict[str, int]

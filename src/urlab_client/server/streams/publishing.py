@@ -28,8 +28,6 @@ from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAut
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
-__all__ = ["StreamServer"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 WAITING_TICKS: Final = 64

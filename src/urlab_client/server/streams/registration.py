@@ -14,8 +14,6 @@ from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.system.health import Health, ended
 
-__all__ = ["Registration"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 

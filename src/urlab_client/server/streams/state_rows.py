@@ -16,8 +16,6 @@ from urlab_client.protocol.topics import StreamTopic, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl
 
-__all__ = ["PublishedRow", "published_rows", "topic_frame"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats: TypeAlias = NDArray[np.float64]

@@ -18,7 +18,6 @@ from urlab_client.protocol.control_messages import (
 )
 from urlab_client.server.physics.controllers import ArticulationControl
 
-__all__ = ["Actuators", "StreamedCommand", "read_commands"]
 NO_LIMIT: Final = 100.0
 """Control range of an actuator without one."""
 

@@ -6,8 +6,6 @@ import contextlib
 import ctypes
 import sys
 
-__all__ = ["limit_arenas", "trim"]
-
 _M_ARENA_MAX = -8  # of mallopt
 
 

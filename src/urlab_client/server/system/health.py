@@ -14,8 +14,6 @@ from typing import Final, TypeVarTuple
 
 from urlab_client._background import daemon
 
-__all__ = ["Health", "ended", "within"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Ts = TypeVarTuple("Ts")

@@ -11,8 +11,6 @@ from collections.abc import Callable
 
 from urlab_client.server.system.health import Health, ended
 
-__all__ = ["ServingThread"]
-
 
 class ServingThread:
     """The current serving thread. It calls `begin` before a request and `finish` after it."""

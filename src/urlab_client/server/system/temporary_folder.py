@@ -20,8 +20,6 @@ from typing import Final, Self
 
 from urlab_client._windows import NamedLock
 
-__all__ = ["TemporaryFolder", "sweep", "working_in"]
-
 _PREFIX: Final = "urlab-"
 _LOCK: Final = ".alive"
 _LOOK_S: Final = 0.01
@@ -72,7 +70,7 @@ def _hold(file: Path, flags: int) -> int | None:
     """Open and lock a file; None if another process holds it. Without support for locks, it is only opened."""
     descriptor = os.open(file, flags, 0o600)
     if sys.platform != "win32":
-        import fcntl  # noqa: PLC0415
+        import fcntl
 
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -115,7 +113,7 @@ def working_in(folder: Path) -> Generator[None]:
         finally:
             works.close()
         return
-    import fcntl  # noqa: PLC0415
+    import fcntl
 
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -157,7 +155,7 @@ def _alone_in(folder: Path) -> Generator[None]:
         finally:
             sweeps.close()
         return
-    import fcntl  # noqa: PLC0415
+    import fcntl
 
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -22,8 +22,6 @@ from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
 from urlab_client.protocol.errors import URLabError
 from urlab_client.server.system.health import Health
 
-__all__ = ["CurveKeys", "CurveServer", "UnprotectedServer", "ZapAuthenticator", "is_loopback"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _ZAP: Final = "inproc://zeromq.zap.01"

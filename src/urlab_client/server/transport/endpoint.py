@@ -20,8 +20,6 @@ from urlab_client.server.system.health import Health
 from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 
-__all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 LINGER_MS: Final = 500

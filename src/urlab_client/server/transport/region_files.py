@@ -26,8 +26,6 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["InstanceDirectory", "RegionFile", "RequestFile"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 PREFIX: Final = "urlab-"

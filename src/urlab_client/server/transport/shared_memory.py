@@ -36,8 +36,6 @@ from urlab_client.server.system.health import Health
 from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile, RequestFile
 
-__all__ = ["MAX_REPLY_BYTES", "SharedMemoryServer"]
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Answer = Callable[[bytes], bytes]

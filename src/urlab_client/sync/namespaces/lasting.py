@@ -10,8 +10,6 @@ from urlab_client.aio.namespaces import lasting as aio
 from urlab_client.protocol.types import PIEStartResult
 from urlab_client.sync._facade import Facade
 
-__all__ = ["Playing", "SceneEdit"]
-
 
 class Playing(Facade, twin=aio.Playing):
     """Play for the duration of a block; see `client.sim.playing()`."""

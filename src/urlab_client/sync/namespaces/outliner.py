@@ -9,8 +9,6 @@ from urlab_client.aio.namespaces import outliner as aio
 from urlab_client.protocol.scene_types import ActorInfo
 from urlab_client.sync.namespaces._ops import OutlinerOps
 
-__all__ = ["OutlinerNamespace"]
-
 
 class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):
     """Inspecting the world, and preparing plain meshes for physics."""

@@ -12,8 +12,6 @@ from urlab_client.protocol.types import RecordingHandle, RecordingSummary, Repla
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.namespaces._ops import ReplayOps
 
-__all__ = ["RecordingNamespace", "ReplayNamespace"]
-
 
 class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
     """Recording joint states on the server. The properties reflect this client's own calls."""

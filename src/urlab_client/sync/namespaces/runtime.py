@@ -21,8 +21,6 @@ from urlab_client.protocol.messages.session import ForwardOk
 from urlab_client.protocol.types import ContactsResult, SimOptions
 from urlab_client.sync.namespaces._ops import RuntimeOps
 
-__all__ = ["RuntimeNamespace"]
-
 
 class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     """Live changes to the running simulation; every op needs a play session."""

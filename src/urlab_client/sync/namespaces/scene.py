@@ -25,8 +25,6 @@ from urlab_client.sync.namespaces.lasting import SceneEdit
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["SceneNamespace"]
-
 
 class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     """Editor-time authoring. Edits during play take effect at the next start of play."""

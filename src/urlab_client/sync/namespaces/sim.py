@@ -12,8 +12,6 @@ from urlab_client.protocol.types import PIEStartResult, PIEStatus
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.namespaces.lasting import Playing
 
-__all__ = ["SimNamespace"]
-
 
 class SimNamespace(Facade, twin=aio.SimNamespace):
     """Starting and stopping play."""
