@@ -252,8 +252,9 @@ def _sphere(shown: Shown) -> tuple[list[float], float]:
     """Return a sphere around all robots, or around all bodies where there is none."""
     model, data = shown.model, shown.data
     owned = np.array([bool(_owner(shown, body)) for body in range(model.nbody)])
-    bodies: NDArray[np.bool_] = owned if owned.any() else np.arange(model.nbody) > 0
-    geoms = bodies[model.geom_bodyid] & (model.geom_rbound > 0.0)
+    if not owned.any():
+        owned[1:] = True  # all but the world
+    geoms = owned[model.geom_bodyid] & (model.geom_rbound > 0.0)
     if not geoms.any():
         return [0.0, 0.0, 0.0], 1.0
     places, sizes = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
