@@ -10,6 +10,6 @@ __all__ = ["rest"]
 
 def rest(server: SimulatedServer) -> None:
     """Let physics wait for steps: in live mode it goes on in real time, or publishes what does not change."""
-    running = server._running._core.play.current  # type: ignore[union-attr]
+    running = server._running.core.play.current
     if running is not None and running.engine.pinned_mode is None:
         running.engine.set_mode(StepMode.DIRECT)
