@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from urlab_client.protocol.client_types import (
+    from urlab_client.aio.client_types import (
         CallOutcome,
         CallRecord,
         ClientConfig,
@@ -18,18 +18,8 @@ if TYPE_CHECKING:
         ServerInfo,
         Verdict,
     )
-    from urlab_client.protocol.descriptions import (
-        ActuatorDescription,
-        ArticulationDescription,
-        CameraDescription,
-        ControllerDescription,
-        EntityDescription,
-        JointDescription,
-        Pose,
-        SceneDescription,
-        SensorDescription,
-    )
-    from urlab_client.protocol.enums import (
+    from urlab_client.aio.observer import ClientObserver
+    from urlab_client.enums import (
         ActuatorType,
         CameraMode,
         CameraTiming,
@@ -40,7 +30,7 @@ if TYPE_CHECKING:
         StepMode,
         Transport,
     )
-    from urlab_client.protocol.errors import (
+    from urlab_client.errors import (
         ActorHierarchyFailed,
         AddQuickConvertFailed,
         AuthenticationFailed,
@@ -152,36 +142,6 @@ if TYPE_CHECKING:
         StreamStats,
         TaskFailed,
     )
-    from urlab_client.protocol.names import UnknownName
-    from urlab_client.protocol.observer import ClientObserver
-    from urlab_client.protocol.scene_types import (
-        ActorBounds,
-        ActorHierarchyNode,
-        ActorInfo,
-        BlueprintInfo,
-        SceneActor,
-        SceneSnapshot,
-        URLabAsset,
-        URLabBlueprint,
-        URLabLightHandle,
-        URLabSpawnHandle,
-    )
-    from urlab_client.protocol.types import (
-        CameraPose,
-        Contact,
-        ContactsResult,
-        JobStatus,
-        KeyframeInfo,
-        MocapPose,
-        PIEStartResult,
-        PIEStatus,
-        RecordingHandle,
-        RecordingSummary,
-        ReplaySession,
-        ReplayStatus,
-        SimOptions,
-        UploadProgress,
-    )
     from urlab_client.sync import (
         DEFAULT,
         Actuator,
@@ -197,19 +157,59 @@ if TYPE_CHECKING:
         URLabPDController,
         check_address,
     )
+    from urlab_client.values.descriptions import (
+        ActuatorDescription,
+        ArticulationDescription,
+        CameraDescription,
+        ControllerDescription,
+        EntityDescription,
+        JointDescription,
+        Pose,
+        SceneDescription,
+        SensorDescription,
+    )
+    from urlab_client.values.names import UnknownName
+    from urlab_client.values.scene_types import (
+        ActorBounds,
+        ActorHierarchyNode,
+        ActorInfo,
+        BlueprintInfo,
+        SceneActor,
+        SceneSnapshot,
+        URLabAsset,
+        URLabBlueprint,
+        URLabLightHandle,
+        URLabSpawnHandle,
+    )
+    from urlab_client.values.types import (
+        CameraPose,
+        Contact,
+        ContactsResult,
+        JobStatus,
+        KeyframeInfo,
+        MocapPose,
+        PIEStartResult,
+        PIEStatus,
+        RecordingHandle,
+        RecordingSummary,
+        ReplaySession,
+        ReplayStatus,
+        SimOptions,
+        UploadProgress,
+    )
 
 __version__: str
 
 # Where a name is looked for, the light modules first. A test holds them against the imports above.
 _HOMES = (
-    "urlab_client.protocol.enums",
-    "urlab_client.protocol.errors",
-    "urlab_client.protocol.names",
-    "urlab_client.protocol.observer",
-    "urlab_client.protocol.client_types",
-    "urlab_client.protocol.descriptions",
-    "urlab_client.protocol.scene_types",
-    "urlab_client.protocol.types",
+    "urlab_client.enums",
+    "urlab_client.errors",
+    "urlab_client.values.names",
+    "urlab_client.aio.observer",
+    "urlab_client.aio.client_types",
+    "urlab_client.values.descriptions",
+    "urlab_client.values.scene_types",
+    "urlab_client.values.types",
     "urlab_client.protocol.messages.cameras",
     "urlab_client.protocol.messages.streams",
     "urlab_client.sync",

@@ -27,8 +27,8 @@ from urlab_client import (
 )
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.protocol.messages.streams import CameraSample
-from urlab_client.protocol.types import JobStatus
 from urlab_client.server import SimulatedServer
+from urlab_client.values.types import JobStatus
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from waiting import until as wait_until
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
 from urlab_client.aio.transport import connection_status
-from urlab_client.protocol.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
+from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,

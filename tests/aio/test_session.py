@@ -13,7 +13,7 @@ from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import Verdict
 from urlab_client.aio import URLabClient
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     RPC_ERRORS,
     ClientClosed,
     ConnectionLost,

@@ -27,8 +27,8 @@ from urlab_client.aio.live.row_source import RowSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import (
+from urlab_client.enums import CameraMode
+from urlab_client.errors import (
     ClientClosed,
     ConcurrentReadError,
     ProtocolError,
@@ -45,9 +45,9 @@ from urlab_client.protocol.messages.streams import (
     ServerReconnected,
     StateSnapshot,
 )
-from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.picture_memory import PictureMemory
 
 sys.path.append(str(Path(__file__).parents[1] / "protocol"))
 import vectors

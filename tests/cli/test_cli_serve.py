@@ -16,7 +16,7 @@ from waiting import eventually
 
 from urlab_client import ModeLocked, URLabClient, URLabPDController
 from urlab_client.cli import main
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",

@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode
 import urlab_client
 from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.enums import ControllerKind
+from urlab_client.errors import BadValue
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
-from urlab_client.protocol.errors import BadValue
 from urlab_client.server import ControllerConfig, Cut, Drop, Faults, Refuse, SimulatedServer
 
 Make = Callable[..., Any]

@@ -7,20 +7,9 @@ import numpy as np
 import pytest
 import vectors
 
-from urlab_client.protocol import pixels, shm, topics
-from urlab_client.protocol.base import Op, Reply
-from urlab_client.protocol.codec import (
-    check_request,
-    decode_answer,
-    decode_job,
-    decode_reply,
-    encode_reply,
-    encode_request,
-    from_wire_array,
-)
-from urlab_client.protocol.dialects import ALPHA, BETA
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import (
+from urlab_client.aio.features import Features
+from urlab_client.enums import CameraMode
+from urlab_client.errors import (
     ControlClaimed,
     HashMismatch,
     LeaseBusy,
@@ -33,11 +22,22 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     rpc_error,
 )
-from urlab_client.protocol.features import Features
+from urlab_client.protocol import pixels, shm, topics
+from urlab_client.protocol.base import Op, Reply
+from urlab_client.protocol.codec import (
+    check_request,
+    decode_answer,
+    decode_job,
+    decode_reply,
+    encode_reply,
+    encode_request,
+    from_wire_array,
+)
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatusOk
 from urlab_client.protocol.messages.session import HelloOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
+from urlab_client.server.dialects import ALPHA, BETA
 
 REPLIES = {op.reply_name: op for op in OPS.values()} | {"set_mode_ok": OPS["set_mode"]}
 

@@ -50,7 +50,7 @@ from urlab_client.aio.streams import Stream
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
-from urlab_client.protocol.names import NameMap
+from urlab_client.values.names import NameMap
 
 Floats = NDArray[np.float64]
 

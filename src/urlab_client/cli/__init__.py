@@ -20,7 +20,7 @@ import urlab_client
 from urlab_client._extras import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 __all__ = ["main"]
 

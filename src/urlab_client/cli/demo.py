@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from urlab_client._extras import need
-from urlab_client._whole_files import replaced
+from urlab_client._platform.files import replaced
 from urlab_client.cli._arguments import Commands, add_dialect, count
 from urlab_client.cli._common import CommandError, import_mujoco, one_line, output
 

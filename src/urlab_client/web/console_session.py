@@ -19,8 +19,8 @@ import anyio.to_thread
 from msgspec import structs
 
 from urlab_client.aio.background import kept_running
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
+from urlab_client.enums import StepMode
+from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,

@@ -18,7 +18,7 @@ import anyio.to_thread
 from msgspec import Struct
 
 from urlab_client._extras import MissingExtra, need
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 from urlab_client.web.stoppable import Progress, stoppable
 
 if TYPE_CHECKING:

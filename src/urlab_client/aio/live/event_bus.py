@@ -11,7 +11,6 @@ import msgspec
 from urlab_client.aio.arguments import collection
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler, client_closed
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,
@@ -26,7 +25,8 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicy,
     TaskFailed,
 )
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.names import did_you_mean
 
 _Event = (
     ServerConnected

@@ -8,17 +8,17 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Struct
 
+from urlab_client.enums import CameraMode
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import doc
 from urlab_client.protocol.codec import encode_message, from_wire_array
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState, StateReply, StepOk
-from urlab_client.protocol.picture_files import JPEG_QUALITY, jpeg, png
-from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.rows import Row
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.picture_files import JPEG_QUALITY, jpeg, png
+from urlab_client.values.pixels import Pixels
+from urlab_client.values.serializable import Serializable
 
 
 class StreamPolicy(StrEnum):

@@ -15,9 +15,9 @@ import numpy as np
 from msgspec import NODEFAULT, Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.plain_reading import kinds_of, read_array, read_bytes
-from urlab_client.protocol.schemas import field_notes, prose
-from urlab_client.protocol.serializable import plain
+from urlab_client.values.plain_reading import kinds_of, read_array, read_bytes
+from urlab_client.values.schemas import field_notes, prose
+from urlab_client.values.serializable import plain
 
 Schema = dict[str, Any]
 

@@ -9,10 +9,10 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.layouts import BytesLike, damaged
-from urlab_client.protocol.picture_memory import PictureMemory
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.enums import CameraMode
+from urlab_client.values.layouts import BytesLike, damaged
+from urlab_client.values.picture_memory import PictureMemory
+from urlab_client.values.serializable import Serializable
 
 Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 

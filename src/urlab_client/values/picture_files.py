@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._extras import need
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.pixels import Pixels, grey
+from urlab_client.enums import CameraMode
+from urlab_client.values.pixels import Pixels, grey
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.values.names import did_you_mean
 
 
 def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for each kind of type
