@@ -22,7 +22,7 @@ from urlab_client.errors import (
     URLabRPCError,
     rpc_error,
 )
-from urlab_client.protocol import pixels, shm, topics
+from urlab_client.protocol import shm, topics
 from urlab_client.protocol.base import Op, Reply
 from urlab_client.protocol.codec import (
     check_request,
@@ -38,6 +38,7 @@ from urlab_client.protocol.messages.session import HelloOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
+from urlab_client.values import pixels
 
 REPLIES = {op.reply_name: op for op in OPS.values()} | {"set_mode_ok": OPS["set_mode"]}
 
