@@ -22,7 +22,7 @@ from pyarrow import parquet
 
 import urlab_client
 from urlab_client.cli import main
-from urlab_client.cli.figures import Quantity, Trace, plot_trace
+from urlab_client.cli.plot import Curves, plot_curves
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
@@ -430,8 +430,8 @@ def test_values_say_what_they_measure() -> None:
 
 
 def test_sensors_of_one_kind_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    traces: list[Trace] = []
-    monkeypatch.setattr("urlab_client.cli.figures.plot_trace", lambda trace, _path: traces.append(trace))
+    drawn: list[Curves] = []
+    monkeypatch.setattr("urlab_client.cli.plot.plot_curves", lambda _title, _time, curves, _path: drawn.extend(curves))
     with (
         SimulatedServer("quadruped", play=True) as server,
         urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
@@ -440,7 +440,7 @@ def test_sensors_of_one_kind_share_an_axis(tmp_path: Path, monkeypatch: pytest.M
         with record(client, tmp_path / "run.mcap"):
             client.step()
     assert run("plot", tmp_path / "run.mcap", "--field", "sensors", "--joints", "imu_gyro.*", "imu_acc*.x") == 0
-    assert [(quantity.label, quantity.names) for quantity in traces[0].quantities] == [
+    assert [(curves.label, curves.names) for curves in drawn] == [
         ("quadruped\nlinear acceleration (m/s²)", ["imu_accelerometer.x"]),
         ("quadruped\nangular velocity (rad/s)", ["imu_gyro.x", "imu_gyro.y", "imu_gyro.z"]),
     ]
@@ -452,7 +452,7 @@ def test_curves_in_one_place_can_be_told_apart(tmp_path: Path) -> None:
     colours = []
     for columns in ([0, 1], [0, 1, 2]):
         names = ["a", "b", "c"][: len(columns)]
-        plot_trace(Trace("", time, values, [Quantity("q", names, columns)]), tmp_path / "plot.png")
+        plot_curves("", time, [Curves("q", names, values[:, columns])], tmp_path / "plot.png")
         pixels = np.asarray(Image.open(tmp_path / "plot.png"))[:, :1150, :3]  # without the legend
         colours.append([int((np.abs(pixels.astype(int) - colour).max(axis=-1) < 10).sum()) for colour in C0_AND_C2])
     (alone, none), (shared, twin) = colours
