@@ -23,7 +23,6 @@ from pyarrow import parquet
 import urlab_client
 from urlab_client.cli import main
 from urlab_client.cli.plot import Curves, plot_curves
-from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import (
@@ -35,8 +34,9 @@ from urlab_client.integrations.record import (
     tables,
 )
 from urlab_client.integrations.record import lerobot as lerobot_dataset
+from urlab_client.integrations.record.contents import even, visible
 from urlab_client.integrations.record.lerobot import LeRobot, _rate
-from urlab_client.integrations.record.pictures import even, visible
+from urlab_client.integrations.record.tables import component_name, quantities
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
@@ -261,7 +261,7 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
 
 
-def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_outlives_a_lerobot_is_not_waited_for(tmp_path: Path) -> None:
     python = tmp_path / "python"
     python.write_text(
         f"#!{sys.executable}\nimport os, time\n"
@@ -269,12 +269,22 @@ def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, mon
         "time.sleep(600)\n"
     )
     python.chmod(0o700)
-    monkeypatch.setattr(lerobot_dataset, "_DEADLINE_S", 0.1)
     with LeRobot(str(python), tmp_path) as writer:
         writer._process.wait()
-        with pytest.raises(RecordingError, match="LeRobot did not finish"):
-            writer.finish()
+        writer.finish()
     os.kill(int((tmp_path / "encodes").read_text()), signal.SIGKILL)
+
+
+def test_a_lerobot_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("import sys\nsys.stdin.read()\n")
+    monkeypatch.setattr(lerobot_dataset, "_SCRIPT", script)
+    monkeypatch.setattr(lerobot_dataset, "_DEADLINE_S", 0.1)
+    monkeypatch.setattr(lerobot_dataset, "_FRAME_S", 0.0)
+    with LeRobot(sys.executable, tmp_path) as writer:
+        writer.add({"state": np.zeros((1, 2))}, ends_episode=True)
+        with pytest.raises(RecordingError, match=r"LeRobot did not finish within 0\.1 s"):
+            writer.finish()
 
 
 @pytest.mark.usefixtures("small_pieces")
