@@ -23,18 +23,13 @@ from starlette.testclient import TestClient
 import urlab_client.protocol
 from urlab_client.aio.client_types import Diagnosis, Finding, ServerInfo, Verdict
 from urlab_client.errors import UnknownArticulation
+from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.integrations.policy.runner import PolicyRun
 from urlab_client.integrations.record.writer import RecorderStats
 from urlab_client.integrations.view.view import ViewStats
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.messages.session import ArticulationInfo, ArticulationState, Clock, HelloOk
-from urlab_client.protocol.messages.streams import (
-    CameraSample,
-    ClientEvent,
-    RowSample,
-    ServerLost,
-    StateSnapshot,
-)
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow
 from urlab_client.protocol.shm import Header, Publication
 from urlab_client.protocol.topics import StreamTopic
