@@ -18,7 +18,7 @@ VALUES = frozenset({"enums", "errors", "values"})
 ALLOWED: dict[str, frozenset[str]] = {
     "enums": frozenset(),
     "errors": frozenset({"enums", "values"}),
-    "values": frozenset({"_extras", "enums", "errors"}),
+    "values": frozenset({"_installation", "enums", "errors"}),
     "protocol": VALUES,
     "events": VALUES | {"protocol"},
     "types": VALUES | {"aio", "protocol"},
@@ -26,18 +26,15 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_platform": frozenset(),
     "_sandbox": frozenset(),
     "_mujoco": frozenset(),
-    "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),
-    "aio": VALUES | {"_extras", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
+    "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
     "sync": VALUES | {"aio", "events", "protocol", "types"},
     "randomise": VALUES | {"protocol"},
-    "server": VALUES
-    | {"_extras", "_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
+    "server": VALUES | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
     "": VALUES | {"_installation", "aio", "events", "protocol", "sync", "types"},
     "integrations": VALUES
     | {
         "",
-        "_extras",
         "_installation",
         "_mujoco",
         "_platform",
@@ -49,12 +46,11 @@ ALLOWED: dict[str, frozenset[str]] = {
         "sync",
     },
     "cluster": VALUES | {"types", "_installation", "_platform", "integrations", "protocol", "sync"},
-    "web": VALUES | {"events", "types", "_extras", "_installation", "aio", "integrations", "protocol"},
-    "mcp": VALUES | {"types", "_extras", "aio", "protocol", "web"},
+    "web": VALUES | {"events", "types", "_installation", "aio", "integrations", "protocol"},
+    "mcp": VALUES | {"types", "_installation", "aio", "protocol", "web"},
     "cli": VALUES
     | {
         "",
-        "_extras",
         "_installation",
         "_mujoco",
         "_platform",

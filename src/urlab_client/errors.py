@@ -360,7 +360,7 @@ class URLabRPCError(URLabError):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error as JSON-compatible data; in addition to the common fields, `details`."""
-        from urlab_client.values.serializable import plain  # errors alone need no NumPy
+        from urlab_client.values.plain import plain  # errors alone need no NumPy
 
         return {**super().to_dict(), "details": plain(self.details, "list")}
 

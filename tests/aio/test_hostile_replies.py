@@ -29,7 +29,7 @@ from urlab_client.errors import ProtocolError
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server.streams.control_messages import ActuatorInfo, ControlPayload, decode_gains
-from urlab_client.values.pixels import decode_camera
+from urlab_client.values.pictures import decode_camera
 
 pytestmark = pytest.mark.mujoco("3.12")  # one of its actuators is a `pid`
 

@@ -41,7 +41,7 @@ from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
 from urlab_client.protocol.topics import TopicKind
-from urlab_client.values.picture_memory import PictureMemory
+from urlab_client.values.pictures import PictureMemory
 
 sys.path.append(str(Path(__file__).parents[1] / "protocol"))
 import vectors

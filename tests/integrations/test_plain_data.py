@@ -34,10 +34,9 @@ from urlab_client.protocol.rows import BaseStateRow, JointRow
 from urlab_client.protocol.shm import Header, Publication
 from urlab_client.protocol.topics import StreamTopic
 from urlab_client.values.descriptions import Pose, SceneDescription
-from urlab_client.values.pixels import CameraImage
-from urlab_client.values.plain_reading import kinds_of
+from urlab_client.values.pictures import CameraImage
+from urlab_client.values.plain import Serializable, kinds_of
 from urlab_client.values.scene_types import ActorHierarchyNode, BlueprintInfo
-from urlab_client.values.serializable import Serializable
 from urlab_client.values.types import CameraPose, SimOptions
 
 # What transports and robots are sent; no call returns any of it.

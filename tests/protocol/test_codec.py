@@ -46,7 +46,7 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.server.streams.broadcast import StateFull
-from urlab_client.values.serializable import plain as plain_data
+from urlab_client.values.plain import plain as plain_data
 
 OPS_BY_NAME = sorted(OPS)
 

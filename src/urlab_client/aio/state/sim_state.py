@@ -45,7 +45,7 @@ from urlab_client.protocol.messages.session import (
 )
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.sim_options import check_sim_options
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import Pixels, decode_camera
 from urlab_client.values.types import SimOptions
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

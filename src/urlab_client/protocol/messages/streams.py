@@ -16,9 +16,8 @@ from urlab_client.protocol.messages.session import ArticulationState, Clock, Ent
 from urlab_client.protocol.rows import Row
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.picture_files import JPEG_QUALITY, jpeg, png
-from urlab_client.values.pixels import Pixels
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.pictures import JPEG_QUALITY, Pixels, jpeg, png
+from urlab_client.values.plain import Serializable
 
 
 class StreamPolicy(StrEnum):
