@@ -16,7 +16,7 @@ from PIL import Image
 from urlab_client.integrations._feed.messages import CompressedImage, EpisodeMessage, OutcomeMessage, RawImage
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.values.pixels import Pixels, without_alpha
+from urlab_client.values.pictures import Pixels, without_alpha
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
