@@ -22,7 +22,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "protocol": VALUES,
     "keys": frozenset({"errors"}),
     "_platform": frozenset(),
-    "_sandbox": frozenset(),
+    "_sandbox": frozenset({"_platform"}),
     "_mujoco": frozenset(),
     "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),

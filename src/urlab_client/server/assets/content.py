@@ -40,8 +40,7 @@ from urlab_client.server.assets.blueprint import (
     to_record,
 )
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
-from urlab_client.server.assets.importer import Compiled, compile_snapshot, one_line, write_snapshot
-from urlab_client.server.assets.sandbox import build_confined
+from urlab_client.server.assets.importer import Compiled, build_confined, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in

@@ -1,11 +1,12 @@
-"""Permanently restricting the file access of a process, with the Linux kernel's Landlock.
+"""Permanently limiting a process: its memory and processor time, and with the Linux kernel's Landlock its files.
 
-This module uses the system calls directly, which are part of the kernel's stable interface. The bindings on the package
-index are either pre-releases or far larger, and as an extra the protection would be missing where it is needed.
+The system calls are used directly, which are part of the kernel's stable interface. The bindings on the package index
+are either pre-releases or far larger, and as an extra the protection would be missing where it is needed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import struct
@@ -111,3 +112,37 @@ def _call(number: int, *arguments: object) -> int:
         error = ctypes.get_errno()
         raise OSError(error, os.strerror(error))
     return result
+
+
+def limit_process(memory_bytes: int, cpu_s: int) -> None:
+    """Limit additional memory and processor time of this process permanently, as far as the system supports it.
+
+    SIGXCPU terminates the process beyond the time limit; allocations fail beyond the memory limit.
+    """
+    if sys.platform == "win32":
+        return
+    import resource  # not on Windows
+
+    present = 0
+    with contextlib.suppress(OSError):
+        present = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
+    # The hard limit is above the soft one, whose signal shows why the process ended.
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 5))
+    memory = present + memory_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def forbid_opening() -> bool:
+    """Permanently keep this process from opening files, sockets and pipes. Open ones stay usable.
+
+    Returns:
+        False on Windows, which has no such limit; nothing was done.
+    """
+    if sys.platform == "win32":
+        return False
+    import resource  # not on Windows
+
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    return True
