@@ -246,7 +246,6 @@ def run_confined(job: Job, progress: Callable[[int], object] = lambda _: None, *
     """Have a job done, and return its result. Blocks for a bounded time.
 
     Args:
-        job: The job.
         progress: Callback invoked about ten times a second. If it raises, the work is broken off.
         keep: Whether the process stays for the next job, which then starts at once.
 

@@ -175,11 +175,7 @@ def _combined(bases: Iterable[Path], folders: Iterable[str], names: Iterable[str
 
 
 def _inside(candidate: Path, roots: tuple[Path, ...]) -> Path | None:
-    """Return the resolved file; None if it does not exist.
-
-    Raises:
-        Outside: It is elsewhere, or not a file but a device or the like.
-    """
+    """Return the resolved file, which must be a regular one in a folder that is allowed; None if there is none."""
     try:
         if not os.path.lexists(candidate):
             return None

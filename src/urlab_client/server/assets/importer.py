@@ -99,11 +99,7 @@ class _Order(msgspec.Struct):
 
 
 def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: Limits) -> Compiled:
-    """Write and compile a snapshot in a confined process, for a file that may refer only to files below `roots`.
-
-    Raises:
-        Refusal: `import_failed`, with what was wrong or which limit was exceeded.
-    """
+    """Write and compile a snapshot in a confined process, for a file that may refer only to files below `roots`."""
     folders = [str(root) for root in roots]
     job = Job(
         work=f"{__name__}:build_order",
@@ -176,7 +172,6 @@ def write_snapshot(file: Path, snapshot: Path) -> Written:
     """Write the snapshot of an MJCF file.
 
     Args:
-        file: The file.
         snapshot: Folder to write, which must not exist.
 
     Raises:
@@ -205,8 +200,6 @@ def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limit
 
     Args:
         written: Result of `write_snapshot`.
-        file: The file.
-        snapshot: Folder of the snapshot.
         limits: For the ranges of its options; nothing is refused here.
 
     Raises:

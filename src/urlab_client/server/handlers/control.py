@@ -19,21 +19,13 @@ def _owner(request: ControlRequest[Any]) -> str:
 
 
 def check_owner(server: ServerCore, request: ControlRequest[Any], robot: ArticulationControl) -> None:
-    """Refuse a write to a robot by a client that does not own it, if robots have owners.
-
-    Raises:
-        Refusal: `not_control_owner`.
-    """
+    """Refuse a write to a robot by a client that does not own it, if robots have owners."""
     if server.dialect.claims:
         server.play.running().claims.check(robot.index.key, _owner(request))
 
 
 def check_all_owners(server: ServerCore, request: ControlRequest[Any]) -> None:
-    """Refuse a write to all robots while another client owns one of them, if robots have owners.
-
-    Raises:
-        Refusal: `not_control_owner`.
-    """
+    """Refuse a write to all robots while another client owns one of them, if robots have owners."""
     if server.dialect.claims:
         running = server.play.running()
         keys = [robot.index.key for robot in running.engine.articulations.controls.values()]

@@ -29,11 +29,7 @@ def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
 
 
 def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
-    """Return the file that a request names, relative to the folder of recordings, and that folder; links are resolved.
-
-    Raises:
-        Refusal: `code`, if it is a folder or not a usable path.
-    """
+    """Return the resolved file that a request names relative to the folder of recordings, and that folder."""
     try:
         folder = replay_folder(server.world.content.root).resolve()
         file = Path(os.path.abspath(folder / path))
@@ -47,11 +43,7 @@ def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
 
 
 def _to_write(server: ServerCore, path: str) -> Path:
-    """Return the file to save a recording to, in the folder of recordings.
-
-    Raises:
-        Refusal: `path_not_writable`.
-    """
+    """Return the file to save a recording to, in the folder of recordings."""
     file, folder = _locate(server, path, "path_not_writable")
     if file.parent != folder:
         raise Refusal(
@@ -65,11 +57,7 @@ def _to_write(server: ServerCore, path: str) -> Path:
 
 
 def _to_read(server: ServerCore, path: str) -> Path:
-    """Return the file to load a recording from, in the folder of recordings or below a model root.
-
-    Raises:
-        Refusal: `path_not_readable`.
-    """
+    """Return the file to load a recording from, in the folder of recordings or below a model root."""
     file, folder = _locate(server, path, "path_not_readable")
     folders = (folder, *server.world.content.model_roots)
     if not any(file.is_relative_to(allowed) for allowed in folders):

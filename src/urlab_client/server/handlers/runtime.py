@@ -257,11 +257,7 @@ def set_sim_options(server: ServerCore, request: runtime.SetSimOptions) -> runti
 
 
 def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
-    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
-
-    Raises:
-        Refusal: `bad_mode`.
-    """
+    """Return the step mode called `text`, in any case. `streaming` means live, and so does `auto` in newer dialects."""
     name = text.casefold()
     try:
         mode = StepMode.LIVE if name == "streaming" else StepMode(name)
@@ -271,11 +267,7 @@ def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
 
 
 def parse_control_source(text: str) -> ControlSource:
-    """Return the control source called `text`, in any case.
-
-    Raises:
-        Refusal: `bad_value`.
-    """
+    """Return the control source called `text`, in any case."""
     try:
         return ControlSource(text.casefold())
     except ValueError:
@@ -315,11 +307,7 @@ def set_camera_delay(server: ServerCore, request: cameras.SetCameraDelay) -> cam
 
 
 def _known(running: Running, request: Request[Any], wanted: Mapping[str, T]) -> dict[str, T]:
-    """Return a request's entries for existing cameras, by camera key, ignoring case.
-
-    Raises:
-        Refusal: `missing_field`; `bad_request` if it contains no camera.
-    """
+    """Return a request's entries for existing cameras, by camera key, ignoring case."""
     asked = need(request, wanted, "cameras")
     if not asked:
         raise Refusal("bad_request", f"{request.__struct_config__.tag}: field 'cameras' is empty")
@@ -338,11 +326,7 @@ def _places(wanted: bool | cameras.CameraTransports) -> tuple[bool, bool]:
 def _latency(
     key: str, asked: cameras.CameraDelay, before: cameras.CameraDelayInForce | None
 ) -> cameras.CameraDelayInForce:
-    """Return the requested latency.
-
-    Raises:
-        Refusal: `bad_request` for a clock that does not exist, and for a number that single precision cannot hold.
-    """
+    """Return the requested latency."""
     clock = asked.clock.lower()
     if clock not in ("sim", "wall"):
         raise Refusal("bad_request", f"set_camera_delay: clock of '{key}' is '{asked.clock}', not 'sim' or 'wall'")

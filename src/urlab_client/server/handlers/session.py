@@ -200,11 +200,7 @@ def _pictures_wait_s(request: session.Step) -> float:
 
 
 def _check_owners(server: ServerCore, running: Running, request: session.Step) -> None:
-    """Refuse commands to robots that the sender does not own, if robots have owners.
-
-    Raises:
-        Refusal: `not_control_owner`; nothing was applied.
-    """
+    """Refuse commands to robots that the sender does not own, if robots have owners."""
     if not server.dialect.claims:
         return
     for name, command in (request.per_articulation or {}).items():

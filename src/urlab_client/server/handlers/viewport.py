@@ -86,11 +86,7 @@ def _seen(view: ViewportCamera) -> dict[str, Any]:
 
 
 def need_point(request: Request[Any], value: Vec3, field: str) -> Vec3:
-    """Return the value of a required vector field.
-
-    Raises:
-        Refusal: `missing_field` if it is absent, malformed or not finite.
-    """
+    """Return the value of a required vector field."""
     point = need(request, value, field)
     if not all(map(math.isfinite, point)):
         raise Refusal("missing_field", f"{request.__struct_config__.tag}: '{field}' needs finite numbers")
@@ -98,11 +94,7 @@ def need_point(request: Request[Any], value: Vec3, field: str) -> Vec3:
 
 
 def need_rotator(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -> Vec3 | None:
-    """Return the rotator (roll, pitch, yaw), degrees, of a request's rotation in Unreal's frame; None without one.
-
-    Raises:
-        Refusal: `missing_field` for numbers that do not form a rotation.
-    """
+    """Return the rotator (roll, pitch, yaw), degrees, of a request's rotation in Unreal's frame; None without one."""
     try:
         return rotator(quat, euler)
     except ValueError as error:

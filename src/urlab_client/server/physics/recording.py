@@ -95,7 +95,6 @@ class LiveRecording:
         """Prepare for a scene.
 
         Args:
-            scene: The scene.
             most_bytes: Memory for frames; beyond it the oldest go, as if the window were shorter.
         """
         self._most_bytes = most_bytes
