@@ -67,7 +67,7 @@ class EditorJobs:
         return job
 
     def take(self, job: str) -> dict[str, Any] | None:
-        """Return the result of a job and forget the job, or None while it is not done. Unknown and expired ones are refused."""
+        """Return the result of a job and forget the job, or return None while it is not done; refuse unknown jobs."""
         with self._lock:
             self._expire()
             if job not in self._results:

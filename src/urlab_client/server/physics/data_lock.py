@@ -81,7 +81,7 @@ class DataLock:
         self._call = call
 
     def acquire(self) -> bool:
-        """Acquire the lock; return False if it does not become free in time. Refuses at once while a call is overdue."""
+        """Acquire the lock, or return False if it does not become free in time. Refuses while a call is overdue."""
         if self.inner.acquire(blocking=False):
             return True
         overdue = self._call.overdue
