@@ -29,8 +29,9 @@ ALLOWED: dict[str, frozenset[str]] = {
     "aio": VALUES | {"_extras", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
     "sync": VALUES | {"aio", "protocol"},
     "randomise": VALUES | {"protocol"},
+    "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
     "server": VALUES
-    | {"_extras", "_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
+    | {"_extras", "_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise", "simulation"},
     "": VALUES | {"_installation", "aio", "protocol", "sync"},
     "integrations": VALUES
     | {
@@ -44,6 +45,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
     },
     "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync"},
@@ -63,6 +65,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
         "web",
     },
@@ -106,7 +109,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "server": (
         "dialects",
-        "controller_text",
         "system",
         "limits",
         "refusal",
@@ -230,6 +232,17 @@ def violations(package: Path) -> list[str]:
 
 def test_imports_point_one_way() -> None:
     assert violations(PACKAGE) == []
+
+
+def test_integrations_use_the_public_server() -> None:
+    public = {"SimulatedServer", "ServedRequest"}
+    inside = [
+        f"{file.relative_to(PACKAGE).as_posix()}:{line}: {imported}"
+        for file in sorted((PACKAGE / "integrations").rglob("*.py"))
+        for line, imported in facts(file).imports
+        if imported.startswith("urlab_client.server.") and imported.rpartition("urlab_client.server.")[2] not in public
+    ]
+    assert inside == []
 
 
 def test_imports_inside_the_large_layers_point_one_way() -> None:

@@ -19,11 +19,11 @@ from urlab_client.protocol.messages.cameras import (
     SetCameraStreamingOk,
 )
 from urlab_client.server.core import ServerCore
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.simulation.controllers import float32
 
 T = TypeVar("T")
 

@@ -25,10 +25,10 @@ from urlab_client.server.assets.actors import Actor
 from urlab_client.server.compile.bounds import actor_bounds
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import Quat, Vec3, xyzw
 
 
