@@ -30,7 +30,9 @@ ALLOWED: dict[str, frozenset[str]] = {
     "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
     "sync": VALUES | {"aio", "events", "protocol", "types"},
     "randomise": VALUES | {"protocol"},
-    "server": VALUES | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
+    "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
+    "server": VALUES
+    | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise", "simulation"},
     "": VALUES | {"_installation", "aio", "events", "protocol", "sync", "types"},
     "integrations": VALUES
     | {
@@ -43,6 +45,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
     },
     "cluster": VALUES | {"types", "_installation", "_platform", "integrations", "protocol", "sync"},
@@ -62,6 +65,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
         "types",
         "web",
@@ -106,7 +110,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "server": (
         "dialects",
-        "controller_text",
         "system",
         "limits",
         "refusal",
@@ -230,6 +233,17 @@ def violations(package: Path) -> list[str]:
 
 def test_imports_point_one_way() -> None:
     assert violations(PACKAGE) == []
+
+
+def test_integrations_use_the_public_server() -> None:
+    public = {"SimulatedServer", "ServedRequest"}
+    inside = [
+        f"{file.relative_to(PACKAGE).as_posix()}:{line}: {imported}"
+        for file in sorted((PACKAGE / "integrations").rglob("*.py"))
+        for line, imported in facts(file).imports
+        if imported.startswith("urlab_client.server.") and imported.rpartition("urlab_client.server.")[2] not in public
+    ]
+    assert inside == []
 
 
 def test_imports_inside_the_large_layers_point_one_way() -> None:

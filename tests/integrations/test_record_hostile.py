@@ -51,7 +51,7 @@ from urlab_client.integrations.record import (
 )
 from urlab_client.randomise import Randomisation
 from urlab_client.server import SimulatedServer
-from urlab_client.server.physics import recording
+from urlab_client.simulation import joint_recording as recording
 from urlab_client.web.messages import state_message
 from urlab_client.web.pictures import _jpeg_of
 from urlab_client.web.recordings import _described

@@ -99,7 +99,7 @@ def run(arguments: RecordArguments) -> int:
     import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # fail early
 
     if arguments.camera and arguments.address.startswith("sim://"):
-        from urlab_client.server.render.opengl import need_backend
+        from urlab_client.simulation.opengl import need_backend
 
         need_backend()  # the server that this command starts renders on this machine
     try:

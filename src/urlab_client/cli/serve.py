@@ -17,7 +17,7 @@ from urlab_client.cli._arguments import Commands, add_dialect, count, image_size
 from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._serve_events import Event, Events, Starter, next_event, stop_on_signals, watch_input
 from urlab_client.enums import CameraMode, StepMode
-from urlab_client.server.controller_text import ControllerText
+from urlab_client.simulation.controller_config import ControllerConfig
 
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
@@ -33,7 +33,7 @@ class ControllerOption(NamedTuple):
     """`--controller ACTOR=KIND[,gain=…]`."""
 
     actor: str
-    controller: ControllerText
+    controller: ControllerConfig
 
 
 class CameraOption(NamedTuple):
@@ -296,7 +296,6 @@ def run(arguments: ServeArguments) -> int:
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
     from urlab_client.server.limits import Limits
-    from urlab_client.server.physics.controllers import ControllerConfig
     from urlab_client.server.simulated import SimulatedServer
 
     try:
@@ -315,7 +314,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_port=arguments.camera_port,
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
-            controllers={item.actor: ControllerConfig.of(item.controller) for item in arguments.controller},
+            controllers={item.actor: item.controller for item in arguments.controller},
             camera_modes={item.camera: item.mode for item in arguments.camera_mode},
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
@@ -436,7 +435,7 @@ def _controller(text: str) -> ControllerOption:
     if not actor or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
     try:
-        return ControllerOption(actor, ControllerText.parse(value))
+        return ControllerOption(actor, ControllerConfig.parse(value))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import mujoco
 
-from urlab_client.server.physics.controllers import float32
+from urlab_client.simulation.controllers import float32
 
 MIN_SPEED: Final = 5.0
 MAX_SPEED: Final = 100.0

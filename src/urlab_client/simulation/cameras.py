@@ -17,10 +17,31 @@ from numpy.typing import NDArray
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraFrame
 
+DEFAULT_CAMERA_SIZE: Final = (640, 480)
+
 CAPACITY: Final = 1000
 """Approximate number of past states kept per camera; at higher rates, states are skipped."""
 
 _SLACK_S: Final = 1e-6  # sums of timesteps are not exact
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCamera:
+    """A camera of an articulation.
+
+    Attributes:
+        name: Short name.
+        id: Camera id in the model.
+        mode: What its pixels mean: `real`, `depth`, `semantic` or `instance`.
+        resolution: Width and height, pixels.
+        fovy: Vertical field of view, degrees.
+    """
+
+    name: str
+    id: int
+    mode: str = "real"
+    resolution: tuple[int, int] = DEFAULT_CAMERA_SIZE
+    fovy: float = 45.0
 
 
 class Instant(NamedTuple):

@@ -13,22 +13,11 @@ from numpy.typing import NDArray
 
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame
-from urlab_client.server.compile.scene_index import SceneCamera
-from urlab_client.server.editor.viewport import ViewMode
-from urlab_client.server.render.appearance import RenderQuality
-from urlab_client.server.render.opengl import Backend, free_context, make_context
-from urlab_client.server.render.sunlight import follow_subject, moving_geoms, shadow_clip
-from urlab_client.server.render.tints import Tints
-from urlab_client.server.render.viewport_picture import (
-    ViewportPicture,
-    add_primitives,
-    aim,
-    ascii_text,
-    bounds_of,
-    light_evenly,
-    outline,
-    showing,
-)
+from urlab_client.simulation.appearance import RenderQuality
+from urlab_client.simulation.cameras import SceneCamera
+from urlab_client.simulation.opengl import Backend, free_context, make_context
+from urlab_client.simulation.sunlight import follow_subject, moving_geoms, shadow_clip
+from urlab_client.simulation.tints import Tints
 
 Bytes = NDArray[np.uint8]
 
@@ -142,40 +131,6 @@ class Stage:
         colors = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(colors, None, area, self._renderer)
         return self._segments(colors[::-1], mode)
-
-    def paint(self, data: mujoco.MjData, picture: ViewportPicture) -> Bytes:
-        """Draw the viewport; return red, green, blue and alpha from the top, shape (height, width, 4)."""
-        width, height = picture.size
-        view, mode, renderer = picture.view, picture.mode, self._renderer
-        if width > renderer.offWidth or height > renderer.offHeight:
-            mujoco.mjr_resizeOffscreen(max(width, renderer.offWidth), max(height, renderer.offHeight), renderer)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
-        if picture.fit and (bounds := bounds_of(self._model, data, self._model.geom_rgba[:, 3] > 0.0)):
-            view = view.framing(*bounds)
-        self._model.vis.global_.fovy = view.fovy(width / height)
-        aim(self._view, view)
-        kinds_of_geoms = mujoco.mjtCatBit.mjCAT_ALL.value
-        with showing(mode, self._model, self._option):
-            mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, kinds_of_geoms, self._scene)
-        for side in self._scene.camera:
-            side.forward[:], side.up[:] = view.forward, view.up
-        if not self._fast:
-            follow_subject(self._scene, self._model, data, self._subjects)
-        if mode is ViewMode.UNLIT:
-            light_evenly(self._scene)
-        add_primitives(self._scene, picture.primitives)
-        if picture.selected and (bounds := bounds_of(self._model, data, self._tints.owned_by(picture.selected))):
-            add_primitives(self._scene, [outline(bounds)])
-        flags, kinds = self._scene.flags, mujoco.mjtRndFlag
-        flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast and mode is ViewMode.LIT
-        flags[kinds.mjRND_SEGMENT] = flags[kinds.mjRND_IDCOLOR] = False
-        flags[kinds.mjRND_WIREFRAME] = mode is ViewMode.WIREFRAME
-        area = mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(area, self._scene, renderer)
-        if picture.overlay:
-            font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
-            mujoco.mjr_overlay(font, corner, area, ascii_text(picture.overlay), "", renderer)
-        return self._read_colors(area, "RGBA")
 
     def _read_colors(self, area: mujoco.MjrRect, order: str) -> Bytes:
         """Return what was drawn, opaque, from the top, shape (height, width, 4).

@@ -21,8 +21,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.server.compile.scene import CompiledScene
-
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats = NDArray[np.float64]
@@ -91,7 +89,7 @@ class LiveRecording:
         max_duration_s: Length of the rolling window, seconds of simulation time; 0 or less is unlimited.
     """
 
-    def __init__(self, scene: CompiledScene, most_bytes: int) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, most_bytes: int) -> None:
         """Prepare for a scene.
 
         Args:
@@ -100,8 +98,7 @@ class LiveRecording:
         self._most_bytes = most_bytes
         self.frames: deque[Frame] = deque()
         self.max_duration_s: float = 0.0
-        self._data = scene.data
-        model = scene.model
+        self._data = data
         coordinates = np.diff(np.append(model.jnt_qposadr, model.nq))
         velocities = np.diff(np.append(model.jnt_dofadr, model.nv))
         self._layout = JointLayout.of(
