@@ -47,8 +47,9 @@ ALLOWED: dict[str, frozenset[str]] = {
         "sync",
     },
     "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync"},
-    "web": VALUES | {"_extras", "_installation", "aio", "integrations", "protocol"},
-    "mcp": VALUES | {"_extras", "aio", "protocol", "web"},
+    "console": VALUES | {"_extras", "aio", "integrations", "protocol"},
+    "web": VALUES | {"_installation", "aio", "console", "integrations", "protocol"},
+    "mcp": VALUES | {"_extras", "aio", "console", "protocol", "web"},
     "cli": VALUES
     | {
         "",
@@ -57,6 +58,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "_mujoco",
         "_platform",
         "aio",
+        "console",
         "integrations",
         "keys",
         "mcp",
@@ -237,7 +239,7 @@ def test_imports_inside_the_large_layers_point_one_way() -> None:
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "console", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 
