@@ -18,8 +18,8 @@ import anyio.to_thread
 from msgspec import Struct
 
 from urlab_client._installation import MissingExtra, need
+from urlab_client.console.stoppable import Progress, stoppable
 from urlab_client.errors import URLabError
-from urlab_client.web.stoppable import Progress, stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient

@@ -19,6 +19,17 @@ import anyio.to_thread
 from msgspec import structs
 
 from urlab_client.aio.background import kept_running
+from urlab_client.console.body_pushing import BodyPushing
+from urlab_client.console.controls import Controls
+from urlab_client.console.description import WorldDescription, describe
+from urlab_client.console.hand_driving import HandDriving
+from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.messages import Ctrl, Hand, Link, LogEntry, Status, World, rounded, state_message
+from urlab_client.console.mujoco_viewer import MujocoViewer
+from urlab_client.console.ops import encode
+from urlab_client.console.pictures import Feed
+from urlab_client.console.recordings import Recordings
+from urlab_client.console.replay import Replay
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
 from urlab_client.events import (
@@ -33,17 +44,6 @@ from urlab_client.events import (
     SessionOpened,
 )
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.web.body_pushing import BodyPushing
-from urlab_client.web.controls import Controls
-from urlab_client.web.description import WorldDescription, describe
-from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.hand_driving import HandDriving
-from urlab_client.web.messages import Ctrl, Hand, Link, LogEntry, Status, World, rounded, state_message
-from urlab_client.web.mujoco_viewer import MujocoViewer
-from urlab_client.web.ops import encode
-from urlab_client.web.pictures import Feed
-from urlab_client.web.recordings import Recordings
-from urlab_client.web.replay import Replay
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient

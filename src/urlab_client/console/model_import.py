@@ -1,4 +1,4 @@
-"""Model uploads in the HTTP API: an MJCF file, or a ZIP archive of an MJCF file and its meshes.
+"""Models that viewers send: an MJCF file, or a ZIP archive of an MJCF file and its meshes.
 
 What viewers send is unpacked and compiled in a confined process only. The server gets what that made of it.
 """
@@ -15,18 +15,14 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
 import anyio.to_thread
-from starlette.requests import Request
-from starlette.responses import Response
 
 from urlab_client.aio.model.compilation import flatten_confined
 from urlab_client.aio.model.upload import FlatModel, upload
+from urlab_client.console.stoppable import stoppable
 from urlab_client.errors import ImportFailed
 from urlab_client.protocol.instances import import_directory
 from urlab_client.values.names import is_file_name
 from urlab_client.values.scene_types import URLabBlueprint
-from urlab_client.web.ops import encode
-from urlab_client.web.route_group import JOB, Handler, RouteGroup
-from urlab_client.web.stoppable import stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -49,29 +45,6 @@ class WouldReplace(Exception):
     def __init__(self, name: str) -> None:
         super().__init__(f"There is already a blueprint {name!r}, which importing this model would replace.")
         self.name = name
-
-
-class ModelRoutes(RouteGroup):
-    """Handler of `/api/models`."""
-
-    def routes(self) -> list[tuple[str, Handler, list[str]]]:
-        """Return path, handler and methods of each route."""
-        return [("/api/models/{name}", self._take, ["PUT"])]
-
-    async def _take(self, request: Request) -> Response:
-        viewer, name = self._viewer(request), request.path_params["name"]
-        request.scope[JOB] = f"the import of {name}"
-        async with self._console.lease.hold(viewer):  # large models take longer than the controls are kept
-            await self._console.opened()
-            model = await received_model(name, request.stream())
-            try:
-                made = await import_model(self._console.client, name, model, request.query_params.get("replace", ""))
-            except WouldReplace as error:
-                hint = f"Send it again with ?replace={error.name} to replace it."
-                said = {"code": "would_replace", "message": str(error), "hint": hint, "name": error.name}
-                return Response(encode({"error": said}), 409, media_type="application/json")
-        self._console.note("call", viewer.name, "import model", name)
-        return Response(encode({"blueprint": made.class_path, "name": made.short_name}), media_type="application/json")
 
 
 async def received_model(name: str, chunks: AsyncIterator[bytes]) -> FlatModel:

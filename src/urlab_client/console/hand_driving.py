@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Protocol
 import anyio
 import numpy as np
 
+from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
+from urlab_client.console.messages import Hand
 from urlab_client.errors import URLabError
-from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
-from urlab_client.web.messages import Hand
 
 if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.aio import URLabClient
+    from urlab_client.console.controls import Controls
     from urlab_client.integrations.teleop import HandControl
-    from urlab_client.web.controls import Controls
 
 _PERIOD_S = 0.02
 _LASTS_S = 0.25

@@ -20,11 +20,11 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.console.recordings import open_run
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.web.recordings import open_run
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient

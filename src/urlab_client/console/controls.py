@@ -11,6 +11,9 @@ import anyio
 import numpy as np
 from msgspec import structs
 
+from urlab_client.console.description import WorldDescription
+from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.ops import encode, perform
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Effect, Request
@@ -20,9 +23,6 @@ from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.messages.streams import (
     StateSnapshot,
 )
-from urlab_client.web.description import WorldDescription
-from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.ops import encode, perform
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient

@@ -14,10 +14,10 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.mujoco_viewer import MujocoViewer, Shown
+from urlab_client.console.replay import Replay
 from urlab_client.enums import StepMode
-from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.mujoco_viewer import MujocoViewer, Shown
-from urlab_client.web.replay import Replay
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient

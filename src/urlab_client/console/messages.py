@@ -8,11 +8,11 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from msgspec import Meta, Struct
 
+from urlab_client.console.description import WorldDescription
+from urlab_client.console.recordings import Conversion, RunningRecording
+from urlab_client.console.replay import ReplayView
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.web.description import WorldDescription
-from urlab_client.web.recordings import Conversion, RunningRecording
-from urlab_client.web.replay import ReplayView
 
 Numbers: TypeAlias = list[float | None]
 """Numbers with five digits; null for a number that is not finite."""
