@@ -36,7 +36,7 @@ PLAIN = {
 AWAITED = {
     "_platform/threads.py:daemon": "makes the threads of the helpers",
     "aio/background.py:background_task": "makes the tasks of the helpers",
-    "aio/session.py:probe": "waits for the task and returns its result",
+    "aio/session/session.py:probe": "waits for the task and returns its result",
     "aio/launch.py:_started": "waits for the task and raises its error",
     "sync/_loop.py:_drive": "the caller of the job waits for it; the job holds every error of its coroutine",
     "sync/_loop.py:_start_job": "likewise",

@@ -15,13 +15,13 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio import launch as launching
-from urlab_client.aio.control import Control
 from urlab_client.aio.launch import LaunchedTransport
-from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.live_state import LiveState
+from urlab_client.aio.session.control import Control
 from urlab_client.aio.state import session_keeper
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.session_keeper import SessionKeeper
+from urlab_client.aio.streams.camera_switch import CameraSwitch
+from urlab_client.aio.streams.live_state import LiveState
 from urlab_client.aio.transport import readiness
 from urlab_client.aio.transport.poller import Poller
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions

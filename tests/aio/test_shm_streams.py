@@ -17,8 +17,8 @@ from plugin_memory import WrittenRegion
 from publisher import Publisher
 from waiting import DEADLINE_S
 
-from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm

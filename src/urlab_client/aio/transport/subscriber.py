@@ -22,7 +22,7 @@ from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._platform.signals import uninterrupted
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket

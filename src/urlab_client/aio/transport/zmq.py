@@ -18,7 +18,7 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport.base import LateReply, TransportStats

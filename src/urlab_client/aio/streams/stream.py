@@ -13,9 +13,9 @@ from types import TracebackType
 from typing import Generic, Protocol, Self, SupportsFloat, TypeVar
 
 from urlab_client.aio.arguments import require
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.event_loop import running_loop
-from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
+from urlab_client.aio.background import running_loop
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.streams.buffer import BufferedMessage, StreamBuffer
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.errors import (
     ConcurrentReadError,

@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from urlab_client.aio.live.camera_source import CameraSource, HasCamera
-from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
+from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.enums import CameraMode
 from urlab_client.errors import ProtocolError, URLabError

@@ -12,7 +12,7 @@ from urlab_client.values.layouts import BytesLike
 
 
 class PublishedSource(ABC):
-    """A `Source` of published messages; see `urlab_client.aio.streams`.
+    """A `Source` of published messages; see `urlab_client.aio.streams.stream`.
 
     Args:
         subscriptions: Sockets of the client.

@@ -6,14 +6,14 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
-from urlab_client.aio.deadline import Timeout
+from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.features import Features
-from urlab_client.aio.live.camera_source import CameraSource, HasCamera
-from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.derived_rows import DerivedRowSource, HasRows
-from urlab_client.aio.live.event_bus import EventBus
-from urlab_client.aio.live.row_source import RowSource
-from urlab_client.aio.live.state_source import OwnSteps, StateSource
+from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
+from urlab_client.aio.streams.camera_switch import CameraSwitch
+from urlab_client.aio.streams.derived_rows import DerivedRowSource, HasRows
+from urlab_client.aio.streams.event_bus import EventBus
+from urlab_client.aio.streams.row_source import RowSource
+from urlab_client.aio.streams.state_source import OwnSteps, StateSource
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions

@@ -9,7 +9,7 @@ from typing import get_args
 import msgspec
 
 from urlab_client.aio.arguments import collection
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler, client_closed
 from urlab_client.events import (
     ClientEvent,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from urlab_client.aio.arguments import collection
-from urlab_client.aio.live.source import PublishedSource
-from urlab_client.aio.live.state_source import StateSource
+from urlab_client.aio.streams.source import PublishedSource
+from urlab_client.aio.streams.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.streams import (

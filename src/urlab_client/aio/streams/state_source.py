@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from urlab_client.aio.live.source import PublishedSource
+from urlab_client.aio.streams.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell

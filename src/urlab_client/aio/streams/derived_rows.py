@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from urlab_client.aio.live.row_source import RowSource
-from urlab_client.aio.live.state_source import StateSource
+from urlab_client.aio.streams.row_source import RowSource
+from urlab_client.aio.streams.state_source import StateSource
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import ArticulationState, EntityState

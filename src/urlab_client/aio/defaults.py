@@ -1,11 +1,24 @@
-"""The default of `step(observations=…)`: the level chosen in `discover()`."""
+"""Defaults that stand for a value chosen elsewhere: by the op, the client or `discover()`."""
 
 from __future__ import annotations
 
 import enum
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from urlab_client.enums import ObservationLevel
+
+
+class Default(enum.Enum):
+    """Type of `DEFAULT`."""
+
+    DEFAULT = "default"
+
+
+DEFAULT: Final = Default.DEFAULT
+"""Use the default timeout of the op or the client."""
+
+Timeout: TypeAlias = float | Literal[Default.DEFAULT] | None
+"""Seconds for queueing, sending and receiving the reply together; None waits without limit."""
 
 
 class SessionLevel(enum.Enum):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.source import PublishedSource
+from urlab_client.aio.streams.camera_switch import CameraSwitch
+from urlab_client.aio.streams.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.enums import CameraMode

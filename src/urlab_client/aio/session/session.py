@@ -10,16 +10,14 @@ from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 from typing import Any, Final, TypeVar
 
-from urlab_client.aio.background import Tell
-from urlab_client.aio.call_records import CallRecords, Observe
-from urlab_client.aio.control import Control
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.background import Tell, running_loop
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.features import Features
-from urlab_client.aio.jobs import OnProgress, finish
-from urlab_client.aio.mutex import Mutex
+from urlab_client.aio.session.call_records import CallRecords, Observe
+from urlab_client.aio.session.control import Control
+from urlab_client.aio.session.jobs import OnProgress, finish
+from urlab_client.aio.session.turn import Limits, Mutex, Settle, Turn, require_reply
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.aio.turn import Limits, Settle, Turn, require_reply
 from urlab_client.errors import (
     ConnectionLost,
     GameThreadTimeout,

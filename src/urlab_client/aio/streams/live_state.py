@@ -9,8 +9,8 @@ from threading import Lock, RLock
 
 from msgspec import Struct
 
-from urlab_client.aio.live.camera_source import CameraSource
-from urlab_client.aio.live.state_source import StateSource
+from urlab_client.aio.streams.camera_source import CameraSource
+from urlab_client.aio.streams.state_source import StateSource
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
