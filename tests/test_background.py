@@ -89,7 +89,6 @@ KILLED = {
     "tests/integrations/test_failing_threads.py": {
         "urlab-environment",
         "urlab-feed",
-        "urlab-lerobot",
         "urlab-pictures",
         "urlab-record",
         "urlab-view",

@@ -22,7 +22,7 @@ from urlab_client.values.pictures import jpeg
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient
-    from urlab_client.integrations.record.pictures import RecordedPicture
+    from urlab_client.integrations.record.contents import RecordedPicture
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
