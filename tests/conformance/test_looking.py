@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -91,9 +92,11 @@ def of_client(client: Any) -> tuple[Any, ...]:
 
 @asynccontextmanager
 async def watched(client: Any, folder: Path) -> AsyncIterator[None]:
-    """Record and show a client of either flavour."""
+    """Record a client of either flavour, and show it where the extra `rerun` is installed."""
     seen = handle(client)
-    watchers: list[Any] = [record(seen, folder / "run.mcap", cameras=()), rerun_view(seen, save=folder / "run.rrd")]
+    watchers: list[Any] = [record(seen, folder / "run.mcap", cameras=())]
+    if importlib.util.find_spec("rerun") is not None:
+        watchers.append(rerun_view(seen, save=folder / "run.rrd"))
     async with AsyncExitStack() as stack:
         for watcher in watchers:
             if isinstance(seen, URLabClient):
