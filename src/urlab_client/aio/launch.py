@@ -70,10 +70,11 @@ def serve_arguments(address: str) -> list[str]:
     """
     models, options = _parsed(address)
     for key, _ in options:
-        if key in _OPENING:
+        name = key.partition("=")[0]  # `server-key%3DFILE` is one key, and sets the option, too
+        if name in _OPENING:
             raise ValueError(
-                f"{address!r}: '{key}' is for a server that others use, and this one is for its client alone; start it "
-                "with `urlab serve`"
+                f"{address!r}: '{name}' is for a server that others use, and this one is for its client alone; start "
+                "it with `urlab serve`"
             )
     arguments = [f"--{key}={value}" if value else f"--{key}" for key, value in options if key != _START_TIMEOUT]
     return [*models, *arguments]

@@ -123,7 +123,8 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         """Stream the camera's pictures as the server publishes them.
 
         Servers of the alpha publish pictures in live mode only, the plugin without time or number. Newer servers
-        publish them in every mode, once per state: no pictures arrive while the simulation stands still.
+        publish them in every mode, once per state. While the simulation stands still, a camera that this call switches
+        on sends the present state if it has not sent it before; nothing else arrives.
 
         Args:
             policy: `latest`, or `all` within the limits of the buffer.
