@@ -34,7 +34,7 @@ PLAIN = {
 """What makes tasks and threads whose end only those see who wait for it."""
 
 AWAITED = {
-    "_background.py:daemon": "makes the threads of the helpers",
+    "_platform/threads.py:daemon": "makes the threads of the helpers",
     "aio/background.py:background_task": "makes the tasks of the helpers",
     "aio/session.py:probe": "waits for the task and returns its result",
     "aio/launch.py:_started": "waits for the task and raises its error",

@@ -14,99 +14,58 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 
 # Layer -> the layers it may import besides itself. The empty name is the public package, `urlab_client` itself.
+VALUES = frozenset({"enums", "errors", "values"})
 ALLOWED: dict[str, frozenset[str]] = {
-    "protocol": frozenset({"_extras"}),
-    "keys": frozenset({"protocol"}),
-    "aio": frozenset(
-        {
-            "_background",
-            "_children",
-            "_confined",
-            "_landlock",
-            "_mjcf_files",
-            "_mujoco",
-            "_processors",
-            "_uninterrupted",
-            "_windows",
-            "keys",
-            "protocol",
-        }
-    ),
-    "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset(
-        {
-            "_background",
-            "_children",
-            "_confined",
-            "_installation",
-            "_landlock",
-            "_mjcf_files",
-            "_mujoco",
-            "_processors",
-            "_uninterrupted",
-            "_whole_files",
-            "_windows",
-            "keys",
-            "protocol",
-            "randomise",
-        }
-    ),
-    "randomise": frozenset({"protocol"}),
-    "enums": frozenset({"protocol"}),
-    "_background": frozenset(),
-    "_children": frozenset(),
-    "_confined": frozenset(),
-    "_landlock": frozenset(),
-    "_mjcf_files": frozenset(),
+    "enums": frozenset(),
+    "errors": frozenset({"enums", "values"}),
+    "values": frozenset({"_installation", "enums", "errors"}),
+    "protocol": VALUES,
+    "events": VALUES | {"protocol"},
+    "types": VALUES | {"aio", "protocol"},
+    "keys": frozenset({"errors"}),
+    "_platform": frozenset(),
+    "_sandbox": frozenset(),
     "_mujoco": frozenset(),
-    "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),
-    "_processors": frozenset(),
-    "_uninterrupted": frozenset(),
-    "_whole_files": frozenset(),
-    "_windows": frozenset(),
-    "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset(
-        {
-            "",
-            "_children",
-            "_extras",
-            "_installation",
-            "_mujoco",
-            "_whole_files",
-            "aio",
-            "enums",
-            "keys",
-            "protocol",
-            "randomise",
-            "server",
-            "sync",
-        }
-    ),
-    "cluster": frozenset({"_installation", "_whole_files", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
-    "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
-    "cli": frozenset(
-        {
-            "",
-            "_background",
-            "_extras",
-            "_installation",
-            "_mujoco",
-            "_whole_files",
-            "_windows",
-            "aio",
-            "enums",
-            "integrations",
-            "keys",
-            "mcp",
-            "protocol",
-            "randomise",
-            "server",
-            "sync",
-            "web",
-        }
-    ),
+    "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
+    "sync": VALUES | {"aio", "events", "protocol", "types"},
+    "randomise": VALUES | {"protocol"},
+    "server": VALUES | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
+    "": VALUES | {"_installation", "aio", "events", "protocol", "sync", "types"},
+    "integrations": VALUES
+    | {
+        "",
+        "_installation",
+        "_mujoco",
+        "_platform",
+        "aio",
+        "keys",
+        "protocol",
+        "randomise",
+        "server",
+        "sync",
+    },
+    "cluster": VALUES | {"types", "_installation", "_platform", "integrations", "protocol", "sync"},
+    "web": VALUES | {"events", "types", "_installation", "aio", "integrations", "protocol"},
+    "mcp": VALUES | {"types", "_installation", "aio", "protocol", "web"},
+    "cli": VALUES
+    | {
+        "",
+        "_installation",
+        "_mujoco",
+        "_platform",
+        "aio",
+        "events",
+        "integrations",
+        "keys",
+        "mcp",
+        "protocol",
+        "randomise",
+        "server",
+        "sync",
+        "types",
+        "web",
+    },
     "__main__": frozenset({"cli"}),
 }
 
@@ -115,6 +74,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "background",
+        "observer",
+        "features",
+        "client_types",
         "deadline",
         "arguments",
         "session_level",
@@ -143,6 +105,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "",
     ),
     "server": (
+        "dialects",
+        "controller_text",
         "system",
         "limits",
         "refusal",
@@ -167,7 +131,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
 }
 
-# `protocol` is pure: it turns values into bytes and back, and leaves waiting, threads and sockets to others.
+# These are pure: they turn values into bytes and back, and leave waiting, threads and sockets to others.
+PURE = frozenset({"enums", "errors", "protocol", "values"})
 NO_IO = frozenset(
     {"anyio", "asyncio", "concurrent", "multiprocessing", "selectors", "socket", "subprocess", "threading", "zmq"}
 )
@@ -256,8 +221,8 @@ def violations(package: Path) -> list[str]:
             if imported.startswith("."):
                 found.append(f"{where}:{line}: relative import of {imported}")
             elif target is None:
-                if layer == "protocol" and imported.partition(".")[0] in NO_IO:
-                    found.append(f"{where}:{line}: protocol imports {imported}, but does no I/O")
+                if layer in PURE and imported.partition(".")[0] in NO_IO:
+                    found.append(f"{where}:{line}: {layer} imports {imported}, but does no I/O")
             elif target != layer and target not in ALLOWED[layer]:
                 found.append(f"{where}:{line}: {layer or package.name} imports {imported}")
     return found

@@ -19,15 +19,15 @@ from scripted import meta_ok
 from waiting import DEADLINE_S, in_time, until
 
 from urlab_client.aio import URLabClient, launch
-from urlab_client.protocol.base import Effect
-from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ClientClosed,
     NoActiveManager,
     OutcomeUnknown,
     ProtocolError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.base import Effect
+from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.registry import OPS
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))

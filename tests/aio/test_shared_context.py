@@ -12,7 +12,7 @@ import pytest
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import context as shared
-from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
+from urlab_client.errors import ClientClosed, ServerUnreachable
 
 
 async def test_those_that_stay_go_on_when_others_are_closed(scripted: Any) -> None:

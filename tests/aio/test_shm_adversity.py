@@ -21,8 +21,8 @@ from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import shm as shm_transport
+from urlab_client.errors import OutcomeUnknown, URLabConnectionError
 from urlab_client.protocol import shm
-from urlab_client.protocol.errors import OutcomeUnknown, URLabConnectionError
 from urlab_client.protocol.fence import processor_fence
 
 SESSION = "11111111-2222-3333-4444-555555555555"

@@ -17,20 +17,20 @@ from samples import sample
 from shm_clients import shared, shm_clients
 from waiting import DEADLINE_S, attempts, gives_up, pass_time, until
 
-from urlab_client._windows import NamedEvent
+from urlab_client._platform.windows import NamedEvent
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import region_channel
 from urlab_client.aio.transport import shm as shm_transport
 from urlab_client.aio.transport.mapped_region import MappedRegion
-from urlab_client.protocol import shm
-from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ProtocolError,
     SessionTakenOver,
     URLabConnectionError,
     URLabRPCError,
     URLabTimeoutError,
 )
+from urlab_client.protocol import shm
+from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.messages.runtime import ReadMocapPose, SetQpos
 from urlab_client.protocol.registry import OPS
 

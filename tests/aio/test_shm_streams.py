@@ -20,11 +20,11 @@ from waiting import DEADLINE_S
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm
-from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
-from urlab_client.protocol.picture_memory import PictureMemory
+from urlab_client.values.pictures import PictureMemory
 
 STATE = b"state/full"
 WIDTH, HEIGHT = 32, 24

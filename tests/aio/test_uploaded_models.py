@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client._landlock import is_available
+from urlab_client._sandbox.landlock import is_available
 from urlab_client.aio.model import archive as archive_module
 from urlab_client.aio.model import compilation
 from urlab_client.aio.model.archive import unpacked

@@ -13,9 +13,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from urlab_client.cli import main
+from urlab_client.errors import URLabError
 from urlab_client.integrations.gym import PushPictures, Reach, URLabBatchEnv, URLabEnv, URLabVectorEnv
 from urlab_client.integrations.policy import OnnxDictNetwork, PolicyFileError, bootstrap_mean, evaluate_in, wilson
-from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise import Noise, Randomisation, Vary
 from urlab_client.server import SimulatedServer
 

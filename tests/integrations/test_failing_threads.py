@@ -13,6 +13,7 @@ import pytest
 from waiting import DEADLINE_S, eventually, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.errors import ConnectionLost, URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.gym import pictures as drawing
 from urlab_client.integrations.gym import vector
@@ -20,7 +21,6 @@ from urlab_client.integrations.record import RecordingError, lerobot, read_run, 
 from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.record.lerobot import LeRobot
 from urlab_client.integrations.view.view import AsyncView, ViewOptions
-from urlab_client.protocol.errors import ConnectionLost, URLabError
 from urlab_client.server import SimulatedServer
 
 

@@ -26,7 +26,7 @@ from waiting import eventually, in_time
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.transport import connection_status
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     NoActiveManager,
     NotReady,
     ProtocolError,

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol import shm
-from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.shm import Region, no_fence
 
 STRIDE = 24

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 import vectors
 
+from urlab_client.enums import CameraMode
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol import rows, shm
-from urlab_client.protocol.control_messages import (
+from urlab_client.protocol.topics import StreamTopic, TopicKind
+from urlab_client.server.streams.control_messages import (
     ActuatorInfo,
     ControlPayload,
     JointGains,
@@ -21,10 +24,7 @@ from urlab_client.protocol.control_messages import (
     encode_gains,
     gains_by_parameter,
 )
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.pixels import decode_camera, encode_camera
-from urlab_client.protocol.topics import StreamTopic, TopicKind
+from urlab_client.values.pictures import decode_camera, encode_camera
 
 # What the codec, not these layouts, is responsible for.
 CODEC_FAMILIES = ("rpc_", "msgpack_", "msg_state_full")

@@ -13,8 +13,8 @@ from beta_bench import ME, OTHER, Bench, Clock
 from waiting import eventually
 from wire import Wire
 
-from urlab_client.protocol.control_messages import ControlPayload
 from urlab_client.server.session import DriverLease
+from urlab_client.server.streams.control_messages import ControlPayload
 
 # Claims.
 

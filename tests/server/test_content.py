@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from wire import files_of_at_most
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
-from urlab_client._whole_files import replaced, write_whole
+from urlab_client._platform.files import replaced, write_whole
 from urlab_client.server.assets import content, sandbox
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.bundled_robots import bundled_models

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import BOT, make_scene
 
-from urlab_client.protocol.enums import ControllerKind
+from urlab_client.enums import ControllerKind
 from urlab_client.server.physics.controllers import (
     ArticulationControl,
     ControllerConfig,

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from scenes import ASSETS, BALL, BOT, hasty, make_scene
 from waiting import eventually
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.handlers.runtime import parse_control_source, parse_mode
 from urlab_client.server.physics import engine as engine_module

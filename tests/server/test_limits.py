@@ -16,8 +16,8 @@ import zmq
 from waiting import attempts, eventually
 from wire import Wire, pack
 
-from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server.dialects import ALPHA
 from urlab_client.server.transport import endpoint
 
 Serve = Callable[..., Wire]

@@ -234,7 +234,7 @@ SAVER = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from urlab_client._whole_files import write_whole
+from urlab_client._platform.files import write_whole
 from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
 
 layout = JointLayout.of([("j", 1, 1)])

@@ -18,9 +18,10 @@ import msgspec
 import pytest
 from wire import Wire
 
-from urlab_client import ImportFailed, URLabTimeoutError
-from urlab_client._landlock import is_available
+from urlab_client import URLabTimeoutError
+from urlab_client._sandbox.landlock import is_available
 from urlab_client.aio import URLabClient
+from urlab_client.errors import ImportFailed
 from urlab_client.server import Limits, ModelError, SimulatedServer, open_server
 from urlab_client.server.assets import sandbox
 from urlab_client.server.refusal import Refusal
@@ -417,7 +418,7 @@ def test_a_confined_process_opens_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "read" / "link").symlink_to(tmp_path / "other" / "file")
     program = (
         "import os, pathlib, socket, sys\n"
-        "from urlab_client._landlock import confine_files\n"
+        "from urlab_client._sandbox.landlock import confine_files\n"
         "here = pathlib.Path(sys.argv[1])\n"
         "kept = open(here / 'other' / 'file')\n"
         "server = socket.create_server(('127.0.0.1', 0))\n"

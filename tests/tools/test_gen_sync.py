@@ -23,7 +23,7 @@ import pytest
 
 import gen_sync
 from urlab_client.aio.namespaces._base import Namespace
-from urlab_client.protocol.errors import ClientClosed
+from urlab_client.errors import ClientClosed
 
 TOOL = Path(gen_sync.__file__)
 DATA = Path(__file__).parent / "data"

@@ -17,7 +17,7 @@ from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient, background
 from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app

@@ -19,18 +19,18 @@ from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
+from urlab_client.enums import ControlMode, OutOfRange
+from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.descriptions import (
+from urlab_client.protocol.messages.session import ControllerInfo
+from urlab_client.values.descriptions import (
     ArticulationDescription,
     ControllerDescription,
     EntityDescription,
     Pose,
 )
-from urlab_client.protocol.enums import ControlMode, OutOfRange
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.session import ControllerInfo
-from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.rotation import rotate
+from urlab_client.values.names import NameMap
+from urlab_client.values.rotation import rotate
 
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])

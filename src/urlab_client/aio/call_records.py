@@ -10,10 +10,10 @@ from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from typing import TypeVar
 
+from urlab_client.aio.client_types import CallOutcome, CallRecord
 from urlab_client.aio.transport.base import LateReply, RequestTransport
+from urlab_client.errors import URLabConnectionError, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.base import Op
-from urlab_client.protocol.client_types import CallOutcome, CallRecord
-from urlab_client.protocol.errors import URLabConnectionError, URLabRPCError, URLabTimeoutError
 
 log: logging.Logger = logging.getLogger("urlab_client.session")
 

@@ -14,6 +14,7 @@ from typing import NoReturn, Self, TypeVar, cast
 from urlab_client.aio.address import transport_to
 from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
+from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
@@ -42,14 +43,14 @@ from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
+from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.errors import URLabError
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
-from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
-from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

@@ -20,9 +20,9 @@ from typing import Any, Final, Protocol, TypeVar, cast
 
 from urlab_client.aio.background import Tell, background_task
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.features import Features
+from urlab_client.errors import ControlClaimed, NotControlOwner, URLabError
 from urlab_client.protocol.base import ControlRequest, Reply, Request
-from urlab_client.protocol.errors import ControlClaimed, NotControlOwner, URLabError
-from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.control import (
     UNCLAIMED,
     ClaimControl,

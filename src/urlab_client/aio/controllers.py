@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.protocol.enums import ControllerKind, known
-from urlab_client.protocol.errors import ControllerSchemaViolation, ProtocolError
+from urlab_client.enums import ControllerKind, known
+from urlab_client.errors import ControllerSchemaViolation, ProtocolError
 from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
 

@@ -6,7 +6,7 @@ import asyncio
 import sys
 from typing import Any
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 
 def running_loop(

@@ -10,9 +10,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
-from urlab_client.protocol.base import Op, Reply
-from urlab_client.protocol.codec import decode_job
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     OutcomeUnknown,
     ProtocolError,
     UnknownJob,
@@ -20,8 +18,10 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.base import Op, Reply
+from urlab_client.protocol.codec import decode_job
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus, OpStatusOk
-from urlab_client.protocol.types import JobStatus
+from urlab_client.values.types import JobStatus
 
 log: logging.Logger = logging.getLogger("urlab_client.session")
 

@@ -15,20 +15,12 @@ from urlab_client.aio.call_records import CallRecords, Observe
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.features import Features
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.turn import Limits, Settle, Turn, require_reply
-from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
-from urlab_client.protocol.codec import (
-    check_finite,
-    check_request,
-    decode_answer,
-    decode_reply,
-    encode_request,
-    op_of,
-)
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ConnectionLost,
     GameThreadTimeout,
     InternalError,
@@ -44,7 +36,15 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.features import Features
+from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
+from urlab_client.protocol.codec import (
+    check_finite,
+    check_request,
+    decode_answer,
+    decode_reply,
+    encode_request,
+    op_of,
+)
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 

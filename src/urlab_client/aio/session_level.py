@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from typing import Final
 
-from urlab_client.protocol.enums import ObservationLevel
+from urlab_client.enums import ObservationLevel
 
 
 class SessionLevel(enum.Enum):

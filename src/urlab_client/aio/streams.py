@@ -17,15 +17,15 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ConcurrentReadError,
     ProtocolError,
     StreamOverflow,
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
+from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 

@@ -10,9 +10,9 @@ from typing import Any, Protocol, Self, TypeAlias, TypeVar, cast
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import op_of
-from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.jobs import OpStarted
 
 R = TypeVar("R", bound=Reply)

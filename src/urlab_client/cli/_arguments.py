@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, Protocol, TypeVar, cast
 
 from urlab_client.cli._common import CommandError, joined
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.enums import StepMode
+from urlab_client.values.names import did_you_mean
 
 ADDRESSES = (
     "HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command"

@@ -13,8 +13,8 @@ from functools import partial
 from types import FrameType
 from typing import TYPE_CHECKING, TypeAlias
 
-from urlab_client._background import daemon
-from urlab_client._windows import read_aside
+from urlab_client._platform.threads import daemon
+from urlab_client._platform.windows import read_aside
 from urlab_client.cli._common import in_background
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ import contextlib
 import logging
 
 from urlab_client._installation import conflict
+from urlab_client.aio.client_types import Diagnosis
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -20,9 +21,8 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import import_mujoco, json_line
-from urlab_client.protocol.client_types import Diagnosis
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
+from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
 
 _UNHEALTHY = 1
 

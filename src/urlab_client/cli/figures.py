@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._whole_files import replaced
+from urlab_client._platform.files import replaced
 
 _PER_PANEL = 6  # more lines in one panel cannot be told apart
 _DPI = 150

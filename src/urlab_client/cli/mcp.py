@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, count, make_client, one_of, seconds
 from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette

@@ -24,7 +24,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import counted, import_mujoco, json_line
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ModeLocked,
     URLabConnectionError,
     URLabRPCError,

@@ -21,7 +21,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco, progress_bar
 from urlab_client.cli._watching import interruptible, run_session
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder

@@ -24,7 +24,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco, json_line, output, progress_bar
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient

@@ -16,8 +16,8 @@ from urlab_client._installation import install_command
 from urlab_client.cli._arguments import Commands, add_dialect, count, image_size, index, port
 from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._serve_events import Event, Events, Starter, next_event, stop_on_signals, watch_input
-from urlab_client.protocol.controller_text import ControllerText
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode
+from urlab_client.server.controller_text import ControllerText
 
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
@@ -400,7 +400,7 @@ def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: 
 
 def _settle_ports(arguments: ServeArguments) -> None:
     """Fill in the ports that were not given: the plugin's defaults, or 0 to derive them from the instance index."""
-    from urlab_client.protocol.dialects import DIALECTS
+    from urlab_client.server.dialects import DIALECTS
 
     defaults = {**_PORTS, "camera": DIALECTS[arguments.dialect].first_camera_port}
     if arguments.instance_index is not None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
-from urlab_client._whole_files import replaced
+from urlab_client._installation import need
+from urlab_client._platform.files import replaced
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -23,9 +23,9 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import URLabTimeoutError
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.enums import CameraMode
+from urlab_client.errors import URLabTimeoutError
+from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient

@@ -28,7 +28,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.cli._terminal_keys import terminal_keys
 from urlab_client.cli._watching import interruptible
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -145,7 +145,7 @@ def run(arguments: TeleopArguments) -> int:
 
 
 def _task(name: str) -> Task:
-    from urlab_client._extras import need
+    from urlab_client._installation import need
 
     need("gymnasium", extra="gym")
     from urlab_client.integrations.gym import TASKS

@@ -24,7 +24,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, import_mujoco
 from urlab_client.cli._page_options import PageArguments
 from urlab_client.cli._watching import interruptible, run_session
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient

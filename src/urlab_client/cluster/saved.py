@@ -15,7 +15,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._whole_files import replaced
+from urlab_client._platform.files import replaced
 from urlab_client.cluster.episodes import Episode, seed_of
 
 _ARRAYS: Final = ("observations", "actions", "rewards")

@@ -13,8 +13,8 @@ import anyio
 from msgspec import Struct
 
 from urlab_client.aio.background import background_task
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
+from urlab_client.enums import StepMode
+from urlab_client.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving, Viewer
 

@@ -15,8 +15,8 @@ from starlette.applications import Starlette
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from urlab_client.aio.background import background_thread
+from urlab_client.errors import URLabError
 from urlab_client.mcp.agent import Agent
-from urlab_client.protocol.errors import URLabError
 from urlab_client.web.access import Access, Guarded
 
 _PATH = "/mcp"

@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar, overload
 
 from msgspec import Struct
 
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client.errors import ProtocolError
 
 MAGIC = 0x424C5255
 VERSION = 1

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from urlab_client.protocol.dialects import ALPHA, Dialect
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene_index import ArticulationIndex
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig

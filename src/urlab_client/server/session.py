@@ -11,7 +11,7 @@ import time
 import uuid
 from collections.abc import Callable
 
-from urlab_client.protocol.enums import ObservationLevel
+from urlab_client.enums import ObservationLevel
 from urlab_client.server.refusal import Refusal
 
 

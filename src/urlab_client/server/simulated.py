@@ -17,11 +17,11 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.enums import CameraMode, StepMode
 from urlab_client.protocol.base import DialectName
-from urlab_client.protocol.dialects import DIALECTS
-from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.config import ServerConfig
+from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
 from urlab_client.server.initial_level import is_level
 from urlab_client.server.limits import Limits

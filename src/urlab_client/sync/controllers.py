@@ -9,7 +9,7 @@ from typing import Any
 
 from urlab_client.aio import controllers as aio
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.protocol.enums import ControllerKind
+from urlab_client.enums import ControllerKind
 from urlab_client.sync._facade import Facade
 
 

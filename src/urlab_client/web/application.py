@@ -22,7 +22,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.body_routes import BodyRoutes

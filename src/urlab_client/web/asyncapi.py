@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from urlab_client.protocol.schemas import prose, schemas
+from urlab_client.values.schemas import prose, schemas
 from urlab_client.web.messages import (
     Ack,
     Ctrl,

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.mujoco_viewer import MujocoViewer, Shown
 from urlab_client.web.replay import Replay

@@ -11,10 +11,10 @@ import anyio
 import numpy as np
 from msgspec import structs
 
+from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Effect, Request
 from urlab_client.protocol.codec import op_of
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetControlSource, SetPaused, SetSimSpeed, SetTwist
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.messages.streams import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     OutcomeUnknown,
     URLabConnectionError,
     URLabError,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import anyio
 import numpy as np
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.messages import Hand
 

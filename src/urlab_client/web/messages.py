@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from msgspec import Meta, Struct
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.web.description import WorldDescription
 from urlab_client.web.recordings import Conversion, RunningRecording

@@ -20,10 +20,10 @@ from starlette.responses import Response
 
 from urlab_client.aio.model.compilation import flatten_confined
 from urlab_client.aio.model.upload import FlatModel, upload
-from urlab_client.protocol.errors import ImportFailed
+from urlab_client.errors import ImportFailed
 from urlab_client.protocol.instances import import_directory
-from urlab_client.protocol.names import is_file_name
-from urlab_client.protocol.scene_types import URLabBlueprint
+from urlab_client.values.names import is_file_name
+from urlab_client.values.scene_types import URLabBlueprint
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import JOB, Handler, RouteGroup
 from urlab_client.web.stoppable import stoppable

@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.runtime import (
 from urlab_client.protocol.messages.session import Forward, Hello, Reset
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, StopPieOk
 from urlab_client.protocol.registry import OPS
-from urlab_client.protocol.schemas import schemas
+from urlab_client.values.schemas import schemas
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient, URLabController

@@ -9,7 +9,7 @@ import anyio.to_thread
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.web.asyncapi import asyncapi
 from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode

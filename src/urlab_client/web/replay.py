@@ -20,8 +20,8 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.model.layout import articulation_layouts
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
+from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.web.recordings import open_run

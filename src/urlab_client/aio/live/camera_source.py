@@ -9,17 +9,16 @@ from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
+from urlab_client.enums import CameraMode
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import (
     CameraSample,
 )
-from urlab_client.protocol.picture_memory import PictureMemory
-from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.pictures import PictureMemory, decode_camera
 
 FIRST_PICTURE_S = 30.0
 """Seconds that a server may take for its first picture, because it initialises OpenGL first."""

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from urlab_client.aio.background import background_task
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session import Session, leaves_open
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraStreaming, CameraTransports, SetCameraStreaming
 from urlab_client.protocol.messages.session import CameraInfo
 

@@ -11,12 +11,12 @@ import numpy as np
 from urlab_client.aio.live.row_source import RowSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import MessageHandler
-from urlab_client.protocol.errors import ProtocolError, URLabError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, Row, SceneRow, SensorRow, TwistRow
 from urlab_client.protocol.topics import StreamTopic, TopicKind
+from urlab_client.values.layouts import BytesLike
 
 _FREE = 0  # mjJNT_FREE
 

@@ -12,10 +12,10 @@ from msgspec import Struct
 from urlab_client.aio.live.camera_source import CameraSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
-from urlab_client.protocol.errors import ProtocolError, URLabError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.pictures import Pixels
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 import numpy as np
 
 from urlab_client.aio.deadline import Timeout
+from urlab_client.aio.features import Features
 from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.derived_rows import DerivedRowSource, HasRows
@@ -17,12 +18,11 @@ from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.features import Features
+from urlab_client.enums import CameraMode
+from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.pictures import Pixels
 
 
 class SharedFrame:

@@ -8,13 +8,13 @@ from urlab_client.aio.arguments import collection
 from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.streams import (
     RowSample,
 )
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
+from urlab_client.values.layouts import BytesLike
 
 _OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
 _OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ProtocolError
+from urlab_client.values.layouts import BytesLike
 
 
 class PublishedSource(ABC):

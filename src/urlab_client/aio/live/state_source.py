@@ -10,13 +10,13 @@ from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import (
     StateSnapshot,
 )
 from urlab_client.protocol.shm import STATE_FILE
 from urlab_client.protocol.topics import STATE_FULL
+from urlab_client.values.layouts import BytesLike
 
 _ONLY_OWN = (
     "This server publishes state only in live mode: call client.runtime.set_mode('live'). In the other modes, "

@@ -15,12 +15,12 @@ from typing import Final
 from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.transport.subscriber import MessageHandler
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import ProtocolError, URLabError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.enums import CameraMode
+from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.protocol.messages.streams import StreamPolicy
-from urlab_client.protocol.pixels import PictureStamp, picture_stamp
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.pictures import PictureStamp, picture_stamp
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

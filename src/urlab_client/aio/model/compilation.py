@@ -22,10 +22,10 @@ from typing import Final
 
 import msgspec
 
-from urlab_client._children import APART
-from urlab_client._confined import forbid_opening, limit_process
-from urlab_client._landlock import confine_files
-from urlab_client._mjcf_files import NamedFiles, named_files
+from urlab_client._platform.children import APART
+from urlab_client._sandbox.confined import forbid_opening, limit_process
+from urlab_client._sandbox.landlock import confine_files
+from urlab_client._sandbox.mjcf_files import NamedFiles, named_files
 from urlab_client.aio.model.archive import unpacked
 from urlab_client.aio.model.upload import FlatModel, flatten
 

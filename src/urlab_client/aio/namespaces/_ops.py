@@ -50,8 +50,8 @@ from urlab_client.protocol.messages.viewport import (
     TrackActor,
     Untrack,
 )
-from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
-from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
+from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.values.types import CameraPose, KeyframeInfo, MocapPose
 
 __all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportNamespace"]
 

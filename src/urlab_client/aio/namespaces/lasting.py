@@ -8,9 +8,9 @@ from types import TracebackType
 
 import anyio
 
-from urlab_client.protocol.enums import PIEState
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.types import PIEStartResult, PIEStatus
+from urlab_client.enums import PIEState
+from urlab_client.errors import URLabError
+from urlab_client.values.types import PIEStartResult, PIEStatus
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from urlab_client.aio.live.camera_source import FIRST_PICTURE_S
-from urlab_client.protocol.enums import CameraTiming
+from urlab_client.enums import CameraTiming
 from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
 from urlab_client.aio.state.step_mode import settle_mode
 from urlab_client.aio.state.step_pictures import StepPictures
+from urlab_client.enums import CameraTiming, StepMode
+from urlab_client.errors import StepTimeout, URLabError
 from urlab_client.protocol.codec import check_finite, op_of
-from urlab_client.protocol.enums import CameraTiming, StepMode
-from urlab_client.protocol.errors import StepTimeout, URLabError
 from urlab_client.protocol.messages.session import Step, StepOk
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from urlab_client._processors import crowded
+from urlab_client._platform.processors import crowded
 
 _MISSES = 4
 _FIRST = 8  # requests of an op before the first trial of sleeping

@@ -12,7 +12,7 @@ from typing import Final
 
 import zmq
 
-from urlab_client._uninterrupted import uninterrupted
+from urlab_client._platform.signals import uninterrupted
 
 Context = zmq.Context[zmq.Socket[bytes]]
 

@@ -14,8 +14,8 @@ import stat
 import sys
 from pathlib import Path
 
-from urlab_client._windows import NamedLock
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client._platform.windows import NamedLock
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, Region, RegionNotReady, attach
 

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from urlab_client._windows import NamedEvent
+from urlab_client._platform.windows import NamedEvent
 from urlab_client.aio.transport.mapped_region import MappedRegion
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import encode_request

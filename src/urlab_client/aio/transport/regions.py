@@ -26,10 +26,10 @@ from urlab_client.aio.transport.subscriber import (
     Subscriptions,
     client_closed,
 )
+from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.errors import ProtocolError, URLabError
-from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.shm import Publication
+from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 

@@ -10,8 +10,8 @@ from pathlib import Path, PurePath
 
 from urlab_client.aio.background import Tell
 from urlab_client.aio.transport.poller import Doorbell, Poller
+from urlab_client.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, region_directories
 

@@ -25,9 +25,7 @@ from urlab_client.aio.transport.poller import ReplyPoll
 from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm_way import way_of
-from urlab_client.protocol import doorbell
-from urlab_client.protocol.base import Effect, Op
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ClientClosed,
     ConnectionLost,
     OutcomeUnknown,
@@ -36,8 +34,10 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerLost
+from urlab_client.protocol import doorbell
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")

@@ -21,13 +21,13 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
-from urlab_client._uninterrupted import uninterrupted
+from urlab_client._platform.signals import uninterrupted
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
-from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ClientClosed, ProtocolError, URLabError
+from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 

@@ -26,9 +26,7 @@ from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.delivery import deliver
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
-from urlab_client.protocol.base import Effect, Op
-from urlab_client.protocol.codec import MAX_REPLY_BYTES
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     AuthenticationFailed,
     ClientClosed,
     ConnectionLost,
@@ -37,15 +35,10 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
+from urlab_client.protocol.base import Effect, Op
+from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-)
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 

@@ -16,16 +16,16 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.aio.observer import ClientObserver
+from urlab_client.enums import StepMode
+from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.names import did_you_mean
-from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._portal import Portal
+from urlab_client.values.names import did_you_mean
 
 log = logging.getLogger("urlab_client.feed")
 

@@ -27,8 +27,8 @@ from urlab_client.integrations._feed.messages import (
     Vector3,
 )
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
+from urlab_client.server.dialects import cleaned_name
 
 if TYPE_CHECKING:
     import mujoco

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
-from urlab_client._whole_files import replaced
+from urlab_client._installation import need
+from urlab_client._platform.files import replaced
 from urlab_client.integrations.record import tables
 from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.index import Progress

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._children import APART
+from urlab_client._platform.children import APART
 from urlab_client.aio.background import background_thread
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.index import Progress
@@ -30,7 +31,6 @@ from urlab_client.integrations.record.reader import Run, phases
 from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
 
 _SCRIPT = Path(__file__).with_name("_lerobot_script.py")
 _DEADLINE_S = 600.0

@@ -13,10 +13,9 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import IDENTITY
 from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.limits import Limits
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3
 
 ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 UNIT_SCALE: Final[Vec3] = (1.0, 1.0, 1.0)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from urlab_client._mjcf_files import NamedFiles, named_files
+from urlab_client._sandbox.mjcf_files import NamedFiles, named_files
 from urlab_client.server.limits import Limits
 
 _MAX_COMBINATIONS = 1_000_000

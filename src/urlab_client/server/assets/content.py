@@ -28,7 +28,7 @@ from typing import Final
 import msgspec
 import mujoco
 
-from urlab_client._whole_files import write_whole
+from urlab_client._platform.files import write_whole
 from urlab_client.protocol.instances import import_directory
 from urlab_client.server.assets.blueprint import (
     IMPORTS,

@@ -16,16 +16,15 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
-from urlab_client._whole_files import write_whole
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.controller_text import ControllerText
-from urlab_client.protocol.rotation import IDENTITY, normalized
+from urlab_client._platform.files import write_whole
 from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
 from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
+from urlab_client.server.controller_text import ControllerText
 from urlab_client.server.refusal import Refusal
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3, normalized
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

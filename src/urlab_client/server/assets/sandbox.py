@@ -25,10 +25,10 @@ from typing import Final
 import msgspec
 import mujoco
 
-from urlab_client._background import daemon
-from urlab_client._children import APART
-from urlab_client._confined import limit_process
-from urlab_client._landlock import confine_files
+from urlab_client._platform.children import APART
+from urlab_client._platform.threads import daemon
+from urlab_client._sandbox.confined import limit_process
+from urlab_client._sandbox.landlock import confine_files
 from urlab_client.server.assets.confinement import Outside, check_references
 from urlab_client.server.assets.importer import Compiled, build_snapshot, mujoco_messages, one_line
 from urlab_client.server.limits import Limits

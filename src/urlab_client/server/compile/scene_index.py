@@ -17,9 +17,9 @@ from urlab_client._mujoco import (
     force_counts,
     force_starts,
 )
-from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
+from urlab_client.server.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.server.refusal import CompileFailed
 
 Ints = NDArray[np.int32]

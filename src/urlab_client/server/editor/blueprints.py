@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from urlab_client.protocol.scene_types import BlueprintInfo
 from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.editor.levels import Levels
 from urlab_client.server.refusal import Refusal
+from urlab_client.values.scene_types import BlueprintInfo
 
 
 class Blueprints:

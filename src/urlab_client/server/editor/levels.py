@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.names import WINDOWS_DEVICES
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import IMPORTS, sanitized
 from urlab_client.server.assets.content import ContentRoot
@@ -15,6 +14,7 @@ from urlab_client.server.assets.level import LevelError, read_level, write_level
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
+from urlab_client.values.names import WINDOWS_DEVICES
 
 UNTITLED: Final = "/Temp/Untitled_1"
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.server.limits import Limits
+from urlab_client.values.rotation import Quat, Vec3
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from urlab_client.protocol.base import Vec3
 from urlab_client.server.assets.actors import UNIT_SCALE, Actor, ConversionSettings
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
+from urlab_client.values.rotation import Vec3
 
 
 class QuickConvert:

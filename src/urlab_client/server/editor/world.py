@@ -13,9 +13,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
-from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode
 from urlab_client.server.assets.actors import (
     ORIGIN,
     UNIT_SCALE,
@@ -35,6 +32,8 @@ from urlab_client.server.editor.level_actors import ActorNames, LevelActors, mat
 from urlab_client.server.editor.levels import Levels
 from urlab_client.server.editor.quick_convert import QuickConvert
 from urlab_client.server.refusal import CompileFailed, Refusal
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, swap_frame
+from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode
 
 __all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
 

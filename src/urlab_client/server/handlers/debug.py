@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from urlab_client.protocol.base import EulerDeg, Quat, Request, Vec3
+from urlab_client.protocol.base import EulerDeg, Request
 from urlab_client.protocol.messages.debug import (
     ClearMarkers,
     ClearMarkersOk,
@@ -23,12 +23,12 @@ from urlab_client.protocol.messages.debug import (
     SetOverlayText,
     SetOverlayTextOk,
 )
-from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, rotate, swap_frame
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.handlers.viewport import need_point, need_rotator
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import usable
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, rotate, swap_frame
 
 YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
 """Replaces an invalid colour."""

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Final
 
-from urlab_client._whole_files import write_whole
-from urlab_client.protocol.enums import StepMode
+from urlab_client._platform.files import write_whole
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.recording import (
     RecordingClear,
     RecordingClearOk,

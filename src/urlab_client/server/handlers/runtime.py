@@ -9,9 +9,7 @@ import mujoco
 import numpy as np
 from msgspec import field
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.dialects import ALPHA, Dialect
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.runtime import (
     ConfigureController,
     ConfigureControllerOk,
@@ -39,14 +37,16 @@ from urlab_client.protocol.messages.runtime import (
     SetTwist,
     SetTwistOk,
 )
-from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
 from urlab_client.server.core import ServerCore
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.handlers.control import check_all_owners, check_owner
 from urlab_client.server.physics.controllers import ArticulationControl, ControlSource
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.values.rotation import Quat, Vec3
+from urlab_client.values.types import Contact, KeyframeInfo, SimOptions
 
 MAX_CONTACTS: Final = 64
 

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 import mujoco
 
-from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from urlab_client.protocol.enums import PIEState
+from urlab_client.enums import PIEState
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie, StopPieOk
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.session import handshake

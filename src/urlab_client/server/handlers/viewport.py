@@ -6,7 +6,7 @@ import math
 import time
 from typing import Any
 
-from urlab_client.protocol.base import Quat, Request, Vec3
+from urlab_client.protocol.base import Request
 from urlab_client.protocol.messages.viewport import (
     FrameActor,
     FrameActorOk,
@@ -21,7 +21,6 @@ from urlab_client.protocol.messages.viewport import (
     Untrack,
     UntrackOk,
 )
-from urlab_client.protocol.rotation import xyzw
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.compile.bounds import actor_bounds
 from urlab_client.server.core import ServerCore
@@ -30,6 +29,7 @@ from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.values.rotation import Quat, Vec3, xyzw
 
 
 @handles(SetCamera)

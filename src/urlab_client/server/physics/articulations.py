@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import reset_controls
-from urlab_client.protocol.dialects import Dialect
 from urlab_client.protocol.messages.session import ArticulationCommand
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import ArticulationIndex
+from urlab_client.server.dialects import Dialect
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist
 from urlab_client.server.refusal import Refusal
 

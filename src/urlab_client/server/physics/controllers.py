@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import control_counts
-from urlab_client.protocol.controller_text import ControllerText
-from urlab_client.protocol.enums import ControllerKind
+from urlab_client.enums import ControllerKind
 from urlab_client.server.compile.scene_index import ArticulationIndex
+from urlab_client.server.controller_text import ControllerText
 
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]

@@ -17,11 +17,11 @@ from typing import Any, Final, Self, TypeVar
 
 import mujoco
 
-from urlab_client.protocol.dialects import ALPHA, Dialect
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import Step
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig
 from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy

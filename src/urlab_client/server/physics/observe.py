@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.enums import ObservationLevel
 from urlab_client.protocol.base import INT32_MAX
-from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import EntityIndex

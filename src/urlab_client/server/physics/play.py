@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.enums import PIEState
+from urlab_client.enums import PIEState
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits

@@ -17,11 +17,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.enums import ObservationLevel
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.dialects import ALPHA, Dialect
-from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import Clock, StepOk
 from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_seconds, wall_seconds
 

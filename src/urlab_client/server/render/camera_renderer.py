@@ -22,12 +22,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.dialects import ALPHA, Dialect
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import SceneCamera
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.render.appearance import Appearance, RenderQuality
 from urlab_client.server.render.drawing import Stage
 from urlab_client.server.render.latency import Instant, Latency, Past

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.editor.viewport import ViewMode

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from urlab_client._children import APART
-from urlab_client.protocol.errors import URLabError
+from urlab_client._platform.children import APART
+from urlab_client.errors import URLabError
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.enums import CameraMode
 
 Bytes = NDArray[np.uint8]
 

@@ -17,11 +17,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import IDENTITY, rotate
 from urlab_client.server.compile.bounds import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3, rotate
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -15,9 +15,9 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 import msgspec
 from msgspec import Struct
 
+from urlab_client.enums import Transport
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.enums import Transport
 from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS

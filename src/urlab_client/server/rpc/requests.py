@@ -18,8 +18,8 @@ from msgspec import UNSET, Struct, inspect
 
 from urlab_client.protocol.base import Op, Request
 from urlab_client.protocol.codec import building
-from urlab_client.protocol.dialects import ALPHA
 from urlab_client.protocol.registry import OPS
+from urlab_client.server.dialects import ALPHA
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.lenient import ABSENT, as_text, bad_request, bare, fill, fold_keys, read_plain

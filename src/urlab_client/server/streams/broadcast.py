@@ -15,9 +15,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
-from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.topics import STATE_FULL, TopicKind
@@ -26,6 +25,7 @@ from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.streams.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
 from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
 from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
 from urlab_client.server.transport.shared_memory import SharedMemoryServer

@@ -15,13 +15,13 @@ from typing import Any, Final
 
 import zmq
 
-from urlab_client._uninterrupted import uninterrupted
-from urlab_client.protocol.control_messages import CameraEndpoint
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client._platform.signals import uninterrupted
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
+from urlab_client.server.streams.control_messages import CameraEndpoint
 from urlab_client.server.streams.streamed_commands import StreamedCommand, read_commands
 from urlab_client.server.system.health import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator

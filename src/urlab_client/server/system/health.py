@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Final, TypeVarTuple
 
-from urlab_client._background import daemon
+from urlab_client._platform.threads import daemon
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

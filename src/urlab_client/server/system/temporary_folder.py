@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from urlab_client._windows import NamedLock
+from urlab_client._platform.windows import NamedLock
 
 _PREFIX: Final = "urlab-"
 _LOCK: Final = ".alive"

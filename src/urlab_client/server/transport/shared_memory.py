@@ -18,10 +18,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, cast
 
-from urlab_client._processors import crowded
-from urlab_client._windows import NamedEvent
+from urlab_client._platform.processors import crowded
+from urlab_client._platform.windows import NamedEvent
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.shm import (
     REPLY_FILE,
     REQUEST_FILE,

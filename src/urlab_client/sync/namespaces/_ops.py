@@ -7,9 +7,9 @@ from __future__ import annotations
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import _ops as aio
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
-from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
 from urlab_client.sync._facade import Facade
+from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.values.types import CameraPose, KeyframeInfo, MocapPose
 
 __all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportNamespace"]
 

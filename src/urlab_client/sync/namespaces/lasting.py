@@ -7,8 +7,8 @@ from __future__ import annotations
 from types import TracebackType
 
 from urlab_client.aio.namespaces import lasting as aio
-from urlab_client.protocol.types import PIEStartResult
 from urlab_client.sync._facade import Facade
+from urlab_client.values.types import PIEStartResult
 
 
 class Playing(Facade, twin=aio.Playing):

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import outliner as aio
-from urlab_client.protocol.scene_types import ActorInfo
 from urlab_client.sync.namespaces._ops import OutlinerOps
+from urlab_client.values.scene_types import ActorInfo
 
 
 class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):

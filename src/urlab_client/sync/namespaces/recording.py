@@ -8,9 +8,9 @@ from pathlib import Path
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import recording as aio
-from urlab_client.protocol.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.namespaces._ops import ReplayOps
+from urlab_client.values.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
 
 
 class RecordingNamespace(Facade, twin=aio.RecordingNamespace):

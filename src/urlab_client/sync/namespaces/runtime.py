@@ -10,7 +10,7 @@ from typing import Any
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import runtime as aio
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,
     CameraDelayInForce,
@@ -18,8 +18,8 @@ from urlab_client.protocol.messages.cameras import (
     CameraTransports,
 )
 from urlab_client.protocol.messages.session import ForwardOk
-from urlab_client.protocol.types import ContactsResult, SimOptions
 from urlab_client.sync.namespaces._ops import RuntimeOps
+from urlab_client.values.types import ContactsResult, SimOptions
 
 
 class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import scene as aio
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.protocol.scene_types import (
+from urlab_client.sync.namespaces._ops import SceneOps
+from urlab_client.sync.namespaces.lasting import SceneEdit
+from urlab_client.values.scene_types import (
     SceneSnapshot,
     URLabAsset,
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
 )
-from urlab_client.protocol.types import JobStatus, UploadProgress
-from urlab_client.sync.namespaces._ops import SceneOps
-from urlab_client.sync.namespaces.lasting import SceneEdit
+from urlab_client.values.types import JobStatus, UploadProgress
 
 if TYPE_CHECKING:
     import mujoco

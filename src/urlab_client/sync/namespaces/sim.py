@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import sim as aio
-from urlab_client.protocol.types import PIEStartResult, PIEStatus
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.namespaces.lasting import Playing
+from urlab_client.values.types import PIEStartResult, PIEStatus
 
 
 class SimNamespace(Facade, twin=aio.SimNamespace):

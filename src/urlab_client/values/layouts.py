@@ -8,7 +8,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client.errors import ProtocolError
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 """A received frame; a memoryview must be one of bytes (format `B`)."""

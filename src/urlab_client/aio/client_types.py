@@ -9,10 +9,10 @@ from typing import Any, Final
 from msgspec import Struct
 from msgspec.structs import asdict
 
-from urlab_client.protocol.enums import StepMode, Transport
-from urlab_client.protocol.features import Features
+from urlab_client.aio.features import Features
+from urlab_client.enums import StepMode, Transport
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 
 class Verdict(StrEnum):

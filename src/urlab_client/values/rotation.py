@@ -11,9 +11,10 @@ here knows of actors or ops.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, TypeAlias
 
-from urlab_client.protocol.base import Quat, Vec3
+Vec3: TypeAlias = tuple[float, float, float]
+Quat: TypeAlias = tuple[float, float, float, float]
 
 IDENTITY: Final[Quat] = (0.0, 0.0, 0.0, 1.0)
 

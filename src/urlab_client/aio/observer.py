@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from urlab_client.protocol.enums import CameraTiming
+from urlab_client.enums import CameraTiming
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
 

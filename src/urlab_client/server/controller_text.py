@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from urlab_client.protocol.enums import ControllerKind
+from urlab_client.enums import ControllerKind
 
 CUSTOM_TEXT: Final = "urlab_controller"
 """Name of the custom text element that names a model's controller."""

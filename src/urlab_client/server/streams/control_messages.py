@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.layouts import INT32, BytesLike, damaged, floats32, vector
+from urlab_client.values.layouts import INT32, BytesLike, damaged, floats32, vector
 
 _BAD_JSON = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 _SETPOINT = np.dtype([("id", "<i4"), ("value", "<f4")])

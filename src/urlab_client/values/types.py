@@ -6,9 +6,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.enums import PIEState
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.enums import PIEState
+from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Quat, Vec3
 
 
 class PIEStartResult(Serializable, Struct):
