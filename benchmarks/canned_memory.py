@@ -22,7 +22,8 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from urlab_client.protocol import doorbell, shm
+from urlab_client._platform.processors import no_fence
+from urlab_client.protocol import shm
 
 __all__ = ["memory_server"]
 
@@ -64,7 +65,9 @@ def memory_server(
 def _region(path: Path, stride: int) -> shm.Region:
     with path.open("w+b") as file:
         file.truncate(shm.region_size(stride))
-        return shm.create(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), stride, fence=shm.no_fence)
+        file.write(shm.HEADER.pack(shm.MAGIC, shm.VERSION, stride, 2, 0, 0))
+        file.flush()
+        return shm.attach(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=no_fence)
 
 
 def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:
@@ -130,7 +133,7 @@ def _main() -> None:
         threading.Thread(target=_write_pictures, args=(directory, camera), daemon=True).start()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     if bell:
-        listener.bind(str(directory / doorbell.FILE))
+        listener.bind(str(directory / shm.DOORBELL_FILE))
         listener.listen()
     print(port, flush=True)
     if not bell:
@@ -149,7 +152,7 @@ def _main() -> None:
                 served_at = -_BRISK_S
                 while True:
                     if memory.serve():
-                        client.send(doorbell.REPLY)
+                        client.send(shm.Ring.REPLY)
                         served_at = time.monotonic()
                     elif time.monotonic() - served_at > _BRISK_S:
                         break

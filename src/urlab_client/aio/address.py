@@ -6,7 +6,7 @@ import re
 
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.aio.transport.curve import ClientKeys
+from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.zmq import ZmqTransport
 
 _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")

@@ -40,9 +40,9 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import send_step, take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.curve import client_keys, is_local
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Reply, Request
@@ -169,7 +169,7 @@ class URLabClient(ClientState):
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
-        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = ServerRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         session = Session(
