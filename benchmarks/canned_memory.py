@@ -12,6 +12,7 @@ import ctypes
 import mmap
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -22,7 +23,6 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from urlab_client._platform.processors import no_fence
 from urlab_client.protocol import shm
 
 __all__ = ["memory_server"]
@@ -30,6 +30,7 @@ __all__ = ["memory_server"]
 _POLL_S = 100e-6
 _BRISK_S = 200e-6
 _PR_SET_TIMERSLACK = 29
+_RUNG_FOR_REPLY = b"r"
 
 
 @contextlib.contextmanager
@@ -65,9 +66,9 @@ def memory_server(
 def _region(path: Path, stride: int) -> shm.Region:
     with path.open("w+b") as file:
         file.truncate(shm.region_size(stride))
-        file.write(shm.HEADER.pack(shm.MAGIC, shm.VERSION, stride, 2, 0, 0))
+        file.write(struct.pack("<IIIIQI36x", shm.MAGIC, shm.VERSION, stride, 2, 0, 0))
         file.flush()
-        return shm.attach(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=no_fence)
+        return shm.attach(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=lambda: None)
 
 
 def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:
@@ -133,7 +134,7 @@ def _main() -> None:
         threading.Thread(target=_write_pictures, args=(directory, camera), daemon=True).start()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     if bell:
-        listener.bind(str(directory / shm.DOORBELL_FILE))
+        listener.bind(str(directory / "doorbell.sock"))
         listener.listen()
     print(port, flush=True)
     if not bell:
@@ -152,7 +153,7 @@ def _main() -> None:
                 served_at = -_BRISK_S
                 while True:
                     if memory.serve():
-                        client.send(shm.Ring.REPLY)
+                        client.send(_RUNG_FOR_REPLY)
                         served_at = time.monotonic()
                     elif time.monotonic() - served_at > _BRISK_S:
                         break
