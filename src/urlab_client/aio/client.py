@@ -39,9 +39,9 @@ from urlab_client.aio.state.stepping import send_step, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.curve import client_keys, is_local
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.errors import URLabError
 from urlab_client.events import ClientEvent
@@ -169,7 +169,7 @@ class URLabClient(ClientState):
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
-        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = ServerRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         session = Session(

@@ -29,7 +29,7 @@ from msgspec import Struct
 from urlab_client._platform.children import APART
 from urlab_client.aio.background import Tell, background_task, background_thread
 from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
-from urlab_client.aio.transport.curve import ClientKeys
+from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
 from urlab_client.events import ClientEvent

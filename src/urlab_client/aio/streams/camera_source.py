@@ -7,15 +7,14 @@ from typing import Protocol
 
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.source import PublishedSource
-from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
+from urlab_client.aio.transport.shm_streams import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.enums import CameraMode
-from urlab_client.protocol import doorbell
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import (
     CameraSample,
 )
-from urlab_client.protocol.shm import camera_file
+from urlab_client.protocol.shm import Ring, camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 from urlab_client.values.layouts import BytesLike
 from urlab_client.values.pictures import PictureMemory, decode_camera
@@ -131,7 +130,7 @@ class CameraSource(PublishedSource):
         topic = self.view.info.zmq_topic
         separator = "/camera/" if "/camera/" in topic else "/"
         articulation, _, camera = topic.strip().partition(separator)
-        return Place(camera_file(articulation, camera), camera_filter(topic), doorbell.CAMERA)
+        return Place(camera_file(articulation, camera), camera_filter(topic), Ring.CAMERA)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Skip a picture that was already read in place of its predecessor."""

@@ -14,9 +14,9 @@ from urlab_client.aio.streams.derived_rows import DerivedRowSource, HasRows
 from urlab_client.aio.streams.event_bus import EventBus
 from urlab_client.aio.streams.row_source import RowSource
 from urlab_client.aio.streams.state_source import OwnSteps, StateSource
-from urlab_client.aio.transport.curve import ClientKeys
-from urlab_client.aio.transport.regions import Regions
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.connection import ClientKeys
+from urlab_client.aio.transport.shm_regions import ServerRegions
+from urlab_client.aio.transport.shm_streams import Regions
 from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
@@ -81,7 +81,7 @@ class Publishers:
         live: Callable[[], bool] = lambda: True,
         features: Callable[[], Features] = Features,
         keys: ClientKeys | None = None,
-        memory: SharedMemoryRegions | None = None,
+        memory: ServerRegions | None = None,
     ) -> None:
         self.default_timeout = default_timeout
         self.subscriptions: Subscriptions = Subscriptions(keys)

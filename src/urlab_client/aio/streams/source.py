@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from urlab_client.aio.transport.regions import Place, Regions
+from urlab_client.aio.transport.shm_streams import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.errors import ProtocolError
 from urlab_client.values.layouts import BytesLike

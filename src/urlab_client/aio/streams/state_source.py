@@ -7,14 +7,13 @@ from collections import deque
 from collections.abc import Callable
 
 from urlab_client.aio.streams.source import PublishedSource
-from urlab_client.aio.transport.regions import Place, Regions
+from urlab_client.aio.transport.shm_streams import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
-from urlab_client.protocol import doorbell
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import (
     StateSnapshot,
 )
-from urlab_client.protocol.shm import STATE_FILE
+from urlab_client.protocol.shm import STATE_FILE, Ring
 from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.values.layouts import BytesLike
 
@@ -106,7 +105,7 @@ class StateSource(PublishedSource):
 
     def place(self) -> Place:
         """See the base class."""
-        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+        return Place(STATE_FILE, STATE_FULL, Ring.STATE)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Skip snapshots that already arrived: both deliver them when the region takes over from the socket."""

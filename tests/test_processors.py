@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from urlab_client.protocol.fence import processor_fence
-from urlab_client.protocol.shm import no_fence
+from urlab_client._platform.processors import no_fence, processor_fence
 
 
 @pytest.fixture(autouse=True)
@@ -32,12 +31,8 @@ def test_other_processors_get_one_that_can_be_called(monkeypatch: pytest.MonkeyP
     fence()
 
 
-def test_without_a_library_for_it_a_mutex_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    libc = ctypes.CDLL(None)
-
+def test_without_a_library_for_it_a_lock_serves(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(name: str | None) -> ctypes.CDLL:
-        if name is None:
-            return libc
         raise OSError(name)
 
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")

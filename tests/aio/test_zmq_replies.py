@@ -1,57 +1,22 @@
-"""Replies reach the task that awaits them in the callback that reads them, and others are not kept waiting by that."""
+"""Replies over ZeroMQ that come twice, or to handshakes that were given up."""
 
 from __future__ import annotations
 
 import asyncio
-import contextvars
 
 import msgspec
 import pytest
 import zmq
 from waiting import DEADLINE_S
 
-from urlab_client.aio.transport import busy_poll
-from urlab_client.aio.transport.delivery import deliver
+from urlab_client.aio.transport import waiting
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.registry import OPS
 
 
-async def test_the_task_goes_on_before_deliver_returns_and_in_its_own_context() -> None:
-    loop, name = asyncio.get_running_loop(), contextvars.ContextVar("name", default="the callback's")
-    reply: asyncio.Future[str] = loop.create_future()
-    order: list[str] = []
-
-    async def wait() -> None:
-        name.set("the task's")
-        order.append(f"{await reply} in {name.get()}, {asyncio.current_task() is task}")
-
-    def receive() -> None:
-        deliver(reply, "it came")
-        order.append("delivered")
-
-    task = asyncio.create_task(wait())
-    await asyncio.sleep(0)
-    loop.call_soon(receive)
-    await task
-    assert order == ["it came in the task's, True", "delivered"]
-
-
-async def test_several_that_wait_all_get_it() -> None:
-    loop = asyncio.get_running_loop()
-    reply: asyncio.Future[str] = loop.create_future()
-
-    async def wait() -> str:
-        return await reply
-
-    tasks = [asyncio.create_task(wait()) for _ in range(2)]
-    await asyncio.sleep(0)
-    loop.call_soon(deliver, reply, "it came")
-    assert await asyncio.gather(*tasks) == ["it came", "it came"]
-
-
 async def test_replies_that_come_twice_keep_no_later_one_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second is still unread when the next request goes out: the descriptor says nothing of the next reply."""
-    monkeypatch.setattr(busy_poll, "crowded", lambda: True)  # who looks by itself would find it
+    monkeypatch.setattr(waiting, "crowded", lambda: True)  # who looks by itself would find it
     op = OPS["forward"]
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
         port = router.bind_to_random_port("tcp://127.0.0.1")

@@ -16,9 +16,7 @@ from typing import TypeVar, cast
 
 from msgspec import Struct
 
-from urlab_client.aio.transport.mapped_region import MappedRegion
-from urlab_client.aio.transport.poller import StreamPoll
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.shm_regions import MappedRegion, ServerRegions
 from urlab_client.aio.transport.subscriber import (
     MessageGone,
     MessageHandler,
@@ -26,9 +24,9 @@ from urlab_client.aio.transport.subscriber import (
     Subscriptions,
     client_closed,
 )
+from urlab_client.aio.transport.waiting import Watch, watch_memory
 from urlab_client.errors import ProtocolError, URLabError
-from urlab_client.protocol import doorbell
-from urlab_client.protocol.shm import Publication
+from urlab_client.protocol.shm import Publication, Ring
 from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
@@ -40,8 +38,9 @@ _SUPERVISE_S = 0.25
 _IDLE_S = 0.5
 _SILENT_S = 1.0
 _ATTEMPTS = 4
+_FASTEST_POLL_S = 250e-6
 
-_WANTS = {doorbell.STATE: doorbell.WANT_STATE, doorbell.CAMERA: doorbell.WANT_CAMERAS}
+_WANTS = {Ring.STATE: Ring.WANT_STATE, Ring.CAMERA: Ring.WANT_CAMERAS}
 
 
 class Place(Struct, frozen=True):
@@ -96,8 +95,7 @@ class _RegionReader:
         self.mapping: MappedRegion = MappedRegion(path)
         self.place = place
         self.handlers: dict[MessageHandler, None] = {}
-        self.watch: StreamPoll | None = None
-        self.silent = False
+        self.watch: Watch | None = None
         self.seen: int = 0
         self.changed_at: float = 0.0
         # Pictures are read on the thread that accesses them.
@@ -108,9 +106,9 @@ class _RegionReader:
     def region_sequence(self) -> int:
         return self.mapping.region.sequence
 
-    def news(self) -> bool:
-        """Return whether there is something to do. Called on the polling thread."""
-        return not self.mapping.intact() or self.mapping.region.sequence != self.seen
+    def has_news(self) -> bool:
+        """Return whether there is something to do. Called on the watching thread, too."""
+        return not self.mapping.intact() or self.region_sequence != self.seen
 
     def begun_anew(self) -> bool:
         """Return whether a server reinitialised the region in place, as happens after a crash of its predecessor."""
@@ -119,7 +117,7 @@ class _RegionReader:
     def message(self) -> BytesLike | None:
         """Return the current publication, or None if there is none. Raises `ProtocolError`."""
         region = self.mapping.region
-        if self.place.ring == doorbell.CAMERA:
+        if self.place.ring == Ring.CAMERA:
             self.seen = region.sequence
             # The handlers use its length and pass it back to their source, which handles this type.
             return cast("BytesLike", SharedPicture(self, self.seen, region.max_payload)) if self.seen else None
@@ -141,17 +139,20 @@ class _RegionReader:
 
     def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
         """Return a live view of the current publication and a check whether it is still valid."""
+
+        def holds(sequence: int) -> bool:
+            with self._lock:
+                return not self._closed and self.mapping.intact() and self.mapping.region.holds(sequence)
+
         with self._lock:
             if self._closed or not self.mapping.intact():
                 return None
-            found = self.mapping.region.view_latest()
-            return None if found is None else (found, lambda: self._holds(found.sequence))
-
-    def _holds(self, sequence: int) -> bool:
-        with self._lock:
-            return not self._closed and self.mapping.intact() and self.mapping.region.holds(sequence)
+            found = self.mapping.region.read_latest(take=lambda view: view)
+            return None if found is None else (found, lambda: holds(found.sequence))
 
     def close(self) -> None:
+        if self.watch is not None:
+            self.watch.close()
         with self._lock:
             self._closed = True
             self.mapping.close()
@@ -161,22 +162,22 @@ class Regions:
     """Everything that one client receives from shared memory. Except for `view`, use from one event loop.
 
     Args:
-        memory: Location of the regions.
+        location: Location of the regions.
         subscriptions: Sockets used as a fallback.
     """
 
-    def __init__(self, memory: SharedMemoryRegions, subscriptions: Subscriptions) -> None:
-        self._memory = memory
+    def __init__(self, location: ServerRegions, subscriptions: Subscriptions) -> None:
+        self._location = location
         self._subscriptions = subscriptions
         self._wanted: dict[MessageHandler, _Wanted] = {}
         self._readers: dict[str, _RegionReader] = {}
-        self._refused: dict[str, str] = {}
+        self._silent: dict[str, int] = {}  # sequence at which a region fell silent, by file
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._away = False
         self._closed = False
         for ring in _WANTS:
-            memory.rung[ring].append(self._look_at_all)
+            location.on_ring[ring].append(self._look_at_all)
 
     def attach(
         self, handler: MessageHandler, subscription: Callable[[], Subscription], place: Callable[[], Place]
@@ -192,7 +193,7 @@ class Regions:
             raise client_closed()
         self._loop = asyncio.get_running_loop()
         reader = self._reader(place)
-        if reader is None or reader.silent:
+        if reader is None:
             self._subscriptions.attach(handler, subscription)
         else:
             self._feed(reader, handler)
@@ -207,7 +208,7 @@ class Regions:
         self._subscriptions.detach(handler)
         for reader in tuple(self._readers.values()):
             reader.handlers.pop(handler, None)
-            if not reader.handlers and not reader.silent:
+            if not reader.handlers:
                 self._close_reader(reader)
 
     def path(self, handler: MessageHandler) -> Path | None:
@@ -217,11 +218,11 @@ class Regions:
     def refresh(self) -> None:
         """Reattach after a handshake: play may have started and the regions may have changed."""
         self._away = False
-        self._refused.clear()
+        self._silent.clear()
         for reader in tuple(self._readers.values()):
-            if not reader.mapping.intact() or reader.mapping.replaced() or self._moved(reader):
+            if not reader.mapping.intact() or self._moved(reader):
                 self._lose(reader)
-        self._settle_all()
+        self._return_to_regions()
 
     def release(self) -> None:
         """Release every region until `refresh`, because play ends or the server and its files are gone."""
@@ -251,7 +252,7 @@ class Regions:
     # Readers
 
     def _reader(self, wanted: Callable[[], Place]) -> _RegionReader | None:
-        """Return the reader of a region. Open it if the region exists and has a publication."""
+        """Return the reader of a region. Open it if the region exists and has news."""
         if self._away:
             return None
         try:
@@ -259,48 +260,49 @@ class Regions:
             known = self._readers.get(place.file)
             if known is not None:
                 return known
-            path = self._memory.find(place.file)
+            path = self._location.find(place.file)
             if path is None:
                 return None
             reader = _RegionReader(path, place)
         except (OSError, ProtocolError) as error:
             log.debug("not from shared memory: %s", error)
             return None
-        if reader.region_sequence == 0:
+        if reader.region_sequence in (0, self._silent.get(place.file)):
             reader.close()
             return None
         reader.changed_at = self._now()
         self._readers[place.file] = reader
-        self._memory.connect_bell()
-        self._memory.want(_WANTS[place.ring])
-        self._rouse(reader)
+        self._location.connect_doorbell()
+        self._location.want(_WANTS[place.ring])
+        self._watch(reader)
         log.debug("receiving from %s", path)
         return reader
 
     def _feed(self, reader: _RegionReader, handler: MessageHandler) -> None:
+        def welcome() -> None:
+            if self._readers.get(reader.place.file) is reader and reader.has_news():
+                self._look_at(reader)
+            else:
+                self._deliver(reader, (handler,))
+
         reader.handlers[handler] = None
         if self._loop is not None:
             # Deliver an existing publication, too, but later: a handler that is attaching is not ready for it yet.
-            self._loop.call_soon(self._welcome, reader, handler)
+            self._loop.call_soon(welcome)
 
-    def _welcome(self, reader: _RegionReader, handler: MessageHandler) -> None:
-        if self._readers.get(reader.place.file) is reader and reader.news():
-            self._look_at(reader)
-        else:
-            self._deliver(reader, (handler,))
-
-    def _rouse(self, reader: _RegionReader) -> None:
-        """Ensure that changes in a reader's region are detected."""
-        if self._memory.bell is None and reader.watch is None:
-            reader.watch = StreamPoll(reader.news, lambda: self._look_at(reader))
-            self._memory.waiter.add(reader.watch)
-        elif self._memory.bell is not None and reader.watch is not None:
-            self._memory.waiter.remove(reader.watch)
-            reader.watch = None
+    def _watch(self, reader: _RegionReader) -> None:
+        """Have a thread look at a region while there is no doorbell."""
+        there = self._readers.get(reader.place.file) is reader
+        if there and self._location.doorbell is None and self._loop is not None:
+            if reader.watch is None:
+                tell = self._location.tell
+                reader.watch = watch_memory(
+                    self._loop, reader.has_news, lambda: self._look_at(reader), fastest_s=_FASTEST_POLL_S, tell=tell
+                )
+            reader.watch.expect()
 
     def _look_at_all(self) -> None:
         for reader in tuple(self._readers.values()):
-            self._rouse(reader)
             self._look_at(reader)
 
     def _look_at(self, reader: _RegionReader) -> None:
@@ -312,15 +314,12 @@ class Regions:
             return
         if reader.begun_anew():
             self._lose(reader)
-            self._settle_all()
+            self._return_to_regions()
             return
         if reader.region_sequence != reader.seen:
             reader.changed_at = self._now()
-            if reader.silent:
-                self._resume(reader)
             self._deliver(reader, tuple(reader.handlers))
-        if reader.watch is not None:
-            reader.watch.resume()
+        self._watch(reader)
 
     def _deliver(self, reader: _RegionReader, handlers: Iterable[MessageHandler]) -> None:
         if self._readers.get(reader.place.file) is not reader or not reader.mapping.intact():
@@ -344,29 +343,15 @@ class Regions:
         handlers = tuple(reader.handlers)
         self._close_reader(reader)
         for handler in handlers:
-            self._subscribe(handler)
+            wanted = self._wanted.get(handler)
+            if wanted is not None:
+                with contextlib.suppress(URLabError, ValueError):  # treat an invalid address like a closed port
+                    self._subscriptions.attach(handler, wanted.subscription)
 
     def _close_reader(self, reader: _RegionReader) -> None:
         self._readers.pop(reader.place.file, None)
-        if reader.watch is not None:
-            self._memory.waiter.remove(reader.watch)
-            reader.watch = None
         reader.handlers.clear()
         reader.close()
-
-    def _subscribe(self, handler: MessageHandler) -> None:
-        wanted = self._wanted.get(handler)
-        if wanted is not None:
-            with contextlib.suppress(URLabError, ValueError):  # treat an invalid address like a closed port
-                self._subscriptions.attach(handler, wanted.subscription)
-
-    def _resume(self, reader: _RegionReader) -> None:
-        """Move handlers back from their sockets to a region that publishes again."""
-        reader.silent = False
-        for handler, wanted in self._wanted.items():
-            if _file_of(wanted.place) == reader.place.file:
-                self._subscriptions.detach(handler)
-                reader.handlers[handler] = None
 
     # Supervision
 
@@ -376,45 +361,31 @@ class Regions:
             self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
         now = self._now()
         for reader in tuple(self._readers.values()):
-            self._rouse(reader)
             self._look_at(reader)
             idle = now - reader.changed_at
             if idle > _IDLE_S and self._readers.get(reader.place.file) is reader:
-                if reader.mapping.replaced() or self._moved(reader):
+                # While play runs, snapshots keep coming. One that exceeds its slot arrives only by socket.
+                silent = idle > _SILENT_S and reader.place.ring == Ring.STATE
+                if silent:
+                    self._silent[reader.place.file] = reader.region_sequence
+                if silent or self._moved(reader):
                     self._lose(reader)
-                elif idle > _SILENT_S and reader.place.ring == doorbell.STATE and not reader.silent:
-                    # While play runs, snapshots keep coming. One that exceeds its slot arrives only by socket.
-                    reader.silent = True
-                    handlers = tuple(reader.handlers)
-                    reader.handlers.clear()
-                    for handler in handlers:
-                        self._subscribe(handler)
-        self._settle_all()
-        for reader in tuple(self._readers.values()):
-            if not self._wanted:
-                self._close_reader(reader)
+        self._return_to_regions()
 
-    def _settle_all(self) -> None:
-        """Move handlers from sockets to their regions if these exist by now."""
+    def _return_to_regions(self) -> None:
+        """Move handlers from sockets to their regions if these have news by now."""
         for handler, wanted in tuple(self._wanted.items()):
             if self.path(handler) is None:
                 reader = self._reader(wanted.place)
-                if reader is not None and not reader.silent:
+                if reader is not None:
                     self._subscriptions.detach(handler)
                     self._feed(reader, handler)
 
     def _moved(self, reader: _RegionReader) -> bool:
         try:
-            return self._memory.find(reader.place.file) != reader.mapping.path
+            return reader.mapping.replaced() or self._location.find(reader.place.file) != reader.mapping.path
         except (OSError, ProtocolError):  # the directory's name comes from the server
             return True
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()
-
-
-def _file_of(place: Callable[[], Place]) -> str | None:
-    try:
-        return place().file
-    except ProtocolError:  # the cameras' names come from the server
-        return None
