@@ -22,13 +22,18 @@ class CommandError(Exception):
     """An expected failure; its text is one line that says what failed, where, and what would be right."""
 
 
+def joined(text: str) -> str:
+    """Return a text on one line. Spaces within its lines stay, because they may be part of a file's name."""
+    return " ".join(line for part in text.splitlines() if (line := part.strip()))
+
+
 def one_line(error: BaseException) -> str:
     """Return an exception's text on one line."""
     text = str(error)
     if isinstance(error, OSError) and error.strerror:
         # Leave out the error number, which does not help users.
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(text.split()) or type(error).__name__
+    return joined(text) or type(error).__name__
 
 
 def in_background() -> bool:

@@ -70,7 +70,7 @@ def run(arguments: Namespace) -> int:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     check_recording(arguments.output, arguments)
     if arguments.camera and arguments.address.startswith("sim://"):
-        from urlab_client.server.render.opengl import need_backend
+        from urlab_client.simulation.opengl import need_backend
 
         need_backend()  # the server that this command starts renders on this machine
     with refusing(KeyError):

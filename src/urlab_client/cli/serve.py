@@ -26,7 +26,7 @@ from urlab_client._platform.windows import read_aside
 from urlab_client.cli._arguments import Parser, add_dialect, count, image_size, index, port
 from urlab_client.cli._common import CommandError, import_mujoco, in_background
 from urlab_client.enums import CameraMode, StepMode
-from urlab_client.server.controller_text import ControllerText
+from urlab_client.simulation.controller_config import ControllerConfig
 
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
@@ -259,7 +259,6 @@ def run(arguments: Namespace) -> int:
 
 def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
     from urlab_client.server.limits import Limits
-    from urlab_client.server.physics.controllers import ControllerConfig
     from urlab_client.server.simulated import SimulatedServer
 
     options = {name: getattr(arguments, name) for name in _PASSED_ON}
@@ -270,7 +269,7 @@ def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
             curve=_curve(arguments),
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
-            controllers={actor: ControllerConfig.of(text) for actor, text in arguments.controller},
+            controllers=dict(arguments.controller),
             camera_modes=dict(arguments.camera_mode),
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
         )
@@ -372,12 +371,12 @@ def _check_paths(arguments: Namespace) -> None:
             raise CommandError(f"--model-root {folder}: no such folder")
 
 
-def _controller(text: str) -> tuple[str, ControllerText]:
+def _controller(text: str) -> tuple[str, ControllerConfig]:
     actor, equals, value = text.partition("=")
     if not actor or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
     try:
-        return actor, ControllerText.parse(value)
+        return actor, ControllerConfig.parse(value)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 

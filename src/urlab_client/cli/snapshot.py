@@ -129,7 +129,7 @@ def _check_mode(arguments: Namespace) -> None:
 def _of_models(arguments: Namespace) -> NDArray[np.uint8]:
     from urlab_client import URLabClient
     from urlab_client.server import SimulatedServer
-    from urlab_client.server.render.opengl import need_backend
+    from urlab_client.simulation.opengl import need_backend
 
     if arguments.handshake is not None:
         raise CommandError("--handshake is for the address of a running server")

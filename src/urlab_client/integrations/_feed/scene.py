@@ -28,7 +28,7 @@ from urlab_client.integrations._feed.messages import (
 )
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
-from urlab_client.server.dialects import cleaned_name
+from urlab_client.values.names import cleaned_name
 
 if TYPE_CHECKING:
     import mujoco

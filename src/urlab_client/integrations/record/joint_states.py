@@ -25,7 +25,7 @@ from urlab_client.integrations.record.index import IndexedChannel, Progress
 from urlab_client.integrations.record.reader import Run
 from urlab_client.integrations.record.tables import quantities
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.server.physics.recording import Frame, decode_json
+from urlab_client.simulation.joint_recording import Frame, decode_json
 
 OWNER = "joints"
 """Key of the only articulation, because the file names compiled joints and no robots."""
