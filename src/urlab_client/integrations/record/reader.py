@@ -338,7 +338,7 @@ class Run:
         now = status.st_size, status.st_mtime_ns
         with self._lock:
             if self._indexed is None or self._indexed[0] != now:
-                self._indexed = now, RecordingIndex.of(self.path, progress)
+                self._indexed = now, RecordingIndex(self.path, progress)
             index = self._indexed[1]
         self.damage = index.damage
         return index
