@@ -16,7 +16,7 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
-from urlab_client.aio.transport import connection_status
+from urlab_client.aio.transport import connection
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
 from urlab_client.events import (
     ClientEvent,
@@ -199,7 +199,7 @@ async def test_garbage_on_the_line_is_a_typed_error_and_the_next_call_works(
 async def test_garbage_in_the_handshake_of_a_reconnection_does_not_end_it_for_good(
     server: SimulatedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection_status, "RETRY_S", 0.2)
+    monkeypatch.setattr(connection, "_RETRY_S", 0.2)
     options = server.client_options() | {"step_mode": "direct"}
     async with Relay(options["step_port"]) as relay, URLabClient(**(options | {"step_port": relay.port})) as client:
         await client.discover()

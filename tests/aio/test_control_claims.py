@@ -14,7 +14,7 @@ from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import ControlClaimed, NotControlOwner
 from urlab_client.aio import URLabClient
-from urlab_client.aio.control import process_owner
+from urlab_client.aio.session.control import process_owner
 from urlab_client.errors import UnknownArticulation
 from urlab_client.protocol.messages.control import ReleaseControl
 from urlab_client.web.explained_errors import explain_error

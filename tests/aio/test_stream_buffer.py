@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
+from urlab_client.aio.streams.buffer import BufferedMessage, StreamBuffer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
 TOPICS = [b"a", b"b", b"c"]

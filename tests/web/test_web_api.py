@@ -22,11 +22,12 @@ from starlette.websockets import WebSocketDisconnect
 from waiting import attempts
 
 from urlab_client.aio import URLabClient
+from urlab_client.console import mujoco_viewer
+from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
 from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app, mujoco_viewer
-from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web import Access, app
 
 
 @pytest.fixture(scope="module")
