@@ -15,17 +15,17 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio import launch as launching
-from urlab_client.aio.control import Control
 from urlab_client.aio.launch import LaunchedTransport
-from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.live_state import LiveState
+from urlab_client.aio.session.control import Control
 from urlab_client.aio.state import session_keeper
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.session_keeper import SessionKeeper
+from urlab_client.aio.streams.camera_switch import CameraSwitch
+from urlab_client.aio.streams.live_state import LiveState
 from urlab_client.aio.transport import waiting as transport_waiting
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.errors import ServerRestarted, ServerUnreachable, URLabError
-from urlab_client.protocol.messages.streams import ClientEvent, ServerReconnected, TaskFailed
+from urlab_client.events import ClientEvent, ServerReconnected, TaskFailed
 from urlab_client.server import SimulatedServer
 
 

@@ -18,7 +18,7 @@ from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
 from urlab_client.aio.transport import connection
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,
@@ -153,8 +153,7 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
     await client.discover()
     scripted.on("current_level", None)
     pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
-    while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
-        pass
+    await asyncio.to_thread(scripted.request, "current_level")
     await asyncio.to_thread(scripted.close)
     reborn = type(scripted)(scripted.port)
     reborn.on("current_level", LEVEL)
@@ -168,8 +167,7 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
 async def test_a_read_whose_server_stays_away_says_that_it_was_lost(client: Any, scripted: Any) -> None:
     await client.discover()
     pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
-    while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
-        pass
+    await asyncio.to_thread(scripted.request, "current_level")
     await asyncio.to_thread(scripted.close)
     await wait_until(lambda: not client.connected)
     pass_time(DEADLINE_S)
@@ -225,8 +223,7 @@ async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any, monkeypat
     reborn = type(scripted)(port)
     reborn.on("current_level", LEVEL)
     try:
-        while (await asyncio.to_thread(reborn.request))["op"] != "list_keyframes":
-            pass
+        await asyncio.to_thread(reborn.request, "list_keyframes")
         assert await client.scene.current_level(timeout=DEADLINE_S) == "/Game/Levels/lab"
     finally:
         await asyncio.to_thread(reborn.close)

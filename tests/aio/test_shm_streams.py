@@ -18,13 +18,13 @@ from waiting import DEADLINE_S
 from written_region import WrittenRegion, create
 
 from urlab_client._platform.processors import processor_fence
-from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
-from urlab_client.values.picture_memory import PictureMemory
+from urlab_client.values.pictures import PictureMemory
 
 STATE = b"state/full"
 WIDTH, HEIGHT = 32, 24

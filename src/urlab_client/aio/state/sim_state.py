@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.live.live_state import LatestPicture, LiveState
-from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.live.step_streams import StepStreams
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.observer import ClientObserver
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
+from urlab_client.aio.streams.live_state import LatestPicture, LiveState
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.step_streams import StepStreams
 from urlab_client.enums import CameraMode, CameraTiming, StepMode
 from urlab_client.errors import (
     NoActiveManager,
@@ -32,6 +32,7 @@ from urlab_client.errors import (
     SessionTakenOver,
     URLabRPCError,
 )
+from urlab_client.events import PlayEnded, SessionLost, SessionOpened
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import (
     ArticulationState,
@@ -42,9 +43,9 @@ from urlab_client.protocol.messages.session import (
     StateReply,
     StepOk,
 )
-from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.sim_options import check_sim_options
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import Pixels, decode_camera
 from urlab_client.values.types import SimOptions
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

@@ -30,9 +30,9 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages.session import HelloOk, StateReply
-from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, Ring
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")

@@ -21,7 +21,7 @@ import zmq
 from msgspec import Struct
 
 from urlab_client._platform.signals import uninterrupted
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.transport.connection import (
     FAILED_HANDSHAKES,
     RECONNECT_MAX_MS,

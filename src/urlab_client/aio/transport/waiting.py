@@ -20,7 +20,7 @@ import zmq
 
 from urlab_client._platform.processors import crowded
 from urlab_client.aio.background import Tell, background_thread
-from urlab_client.protocol.messages.streams import ClientEvent
+from urlab_client.events import ClientEvent
 
 Socket: TypeAlias = zmq.Socket[bytes]
 

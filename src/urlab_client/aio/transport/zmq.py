@@ -17,7 +17,7 @@ from typing import cast
 import zmq
 from msgspec import Struct
 
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.transport.base import LateReply, TransportStats, lost, no_reply
 from urlab_client.aio.transport.connection import (
     FAILED_HANDSHAKES,
@@ -36,17 +36,10 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-)
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 

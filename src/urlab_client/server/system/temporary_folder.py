@@ -29,9 +29,6 @@ class TemporaryFolder:
     """A temporary folder of this process.
 
     Not a `tempfile.TemporaryDirectory`, which a forked child would remove.
-
-    Attributes:
-        path: The folder.
     """
 
     path: Path
@@ -148,11 +145,7 @@ def sweep(folder: Path, *patterns: str) -> None:
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Generator[None]:
-    """Lock a folder that no process is using.
-
-    Raises:
-        OSError: A process is using it, or it does not exist.
-    """
+    """Lock a folder; raises `OSError` while a process is using it, or if it does not exist."""
     if sys.platform == "win32":
         sweeps = NamedLock(_name("sweeps", folder))
         try:
