@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, Literal, Self, get_args
 
@@ -281,6 +282,11 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
     def delays_actions(self) -> bool:
         """Whether actions are delayed."""
         return steps_range(self.delay.action)[1] > 0
+
+    def latencies(self, cameras: Iterable[str]) -> dict[str, CameraLatency]:
+        """Return the latencies of the cameras that have one; the last entry that names a camera applies."""
+        names = [*cameras]
+        return {name: late for late in self.camera for name in names if fnmatch.fnmatchcase(name, late.camera)}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:

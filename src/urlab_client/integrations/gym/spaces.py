@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.enums import CameraMode
@@ -36,6 +37,21 @@ class _Articulation:
     low: Floats
     high: Floats
     widths: Mapping[Field, int]
+
+
+def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
+    """Return the fields of an observation level, or the given field names.
+
+    Raises:
+        ValueError: The level is unknown.
+    """
+    if not isinstance(observations, str):
+        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
+    if observations not in LEVELS:
+        raise ValueError(
+            f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
+        )
+    return LEVELS[observations]
 
 
 class SpaceMapping:
@@ -110,6 +126,11 @@ class SpaceMapping:
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
         """Return the names of the hinge and slide joints of an articulation: joints with a scalar position."""
         return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
+
+    def scalar_joints(self, key: str, model: mujoco.MjModel) -> NDArray[np.intp]:
+        """Return the ids of the joints in `joint_names`."""
+        joints = self._parts[key].layout.joints
+        return np.array([joints[name] for name in self.joint_names(key, model)], dtype=np.intp)
 
     def set_points(self, action: Any) -> dict[str, Floats]:
         """Return the set-points of each articulation, shape (…, n_ctrl), from an action.
