@@ -21,7 +21,7 @@ from msgspec import structs
 from urlab_client.aio.background import kept_running
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,
@@ -31,8 +31,8 @@ from urlab_client.protocol.messages.streams import (
     ServerSilent,
     SessionLost,
     SessionOpened,
-    StateSnapshot,
 )
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.web.body_pushing import BodyPushing
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe

@@ -17,7 +17,7 @@ from urlab_client.aio.background import background_task, kept_running
 from urlab_client.enums import CameraMode, StepMode
 from urlab_client.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
-from urlab_client.values.picture_files import jpeg
+from urlab_client.values.pictures import jpeg
 from urlab_client.web.messages import PictureHead
 
 if TYPE_CHECKING:

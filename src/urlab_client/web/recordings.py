@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import anyio.to_thread
 from msgspec import Struct
 
-from urlab_client._extras import MissingExtra, need
+from urlab_client._installation import MissingExtra, need
 from urlab_client.errors import URLabError
 from urlab_client.web.stoppable import Progress, stoppable
 

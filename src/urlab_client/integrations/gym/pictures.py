@@ -32,7 +32,7 @@ from urlab_client.simulation.drawing import Stage
 from urlab_client.simulation.opengl import Backend, need_backend
 from urlab_client.simulation.tints import Tints
 from urlab_client.values.names import cleaned_name
-from urlab_client.values.pixels import Pixels, decode_camera, observed_pixels
+from urlab_client.values.pictures import Pixels, decode_camera, observed_pixels
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""
