@@ -113,7 +113,7 @@ class InverseKinematics:
             )
         self._client = client
         self._source = model
-        self._robot = _robot(client, articulation)
+        self._robot = only_robot(client, articulation)
         if (site is None) is (body is None):
             raise ValueError("give exactly one frame: either site=NAME or body=NAME")
         kind, name = ("site", site) if site is not None else ("body", body or "")
@@ -187,11 +187,11 @@ class InverseKinematics:
             KeyError: A joint of `start` is not one of `self.joints`.
             URLabError: The client's model has been replaced since.
         """
-        aim = _vector("position", position, 3)
+        aim = vector("position", position, 3)
         turn = None if quaternion is None else _unit(quaternion)
         if starts < 1:
             raise ValueError(f"starts must be at least 1, not {starts}")
-        limits = _positive("tolerance", tolerance), _positive("rotation_tolerance", rotation_tolerance)
+        limits = positive("tolerance", tolerance), positive("rotation_tolerance", rotation_tolerance)
         found: list[IkSolution] = []
         for qpos in self._initial_positions(start, starts):
             found.append(self._descend(qpos, aim, turn, limits))
@@ -291,14 +291,15 @@ class InverseKinematics:
         return f"<InverseKinematics {self._kind} {self.frame!r} of {self._robot.name!r}>"
 
 
-def _robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulation | AsyncArticulation:
+def only_robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulation | AsyncArticulation:
+    """Return an articulation by its key, or the only one."""
     robots = client.articulations
     if key is not None:
         return robots[key]
     if len(robots) != 1:
         raise URLabError(
             f"Name the articulation: the scene has {', '.join(robots) or 'none'}.",
-            hint="Call InverseKinematics(client, KEY).",
+            hint="Pass its key as the second argument.",
         )
     return next(iter(robots.values()))
 
@@ -373,7 +374,8 @@ def _restricted(model: mujoco.MjModel, joints: list[int], low: Floats, high: Flo
     return private
 
 
-def _vector(what: str, values: Vector, length: int) -> Floats:
+def vector(what: str, values: Vector, length: int) -> Floats:
+    """Return numbers as an array of this length."""
     given = finite_array(what, values)
     if given.shape != (length,):
         raise ValueError(f"{what} takes {length} numbers, got an array of shape {given.shape}")
@@ -381,14 +383,15 @@ def _vector(what: str, values: Vector, length: int) -> Floats:
 
 
 def _unit(quaternion: Vector) -> Floats:
-    given = _vector("quaternion", quaternion, 4)
+    given = vector("quaternion", quaternion, 4)
     length = float(np.linalg.norm(given))
     if length < 1e-9:
         raise ValueError("quaternion is all zeros, which is not a valid orientation")
     return given / length
 
 
-def _positive(what: str, value: float) -> float:
+def positive(what: str, value: float) -> float:
+    """Return a number as a float above 0."""
     number = finite(what, value)
     if number <= 0:
         raise ValueError(f"{what} must be above 0, not {number:g}")
