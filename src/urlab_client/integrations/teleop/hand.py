@@ -11,8 +11,7 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
 from urlab_client.aio.model.numbers import finite
 from urlab_client.errors import URLabError
-from urlab_client.integrations.ik import IkSolution, InverseKinematics
-from urlab_client.integrations.ik.solver import Vector, only_robot, own_sites, positive, vector
+from urlab_client.integrations.ik import IkSolution, InverseKinematics, Vector, only_robot, own_sites, positive, vector
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.client import URLabClient
 

@@ -1,4 +1,7 @@
-"""The search: starts at the current joint positions, then at others, and iterates quadratic programs of mink."""
+"""Inverse kinematics: joint positions, within their limits, that bring a site or body of a robot to a pose.
+
+The solver is mink. Needs the extra `teleop`.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ import copy
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
-import mink
 import mujoco
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client._installation import need
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator, Joint
@@ -23,6 +26,12 @@ from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import split_prefix, unknown_name
 from urlab_client.values.plain import Serializable
+
+need("mink", extra="teleop")
+
+import mink  # noqa: E402
+
+__all__ = ["IkSolution", "InverseKinematics", "UnreachableTarget"]
 
 Vector = Sequence[float] | Floats
 
