@@ -158,11 +158,7 @@ class WarpBatch:
             ) from error
 
     def bind(self, name: str) -> NDArray[Any]:
-        """Return an `MjData` field of all simulations, shape (nsim, …). Writes to parts of the state take effect.
-
-        Raises:
-            ValueError: The field is not copied back from the device.
-        """
+        """Return an `MjData` field of all simulations, shape (nsim, …). Writes to parts of the state take effect."""
         if name not in self._bound:
             if name not in {*_SENT, *_TAKEN}:
                 raise ValueError(
@@ -172,11 +168,7 @@ class WarpBatch:
         return self._bound[name]
 
     def expand(self, name: str) -> NDArray[Any]:
-        """Reject a model field with a value for each simulation.
-
-        Raises:
-            ValueError: Always.
-        """
+        """Reject a model field with a value for each simulation."""
         raise ValueError(f"with engine='warp' all copies share one model: {name} cannot vary among them")
 
     def reset(self, ids: Indices, keyframe: int = -1) -> None:

@@ -43,9 +43,6 @@ class EnvEpisode:
     """One client that is reset and stepped as an environment.
 
     Attributes:
-        client: The client, discovered and in `direct` or `puppet` mode.
-        mapping: Its articulations as spaces.
-        observation_space: Space of the mapping, with `cameras` added if cameras are observed.
         frames: The last frame of each requested camera.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
@@ -59,17 +56,16 @@ class EnvEpisode:
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
     ) -> None:
-        """Set up the episodes of a client.
+        """Set up the episodes of a client, and the task unless it already is.
 
         Args:
-            client: The client.
-            settings: Settings of the episodes. The task is set up here unless it already is.
+            client: The client, discovered and in `direct` or `puppet` mode.
+            settings: Settings of the episodes.
             randomise: What varies from episode to episode. If None, the server's own declaration applies.
             earlier: Episodes of the earlier client that this client replaces.
 
         Raises:
-            URLabError: The client has no model or no articulation, the client is in live mode, or the server varies
-                its scene differently.
+            URLabError: The client cannot serve an environment, or its server varies the scene differently.
             UnsupportedRandomisation: The server varies nothing itself, and no op does.
             KeyError: A camera is unknown.
             ValueError: An option is out of range, or the scene has no camera to render.
@@ -122,11 +118,7 @@ class EnvEpisode:
             self.observation_space = with_task(self.observation_space, settings.task)
 
     def states(self) -> States:
-        """Return the current state in the form passed to tasks, with n = 1.
-
-        Raises:
-            URLabError: The environment has no task, or the client has no local data.
-        """
+        """Return the current state in the form passed to tasks, with n = 1."""
         data = self.client.data
         if self._settings.task is None or data is None:
             raise URLabError("This environment has no task.")
@@ -142,10 +134,7 @@ class EnvEpisode:
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        Args:
-            rng: The environment's generator.
-            keyframe: Keyframe to start from instead of the one in the settings.
-            seed: Seed of what varies; None if nothing varies.
+        `keyframe` replaces the one in the settings. `seed` determines what varies; None if nothing varies.
         """
         client = self.client
         keyframe = self._settings.keyframe if keyframe is None else keyframe
@@ -181,12 +170,7 @@ class EnvEpisode:
     async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
         """Apply an action for `n_substeps` and return the observation after it.
 
-        Args:
-            action: The action.
-            forces: Forces applied during the action, by body, N, world frame, shape (3,).
-
-        Raises:
-            ValueError: The action has the wrong shape or is not finite. Nothing was sent.
+        `forces` act on bodies during the action, N, world frame, shape (3,).
         """
         return await self.act(self.mapping.set_points(action), forces)
 
@@ -252,11 +236,7 @@ class EnvEpisode:
             await runtime.forward()
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
-        """Return the articulation of a body, and the body's name in it.
-
-        Raises:
-            KeyError: The scene has no such body.
-        """
+        """Return the articulation of a body, and the body's name in it."""
         key, _, name = body.partition("/")
         articulation = self.client.articulations[key]
         articulation.bodies[name]
@@ -348,11 +328,7 @@ class EnvEpisode:
 
 
 def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisation | None) -> Randomisation | None:
-    """Return what varies: the given declaration, or the server's own.
-
-    Raises:
-        URLabError: The server has a different declaration of its own.
-    """
+    """Return what varies: the given declaration, or the server's own, which must not differ from it."""
     declared = declared_in(model)
     if randomise is None:
         return declared
@@ -370,11 +346,7 @@ def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:
-    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name.
-
-    Raises:
-        KeyError: The camera does not exist.
-    """
+    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name."""
     key, slash, camera = text("the name of a camera", name).partition("/")
     if slash:
         return client.articulations[key].cameras[camera]
@@ -382,11 +354,7 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
 
 
 def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
-    """Return the camera that `render` shows, by default the first colour camera; None without a render mode.
-
-    Raises:
-        ValueError: The scene has no colour camera.
-    """
+    """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
     if settings.render_mode is None:
         return None
     if settings.render_camera is not None:

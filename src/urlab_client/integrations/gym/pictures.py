@@ -81,17 +81,7 @@ class PictureScene:
 
     @classmethod
     def of(cls, client: URLabClient, model: mujoco.MjModel, cameras: Sequence[str]) -> PictureScene:
-        """Return the scene of a client.
-
-        Args:
-            client: A client after `discover()`.
-            model: The client's model.
-            cameras: The cameras, as `ARTICULATION/CAMERA` or as the name of a scene-level camera.
-
-        Raises:
-            KeyError: A camera does not exist.
-            URLabError: The compiled scene lacks a camera that the server lists.
-        """
+        """Return the scene of a client, with cameras by `ARTICULATION/CAMERA` or the name of a scene-level one."""
         owners = {
             body.id: articulation.compiled_prefix
             for articulation in client.articulations.values()
@@ -116,12 +106,7 @@ class BatchPictures:
     """
 
     def __init__(self, scene: PictureScene, observed: Sequence[str], latencies: Mapping[str, CameraLatency]) -> None:
-        """Look up the cameras.
-
-        Args:
-            scene: The scene.
-            observed: The cameras that `observe` shows.
-            latencies: Latencies of some of these.
+        """Look up the cameras that `observe` shows, some of which have a latency.
 
         Raises:
             RenderingUnavailable: There are such cameras, and this machine cannot draw.
@@ -141,28 +126,13 @@ class BatchPictures:
             self._drawing()
 
     def begin(self, i: int, seed: int, visible: Visible) -> None:
-        """Begin an episode of a copy. Delayed cameras show its start without delay.
-
-        Args:
-            i: Index of the copy.
-            seed: Seed of the jitter.
-            visible: The start.
-        """
+        """Begin an episode of copy `i`. Delayed cameras show its start without delay; `seed` is that of the jitter."""
         for name, delay in self._delays.items():
             self._latencies[name, i] = Latency(delay, seed)
             self._shown[name, i] = visible.state
 
     def observe(self, indices: Sequence[int], times: Sequence[float], copies: Sequence[Visible]) -> dict[str, Any]:
-        """Return the camera observations of some copies after an action, by camera.
-
-        Args:
-            indices: Indices of the copies.
-            times: Their simulation times, seconds.
-            copies: What pictures of them show now; delayed cameras show earlier states.
-
-        Raises:
-            TimeoutError: A picture took too long.
-        """
+        """Return the camera observations of some copies after an action, by camera, at these simulation times."""
         drawn = self.draw([name for name in self._observed if name not in self._delays], copies)
         for name in self._delays:
             shown = [
@@ -177,10 +147,6 @@ class BatchPictures:
 
     def draw(self, cameras: Sequence[str], copies: Sequence[Visible]) -> dict[str, list[Pixels]]:
         """Return the pictures of some copies by camera, in the format of `URLabCameraView.latest_frame`.
-
-        Args:
-            cameras: Names in `PictureScene.cameras`.
-            copies: State and appearance of each copy.
 
         Raises:
             RenderingUnavailable: This machine cannot draw.
@@ -305,12 +271,7 @@ class _Painter:
 
 
 def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamera:
-    """Return a camera as the server draws it.
-
-    Raises:
-        KeyError: The camera does not exist.
-        URLabError: The compiled scene lacks the camera.
-    """
+    """Return a camera as the server draws it."""
     view = client_camera(client, name)
     key, slash, _ = name.partition("/")
     prefix = f"{client.articulations[key].compiled_prefix}_" if slash else ""

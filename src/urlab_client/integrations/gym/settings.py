@@ -21,20 +21,7 @@ TerminationFn = Callable[[Observation, dict[str, Any]], Any]
 class EpisodeSettings:
     """Settings of episodes: the arguments of an environment, else the values of its task, else the defaults.
 
-    Attributes:
-        task: The task, or None.
-        reward_fn: The reward function. If None, rewards are 0.
-        termination_fn: The termination function. If None, episodes never terminate.
-        fields: Observed fields.
-        n_substeps: Physics steps per action.
-        max_episode_steps: Actions per episode, or None for no limit.
-        keyframe: Keyframe in which episodes start, or None for the initial state.
-        reset_noise: Largest deviation of joints from the start.
-        space_mode: `flat` or `dict`.
-        cameras: Cameras whose pictures are observed.
-        articulations: Articulations that are observed, or None for all.
-        render_mode: `rgb_array` to draw pictures for `render`, or None.
-        render_camera: Camera that `render` shows; None for the first colour camera.
+    `URLabEnv` and `Task` describe them.
     """
 
     task: Task | None
@@ -68,13 +55,7 @@ class EpisodeSettings:
         render_mode: str | None = None,
         render_camera: str | None = None,
     ) -> EpisodeSettings:
-        """Return the effective settings. None selects the value of the task, or the default without a task.
-
-        Raises:
-            TypeError: An argument has a wrong type.
-            ValueError: A number is below 1, the noise is negative, the render mode or the observation level is unknown,
-                or a function is given beside a task, which replaces it.
-        """
+        """Return the effective settings. None selects the value of the task, or the default without a task."""
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if task is not None:
@@ -129,11 +110,7 @@ def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:
-    """Return the keyframe named in the options of a reset.
-
-    Raises:
-        ValueError: An option is unknown.
-    """
+    """Return the keyframe named in the options of a reset."""
     unknown = set(options or {}) - {"keyframe"}
     if unknown:
         raise ValueError(f"unknown reset options {', '.join(map(str, unknown))}; the only option is 'keyframe'")

@@ -40,11 +40,7 @@ class _Articulation:
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
-    """Return the fields of an observation level, or the given field names.
-
-    Raises:
-        ValueError: The level is unknown.
-    """
+    """Return the fields of an observation level, or the given field names."""
     if not isinstance(observations, str):
         return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
     if observations not in LEVELS:
@@ -237,11 +233,7 @@ def dict_space(entries: Mapping[str, Space]) -> Space:
 
 
 def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
-    """Return a mapping's observation space with an entry `cameras` that holds the pictures by camera.
-
-    Raises:
-        ValueError: The space is flat, or an articulation is named `cameras`.
-    """
+    """Return a mapping's observation space with an entry `cameras` that holds the pictures by camera."""
     if not cameras:
         return mapping.observation_space
     if mapping.mode != "dict":
@@ -253,12 +245,7 @@ def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
 
 
 def camera_space(mode: CameraMode | str, resolution: tuple[int, int]) -> Space:
-    """Return the space of `observed_pixels`: depth in metres, RGB as in `render`, or BGRA of segmentations.
-
-    Args:
-        mode: Meaning of the pixels.
-        resolution: Width and height, pixels.
-    """
+    """Return the space of `observed_pixels`: depth in metres, RGB as in `render`, or BGRA of segmentations."""
     width, height = resolution
     if mode == CameraMode.DEPTH:
         return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)

@@ -44,14 +44,7 @@ class ResetNoise:
         return self.hinge > 0 or self.slide > 0
 
     def add(self, rng: np.random.Generator, model: mujoco.MjModel, joints: NDArray[np.intp], qpos: Floats) -> None:
-        """Add random noise to the positions of hinge and slide joints in place.
-
-        Args:
-            rng: Generator.
-            model: The compiled scene.
-            joints: Ids of the joints.
-            qpos: Positions of the whole scene, shape (nq,).
-        """
+        """Add random noise in place to the positions of hinge and slide joints, given their ids; shape (nq,)."""
         address = model.jnt_qposadr[joints]
         positions: Floats = qpos[address]
         scale = np.where(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE, self.slide, self.hinge)
@@ -237,11 +230,7 @@ class States:
 
 
 def joined(parts: Sequence[States | None]) -> States:
-    """Return the states of several environments as one. A missing state (None) repeats the first known one.
-
-    Raises:
-        ValueError: All states are missing.
-    """
+    """Return the states of several environments as one. A missing state (None) repeats the first known one."""
     known = next((part for part in parts if part is not None), None)
     if known is None:
         raise ValueError("no environment has a state")
@@ -266,11 +255,7 @@ def with_task(space: Space, task: Task | None) -> Space:
 
 
 def add_observed(observation: Observation, task: Task, observed: Floats) -> Observation:
-    """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes.
-
-    Raises:
-        ValueError: `observed` has the wrong shape.
-    """
+    """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes."""
     if observed.shape[-1:] != (task.n_observed,):
         raise ValueError(
             f"{type(task).__name__}.observe() returned {observed.shape[-1]} numbers; n_observed is {task.n_observed}"

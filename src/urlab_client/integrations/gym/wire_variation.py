@@ -47,13 +47,8 @@ class WireVariation(VariedByOps):
     ) -> None:
         """Look up what varies.
 
-        Args:
-            client: The client, after the handshake.
-            model: The client's model.
-            layouts: Layouts of the articulations in the model, by key.
-            declared: What varies.
-            earlier: The variation of an earlier session with the server, which may have left gravity and gains varied.
-                If None, the current gravity and gains count as unvaried.
+        `earlier` is the variation of an earlier session with the server, which may have left gravity and gains varied;
+        if None, the current gravity and gains count as unvaried.
 
         Raises:
             UnsupportedRandomisation: No op changes one of the quantities.
