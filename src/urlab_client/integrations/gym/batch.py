@@ -231,9 +231,10 @@ class URLabBatchEnv(Vectorized):
                 self._varied.start(i, qpos[i])
             self._batch.forward(indices)
         if noise:
+            noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
             for i in map(int, indices):
-                for articulation in self.mapping.keys:
-                    noise.add(self._rngs[i], self.model, self.mapping.scalar_joints(articulation, self.model), qpos[i])
+                for joints in noisy:
+                    noise.add(self._rngs[i], self.model, joints, qpos[i])
             self._batch.forward(indices)
         if self.task is not None:
             for i in map(int, indices):
@@ -242,8 +243,9 @@ class URLabBatchEnv(Vectorized):
                 qpos[i], self._goals[i] = start.qpos, start.goal
             self._batch.forward(indices)
         self._step_count[indices] = 0
-        for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):
-            self._pictures.begin(i, int(seeds[i]), visible)
+        if self._pictures.delays:
+            for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):
+                self._pictures.begin(i, int(seeds[i]), visible)
 
     def _act(self, indices: Indices, set_points: Mapping[str, Floats]) -> None:
         ctrl = self._arrays["ctrl"]

@@ -113,7 +113,7 @@ class BatchPictures:
         """
         self._scene = scene
         self._observed = observed
-        self._delays = {
+        self.delays: dict[str, CameraDelayInForce] = {
             name: CameraDelayInForce(
                 delay_s=late.delay_s, jitter_s=late.jitter_s, clock="sim", on_state_change=True, max_fps=0.0
             )
@@ -127,14 +127,14 @@ class BatchPictures:
 
     def begin(self, i: int, seed: int, visible: Visible) -> None:
         """Begin an episode of copy `i`. Delayed cameras show its start without delay; `seed` is that of the jitter."""
-        for name, delay in self._delays.items():
+        for name, delay in self.delays.items():
             self._latencies[name, i] = Latency(delay, seed)
             self._shown[name, i] = visible.state
 
     def observe(self, indices: Sequence[int], times: Sequence[float], copies: Sequence[Visible]) -> dict[str, Any]:
         """Return the camera observations of some copies after an action, by camera, at these simulation times."""
-        drawn = self.draw([name for name in self._observed if name not in self._delays], copies)
-        for name in self._delays:
+        drawn = self.draw([name for name in self._observed if name not in self.delays], copies)
+        for name in self.delays:
             shown = [
                 Visible(self._revealed(name, i, time, visible), visible.look)
                 for i, time, visible in zip(indices, times, copies, strict=True)
