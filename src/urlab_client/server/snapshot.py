@@ -33,10 +33,8 @@ def take_snapshot(
     """Draw the viewport.
 
     Args:
-        server: The server.
         dispatcher: Dispatcher of its requests, which is paused while the state is read.
         size: Width and height, pixels.
-        frame_all: Frame everything, keeping the direction of the viewport camera.
 
     Returns:
         Red, green, blue and alpha from the top, shape (height, width, 4).

@@ -12,7 +12,7 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -33,6 +33,9 @@ FRAME_OVERHEAD: Final = 500
 CSV_PERIOD_S: Final = 0.002
 
 _READ_BYTES: Final = 1 << 30
+_SMALL_BYTES: Final = 64 << 20
+_BYTES_PER_BYTE: Final = 16  # a frame of one joint takes 8 times as much memory as its text
+_VALUE_CHARS: Final = 2 << 20  # as text; decoded, a value takes up to 70 times as much memory
 _LAYOUT_OVERHEAD: Final = 600  # about the bytes of a joint in a layout
 _NAME_CHARS: Final = 4096
 _SPACE: Final = re.compile(r"[ \t\n\r]*")
@@ -93,8 +96,6 @@ class LiveRecording:
         """Prepare for a scene.
 
         Args:
-            model: The scene.
-            data: Its state.
             most_bytes: Memory for frames; beyond it the oldest go, as if the window were shorter.
         """
         self._most_bytes = most_bytes
@@ -183,18 +184,20 @@ def decode_json(content: bytes) -> list[Frame]:
     """Read a recording file: keys in any case, missing ones at their defaults, unknown ones ignored.
 
     Raises:
-        ValueError: It is not JSON, has no list of frames, or more of them than fit into 1 GiB.
+        ValueError: It is not JSON, has no list of frames, has a value of 2 MiB or more, or its frames take more memory
+            than it may take: 16 times its size, at least 64 MiB and at most 1 GiB.
     """
     made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
+    most = min(_READ_BYTES, max(_SMALL_BYTES, _BYTES_PER_BYTE * len(content)))
     try:
-        return _kept(_from_file(_read(frame), made) for frame in _frames(_text(content)))
+        return _kept((_from_file(_read(frame), made) for frame in _frames(_text(content))), most)
     except (RecursionError, OverflowError) as error:
         raise ValueError(f"it is not a recording: {error}") from None
 
 
 def _frames(text: str) -> Iterator[object]:
     """Yield the frames of a file one at a time, because decoded they take much more memory than as text."""
-    decode = json.JSONDecoder().raw_decode
+    decode = _value_decoder(text)
 
     def space(at: int) -> int:
         return cast("re.Match[str]", _SPACE.match(text, at)).end()
@@ -208,24 +211,48 @@ def _frames(text: str) -> Iterator[object]:
 
     found, at = False, after(0, "{")
     while text[at - 1] != "}":
-        key, at = decode(text, space(at))
+        key, at = decode(space(at))
         at = space(after(at, ":"))
         if isinstance(key, str) and key.casefold() == "frames" and text[at : at + 1] == "[":
             found, at = True, space(at + 1)
             while text[at : at + 1] != "]":
-                frame, at = decode(text, at)
+                frame, at = decode(at)
                 yield frame
                 at = after(at, ",]")
                 at = at - 1 if text[at - 1] == "]" else space(at)
             at += 1
         else:
-            at = decode(text, at)[1]
+            at = decode(at)[1]
         at = after(at, ",}")
     if not found:
         raise ValueError("the list 'Frames' is missing")
 
 
-def _kept(frames: Iterable[Frame]) -> list[Frame]:
+def _value_decoder(text: str) -> Callable[[int], tuple[object, int]]:
+    """Return a function that decodes the value at a character and returns it and its end.
+
+    It looks at a part of the text at a time, so that no value can take more memory than such a part.
+    """
+    scan, part, start = json.JSONDecoder().raw_decode, "", 0
+
+    def decode(at: int) -> tuple[object, int]:
+        nonlocal part, start
+        if start + len(part) < min(at + _VALUE_CHARS, len(text)):
+            part, start = text[at : at + 2 * _VALUE_CHARS], at
+        try:
+            value, end = scan(part, at - start)
+        except json.JSONDecodeError as error:
+            if start + len(part) == len(text):
+                raise json.JSONDecodeError(error.msg, text, start + error.pos) from None
+            value, end = None, len(part)  # damaged, or cut off
+        if start + end - at >= _VALUE_CHARS:
+            raise ValueError(f"the value at character {at} is damaged, or has {_VALUE_CHARS} characters or more")
+        return value, start + end
+
+    return decode
+
+
+def _kept(frames: Iterable[Frame], most: int) -> list[Frame]:
     kept: list[Frame] = []
     layouts: set[int] = set()
     size = 0
@@ -234,8 +261,8 @@ def _kept(frames: Iterable[Frame]) -> list[Frame]:
         if id(frame.layout) not in layouts:
             layouts.add(id(frame.layout))
             size += _LAYOUT_OVERHEAD * len(frame.layout.joints)
-        if size > _READ_BYTES:
-            raise ValueError(f"its frames take more than {_READ_BYTES} bytes of memory")
+        if size > most:
+            raise ValueError(f"its frames take more than {most} bytes of memory")
         kept.append(frame)
     return kept
 
@@ -294,7 +321,7 @@ def decode_csv(content: bytes) -> list[Frame]:
         ValueError: It has no header, or a cell is not a number.
     """
     try:
-        return _kept(_from_table(row for row in csv.reader(io.StringIO(_text(content))) if row))
+        return _kept(_from_table(row for row in csv.reader(io.StringIO(_text(content))) if row), _READ_BYTES)
     except csv.Error as error:
         raise ValueError(f"it is not a table: {error}") from None
 

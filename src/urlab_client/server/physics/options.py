@@ -74,13 +74,7 @@ class OptionOverrides:
     """
 
     def __init__(self, model: mujoco.MjModel, limits: Limits, dialect: Dialect = ALPHA) -> None:
-        """Start with the integrator the scene was compiled with.
-
-        Args:
-            model: The model of the play session.
-            limits: For the iterations.
-            dialect: Decides the precision of numbers and the spelling of keywords.
-        """
+        """Start with the integrator the scene was compiled with."""
         self._limits = limits
         self._dialect = dialect
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}

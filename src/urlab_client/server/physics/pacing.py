@@ -54,9 +54,6 @@ class LivePacing:
     def take_slot(self, *, idle: bool) -> float:
         """Take the next slot if it is due.
 
-        Args:
-            idle: Whether an iteration would change nothing and no hook observes it.
-
         Returns:
             0 if the slot was taken, otherwise the seconds to wait before the next call.
         """
