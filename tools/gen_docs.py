@@ -336,8 +336,9 @@ def exports(module: str) -> dict[str, str]:
 
 def around() -> list[str]:
     """Return the public modules beside clients and server."""
-    packages = sorted(path.parent.name for path in (SRC / "urlab_client" / "integrations").glob("[!_]*/__init__.py"))
-    integrations = [f"urlab_client.integrations.{name}" for name in packages]
+    folder = SRC / "urlab_client" / "integrations"
+    public = [path for path in folder.iterdir() if not path.name.startswith("_")]
+    integrations = [f"urlab_client.integrations.{name}" for name in sorted(path.stem for path in public)]
     for package, module in (("gym", "envhub"), ("record", "export")):
         at = integrations.index(f"urlab_client.integrations.{package}") + 1
         integrations.insert(at, f"urlab_client.integrations.{package}.{module}")
