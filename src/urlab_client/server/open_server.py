@@ -36,7 +36,7 @@ from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.snapshot import take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
-from urlab_client.server.streams.control_messages import CameraEndpoint
+from urlab_client.server.streams.commands import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
 from urlab_client.server.streams.registration import Registration
 from urlab_client.server.system.health import Health
