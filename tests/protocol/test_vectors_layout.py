@@ -204,7 +204,8 @@ def test_info() -> None:
     ranges = {3: ' ctrlrange="-1.5 1.5"'}
     motors = "".join(f'<motor joint="j"{ranges.get(number, "")}/>' for number in range(12))
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>{motors}</actuator></mujoco>'
+        '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
     )
     index = SimpleNamespace(
         key="g1", prefix="g1_", actuators=np.array([3, 11], np.int32), actuator_names=("left_knee", "waist")
