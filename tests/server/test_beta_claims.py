@@ -12,7 +12,7 @@ from beta_bench import ME, OTHER, Bench, Clock
 from waiting import eventually
 from wire import Wire, set_points
 
-from urlab_client.server.session import DriverLease
+from urlab_client.server.core import DriverLease
 
 # Claims.
 

@@ -24,7 +24,7 @@ from raw_shm import HEADER, RawRegion, RawShm
 from waiting import eventually
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile
 from urlab_client.server.transport.shared_memory import MAX_LISTENERS, SharedMemoryServer
 

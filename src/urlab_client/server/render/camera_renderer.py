@@ -34,7 +34,7 @@ from urlab_client.server.render.latency import Instant, Latency, Past
 from urlab_client.server.render.opengl import RenderingUnavailable, need_backend, search_backend
 from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import ViewportPicture
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -22,7 +22,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
 from urlab_client.server.streams.commands import CameraEndpoint, StreamedCommand, read_commands
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
