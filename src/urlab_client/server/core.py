@@ -40,10 +40,10 @@ from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.refusal import CompileFailed, Refusal
-from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.threads import Health
+from urlab_client.simulation.appearance import Appearance
 
 
 class ServerSession:

@@ -33,7 +33,6 @@ from urlab_client.server.faults import FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.handlers.viewport import look
 from urlab_client.server.refusal import CompileFailed, Refusal
-from urlab_client.server.render.opengl import RenderingUnavailable, need_backend
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.rpc.dispatch import Dispatcher, Watchdog
 from urlab_client.server.streams.camera_streams import CameraStreams
@@ -45,6 +44,7 @@ from urlab_client.server.system.threads import Health
 from urlab_client.server.transport.curve_authentication import CurveKeys, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
+from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 
 LARGEST_PIXELS: Final = 16384
 """Longest side in pixels, the maximum of common drivers."""

@@ -22,8 +22,8 @@ from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
-from urlab_client.server.controller_text import ControllerText
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, normalized
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -275,7 +275,7 @@ def _check_settings(entry: _Actor) -> None:
     if entry.controller:
         if entry.kind is not ActorKind.ARTICULATION:
             raise ValueError("only an articulation can have a 'controller'")
-        ControllerText.parse(entry.controller)
+        ControllerConfig.parse(entry.controller)
     if entry.kind is ActorKind.ARTICULATION and entry.scale != UNIT_SCALE:
         raise ValueError("an articulation cannot be scaled")
     if 0.0 in entry.scale:

@@ -10,13 +10,13 @@ from urlab_client._platform.files import write_whole
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages import recording
 from urlab_client.server.core import ServerCore
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.physics.play import Running
-from urlab_client.server.physics.recording import LIVE_SESSION, duration, encode_json
 from urlab_client.server.physics.replay import Player, ReplaySessions, replay_folder
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.simulation.controllers import float32
+from urlab_client.simulation.joint_recording import LIVE_SESSION, duration, encode_json
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""

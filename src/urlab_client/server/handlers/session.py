@@ -17,11 +17,12 @@ from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RPC_STRIDE
 from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_owner
-from urlab_client.server.physics.controllers import ArticulationControl, float32
+from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import FRAMES_DEADLINE_S, Film
 from urlab_client.server.rpc.dispatch import handles
+from urlab_client.simulation.controllers import float32
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -14,10 +14,10 @@ from urlab_client.server.compile.bounds import actor_bounds
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need, usable
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, rotate, swap_frame, xyzw
 
 

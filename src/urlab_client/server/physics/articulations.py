@@ -15,8 +15,9 @@ from urlab_client.protocol.messages.session import ArticulationCommand
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.dialects import Dialect
-from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource, Twist
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 
 
 class Articulations:

@@ -23,7 +23,7 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
-from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig
+from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.physics.scheduling import (
@@ -41,6 +41,7 @@ from urlab_client.server.physics.scheduling import (
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.threads import Health
+from urlab_client.simulation.controller_config import ControllerConfig
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -17,8 +17,8 @@ from msgspec import Struct, defstruct
 from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.limits import Limits, option_problem
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.types import SimOptions
 
 CHOICES: Final[Mapping[str, Mapping[str, Any]]] = {

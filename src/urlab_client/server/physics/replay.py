@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
-from urlab_client.server.physics.recording import (
+from urlab_client.simulation.joint_recording import (
     LIVE_SESSION,
     Frame,
     JointLayout,
@@ -186,7 +186,7 @@ class ReplaySessions:
         Args:
             files: The recordings that were there when play started; `scan` loads them.
         """
-        self.live: LiveRecording = LiveRecording(scene, limits.recording_bytes)
+        self.live: LiveRecording = LiveRecording(scene.model, scene.data, limits.recording_bytes)
         self._most = limits.recording_file_bytes
         self.active: str = LIVE_SESSION
         self._loaded: dict[str, list[Frame]] = {}

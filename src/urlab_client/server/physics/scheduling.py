@@ -18,9 +18,9 @@ import mujoco
 
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import Step
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.threads import Health, ended, within
+from urlab_client.simulation.controllers import float32
 
 MIN_TIMEOUT_S: Final = 1.0
 """Shortest duration of an overdue MuJoCo call; a slice of a long request may take a while on a busy machine."""
