@@ -26,10 +26,6 @@ Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3] | None:
     """Return the lower and upper corner of the box around an actor at its authored pose, world frame, metres.
 
-    Args:
-        actor: The actor.
-        every_geom: Count geoms that collide with nothing, too.
-
     Returns:
         The corners; None for an actor without geoms. Planes are endless and do not count.
 
@@ -91,8 +87,6 @@ def box_around(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.boo
     """Return the box around the chosen geoms, of which there must be one at least; none may be a plane.
 
     Args:
-        model: The model.
-        data: Its data with positions computed.
         geoms: Mask, shape (ngeom,).
     """
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)

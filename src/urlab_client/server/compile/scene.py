@@ -48,7 +48,6 @@ def attached_scene(spec: mujoco.MjSpec, actors: Sequence[Actor]) -> tuple[str, d
     kind share the files of the first, because files are large, unlike documents.
 
     Args:
-        spec: The compiled scene, for its options.
         actors: What it was compiled from, in spawn order.
 
     Returns:
@@ -200,7 +199,6 @@ def compile_scene(
         actors: In spawn order.
         options: Which `<option>` the scene has, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
-        texts: Custom texts of the model, by name.
         limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 
     Returns:

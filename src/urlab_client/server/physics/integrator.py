@@ -84,11 +84,7 @@ class Integrator:
         """Prepare to step a scene's data in place.
 
         Args:
-            scene: The scene.
-            articulations: Their set-points and controllers make the controls.
-            variation: What varies from reset to reset.
             call: Entered while MuJoCo works.
-            stopping: Whether a request under way is to be broken off.
         """
         self._model = scene.model
         self._data = scene.data
@@ -103,11 +99,7 @@ class Integrator:
         """Integrate a direct step.
 
         Args:
-            n_steps: Sub-steps.
             raw: Articulations whose controller has no say.
-
-        Raises:
-            Refusal: `shutting_down`, between two slices.
         """
         mj_step, model, data = mujoco.mj_step, self._model, self._data
         apply_controls = self._articulations.apply_controls

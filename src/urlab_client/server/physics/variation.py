@@ -31,8 +31,6 @@ class SceneVariation:
 
         Args:
             scene: The scene as compiled.
-            declaration: What to vary.
-            articulations: Their controllers' gains vary, too.
 
         Raises:
             ValueError: A name fits no element.
