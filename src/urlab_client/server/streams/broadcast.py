@@ -25,9 +25,8 @@ from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.streams.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
+from urlab_client.server.streams.commands import Actuators, CameraEndpoint, Gains, StreamedCommand, StreamedSetPoints
 from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
-from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -172,7 +171,7 @@ class Broadcast:
         self._info_due = next_info(tick.live)
         endpoints = tuple(cameras(self.running.scene))
         for control in self._controls:
-            yield self._actuators.info(control, endpoints).encode()
+            yield self._actuators.info(control, endpoints)
 
     def command_topics(self) -> Iterator[bytes]:
         """Yield the topics to which the articulations subscribe."""
@@ -199,7 +198,7 @@ class Broadcast:
                 command = commands.popleft()
                 if engine.mode not in _LIVE:
                     continue
-                if isinstance(command, ControlPayload):
+                if isinstance(command, StreamedSetPoints):
                     self._actuators.stage(command, self._owned)
                 else:
                     self._set_gains(*command)
@@ -210,10 +209,10 @@ class Broadcast:
     def _owned(self, control: ArticulationControl) -> bool:
         return self._dialect.claims and self.running.claims.owner(control.index.key) != UNCLAIMED
 
-    def _set_gains(self, key: str, gains: dict[str, JointGains]) -> None:
+    def _set_gains(self, key: str, gains: Gains) -> None:
         try:
             with self._engine.commanding() as articulations:
-                articulations.configure_controller(key, gains_by_parameter(gains))
+                articulations.configure_controller(key, gains)
         except Refusal as refusal:
             logger.debug("gains streamed to '%s' have no effect: %s", key, refusal.message)
 

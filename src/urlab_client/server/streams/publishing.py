@@ -21,9 +21,8 @@ from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
-from urlab_client.server.streams.control_messages import CameraEndpoint
-from urlab_client.server.streams.streamed_commands import StreamedCommand, read_commands
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.streams.commands import CameraEndpoint, StreamedCommand, read_commands
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
