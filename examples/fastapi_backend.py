@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from urlab_client import URLabConnectionError, URLabError
 from urlab_client.aio import URLabClient
-from urlab_client.protocol.descriptions import ArticulationDescription, SceneDescription
+from urlab_client.values.descriptions import ArticulationDescription, SceneDescription
 
 address = os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused")
 watched = os.environ.get("URLAB_WATCH")  # file with the response of /handshake from the controlling worker

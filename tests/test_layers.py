@@ -14,121 +14,80 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 
 # Layer -> the layers it may import besides itself. The empty name is the public package, `urlab_client` itself.
+VALUES = frozenset({"enums", "errors", "values"})
 ALLOWED: dict[str, frozenset[str]] = {
-    "protocol": frozenset({"_extras"}),
-    "keys": frozenset({"protocol"}),
-    "aio": frozenset(
-        {
-            "_background",
-            "_children",
-            "_confined",
-            "_landlock",
-            "_mjcf_files",
-            "_mujoco",
-            "_processors",
-            "_uninterrupted",
-            "_windows",
-            "keys",
-            "protocol",
-        }
-    ),
-    "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset(
-        {
-            "_background",
-            "_children",
-            "_confined",
-            "_installation",
-            "_landlock",
-            "_mjcf_files",
-            "_mujoco",
-            "_processors",
-            "_uninterrupted",
-            "_whole_files",
-            "_windows",
-            "keys",
-            "protocol",
-            "randomise",
-        }
-    ),
-    "randomise": frozenset({"protocol"}),
-    "enums": frozenset({"protocol"}),
-    "_background": frozenset(),
-    "_children": frozenset(),
-    "_confined": frozenset(),
-    "_landlock": frozenset(),
-    "_mjcf_files": frozenset(),
+    "enums": frozenset(),
+    "errors": frozenset({"enums", "values"}),
+    "values": frozenset({"_installation", "enums", "errors"}),
+    "protocol": VALUES,
+    "events": VALUES | {"protocol"},
+    "types": VALUES | {"aio", "protocol"},
+    "keys": frozenset({"errors"}),
+    "_platform": frozenset(),
+    "_sandbox": frozenset({"_platform"}),
     "_mujoco": frozenset(),
-    "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),
-    "_processors": frozenset(),
-    "_uninterrupted": frozenset(),
-    "_whole_files": frozenset(),
-    "_windows": frozenset(),
-    "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset(
-        {
-            "",
-            "_children",
-            "_extras",
-            "_installation",
-            "_mujoco",
-            "_whole_files",
-            "aio",
-            "enums",
-            "keys",
-            "protocol",
-            "randomise",
-            "server",
-            "sync",
-        }
-    ),
-    "cluster": frozenset({"_installation", "_whole_files", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
-    "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
-    "cli": frozenset(
-        {
-            "",
-            "_background",
-            "_extras",
-            "_installation",
-            "_mujoco",
-            "_whole_files",
-            "_windows",
-            "aio",
-            "enums",
-            "integrations",
-            "keys",
-            "mcp",
-            "protocol",
-            "randomise",
-            "server",
-            "sync",
-            "web",
-        }
-    ),
+    "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
+    "sync": VALUES | {"aio", "events", "protocol", "types"},
+    "randomise": VALUES | {"protocol"},
+    "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
+    "server": VALUES
+    | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise", "simulation"},
+    "": VALUES | {"_installation", "aio", "events", "protocol", "sync", "types"},
+    "integrations": VALUES
+    | {
+        "",
+        "_installation",
+        "_mujoco",
+        "_platform",
+        "aio",
+        "keys",
+        "protocol",
+        "randomise",
+        "server",
+        "simulation",
+        "sync",
+    },
+    "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync", "types"},
+    "console": VALUES | {"_installation", "aio", "events", "integrations", "protocol", "types"},
+    "web": VALUES | {"_installation", "aio", "console", "events", "integrations", "protocol", "types"},
+    "mcp": VALUES | {"_installation", "aio", "console", "protocol", "types", "web"},
+    "cli": VALUES
+    | {
+        "",
+        "_installation",
+        "_mujoco",
+        "_platform",
+        "aio",
+        "console",
+        "events",
+        "integrations",
+        "keys",
+        "mcp",
+        "protocol",
+        "randomise",
+        "server",
+        "simulation",
+        "sync",
+        "types",
+        "web",
+    },
     "__main__": frozenset({"cli"}),
 }
 
 # Inside the two large layers, too: a room (a package, or a module beside the packages) imports those before it only.
 ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
-        "event_loop",
         "background",
-        "deadline",
+        "observer",
+        "features",
+        "client_types",
+        "defaults",
         "arguments",
-        "session_level",
-        "mutex",
-        "stream_buffer",
         "transport",
-        "call_records",
         "launch",
-        "control",
-        "jobs",
-        "turn",
         "session",
         "streams",
-        "live",
         "model",
         "controllers",
         "cameras",
@@ -137,12 +96,12 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "state",
         "explain",
         "namespaces",
-        "address",
         "client_state",
         "client",
         "",
     ),
     "server": (
+        "dialects",
         "system",
         "limits",
         "refusal",
@@ -167,7 +126,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
 }
 
-# `protocol` is pure: it turns values into bytes and back, and leaves waiting, threads and sockets to others.
+# These are pure: they turn values into bytes and back, and leave waiting, threads and sockets to others.
+PURE = frozenset({"enums", "errors", "protocol", "values"})
 NO_IO = frozenset(
     {"anyio", "asyncio", "concurrent", "multiprocessing", "selectors", "socket", "subprocess", "threading", "zmq"}
 )
@@ -256,8 +216,8 @@ def violations(package: Path) -> list[str]:
             if imported.startswith("."):
                 found.append(f"{where}:{line}: relative import of {imported}")
             elif target is None:
-                if layer == "protocol" and imported.partition(".")[0] in NO_IO:
-                    found.append(f"{where}:{line}: protocol imports {imported}, but does no I/O")
+                if layer in PURE and imported.partition(".")[0] in NO_IO:
+                    found.append(f"{where}:{line}: {layer} imports {imported}, but does no I/O")
             elif target != layer and target not in ALLOWED[layer]:
                 found.append(f"{where}:{line}: {layer or package.name} imports {imported}")
     return found
@@ -267,12 +227,23 @@ def test_imports_point_one_way() -> None:
     assert violations(PACKAGE) == []
 
 
+def test_integrations_use_the_public_server() -> None:
+    public = {"SimulatedServer", "ServedRequest"}
+    inside = [
+        f"{file.relative_to(PACKAGE).as_posix()}:{line}: {imported}"
+        for file in sorted((PACKAGE / "integrations").rglob("*.py"))
+        for line, imported in facts(file).imports
+        if imported.startswith("urlab_client.server.") and imported.rpartition("urlab_client.server.")[2] not in public
+    ]
+    assert inside == []
+
+
 def test_imports_inside_the_large_layers_point_one_way() -> None:
     assert room_violations(PACKAGE) == []
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "console", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 
@@ -332,9 +303,9 @@ def test_every_room_with_a_place_exists() -> None:
             "server/physics/a.py:1: server/physics imports urlab_client.server.handlers.scene.x, which stands above it",
         ),
         (
-            "aio/session.py",
+            "aio/session/session.py",
             "def f():\n    from urlab_client.aio import client\n",
-            "aio/session.py:2: aio/session imports urlab_client.aio.client, which stands above it",
+            "aio/session/session.py:2: aio/session imports urlab_client.aio.client, which stands above it",
         ),
         ("server/attic/a.py", "", "server/attic/a.py: attic is not a room of server"),
     ],

@@ -134,7 +134,7 @@ def error_rows(codes: dict[str, type[Any]], ops: Iterable[Op], envelope: Iterabl
 
 def own_errors(base: type[Any]) -> Iterator[list[str]]:
     """Yield the errors of the protocol that stand for no wire code, depth first."""
-    from urlab_client.protocol.errors import RPC_ERRORS, URLabError, URLabRPCError
+    from urlab_client.errors import RPC_ERRORS, URLabError, URLabRPCError
 
     for cls in base.__subclasses__():
         if cls.__module__ not in (URLabError.__module__, URLabRPCError.__module__):
@@ -152,7 +152,7 @@ def own_errors(base: type[Any]) -> Iterator[list[str]]:
 
 def render() -> str:
     import urlab_client.server.handlers  # noqa: F401  # registers the handlers
-    from urlab_client.protocol import errors
+    from urlab_client import errors
     from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS
     from urlab_client.server.rpc.dispatch import HANDLERS
 

@@ -141,7 +141,7 @@ def description(annotation: Any) -> str:
 
 
 def docstring(op: Any, docs: list[tuple[str, str]]) -> str:
-    from urlab_client.protocol import errors
+    from urlab_client import errors
 
     text = inspect.cleandoc(op.request.__doc__)
     arguments = "\n".join(wrapped(f"{name}: {text}") for name, text in docs)
@@ -190,15 +190,15 @@ def render() -> dict[Path, str]:
     body = "\n".join(groups_text(groups))
     mentioned = set(re.findall(r"\b[A-Z]\w+\b", body))
     types = {
-        module: sorted(mentioned.intersection(Source(SRC / "urlab_client" / "protocol" / f"{module}.py").classes))
+        module: sorted(mentioned.intersection(Source(SRC / "urlab_client" / "values" / f"{module}.py").classes))
         for module in TYPES
     }
     imports = [
         "from __future__ import annotations\n",
-        "from urlab_client.aio.deadline import DEFAULT, Timeout",
+        "from urlab_client.aio.defaults import DEFAULT, Timeout",
         "from urlab_client.aio.namespaces._base import Namespace, Vector, as_quat, as_vec3, fill, target_by",
         *(f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(used.items())),
-        *(f"from urlab_client.protocol.{module} import {', '.join(names)}" for module, names in types.items()),
+        *(f"from urlab_client.values.{module} import {', '.join(names)}" for module, names in types.items()),
     ]
     return generated.tidied({OUTPUT: "\n".join([HEADER, *imports, "", body])}, SRC, "urlab_client")
 

@@ -1,17 +1,14 @@
-"""Public enumerations; see `urlab_client.protocol.enums` for their definition."""
+"""Enumerations of the wire, for every layer. Each member is a `str` equal to the value on the wire.
 
-from urlab_client.protocol.enums import (
-    ActuatorType,
-    CameraMode,
-    CameraTiming,
-    ControllerKind,
-    ControlMode,
-    ObservationLevel,
-    OutOfRange,
-    PIEState,
-    StepMode,
-    Transport,
-)
+A server may send a value that no enum contains. Where a type is `SomeEnum | str`, such a value stays a plain `str`; see
+`known`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Final, TypeVar
 
 __all__ = [
     "ActuatorType",
@@ -25,3 +22,119 @@ __all__ = [
     "StepMode",
     "Transport",
 ]
+
+E = TypeVar("E", bound=StrEnum)
+
+
+class StepMode(StrEnum):
+    """What advances physics."""
+
+    AUTO = "auto"
+    DIRECT = "direct"
+    PUPPET = "puppet"
+    LIVE = "live"
+
+    @classmethod
+    def _missing_(cls, value: object) -> StepMode | None:
+        return next((mode for mode, later in LATER_MODE_NAMES.items() if later == value), None)
+
+
+LATER_MODE_NAMES: Final[Mapping[StepMode, str]] = {
+    StepMode.LIVE: "freerun",
+    StepMode.DIRECT: "stepped",
+    StepMode.PUPPET: "statepushed",
+}
+"""Names of the modes on servers after the beta."""
+
+
+class ControlMode(StrEnum):
+    """What turns set-points into actuator signals."""
+
+    UE_CONTROLLER = "ue_controller"
+    RAW = "raw"
+
+
+class ActuatorType(StrEnum):
+    """MJCF actuator element. The plugin reports `<general>` as `MOTOR`; the client classifies it by gain and bias."""
+
+    MOTOR = "motor"
+    POSITION = "position"
+    VELOCITY = "velocity"
+    INT_VELOCITY = "intvelocity"
+    DAMPER = "damper"
+    CYLINDER = "cylinder"
+    MUSCLE = "muscle"
+    ADHESION = "adhesion"
+    DC_MOTOR = "dcmotor"
+
+
+class ControllerKind(StrEnum):
+    """Kind of the controller attached to an articulation."""
+
+    PD = "pd"
+    PASSTHROUGH = "passthrough"
+
+    @classmethod
+    def _missing_(cls, value: object) -> ControllerKind | None:
+        # The plugin calls its passthrough controller "base".
+        return cls.PASSTHROUGH if value == "base" else None
+
+
+class CameraMode(StrEnum):
+    """Meaning of a camera's pixels."""
+
+    REAL = "real"
+    DEPTH = "depth"
+    SEMANTIC = "semantic"
+    INSTANCE = "instance"
+
+
+class CameraTiming(StrEnum):
+    """Which frame a step reply carries: one rendered after the step, or the newest available."""
+
+    SYNC = "sync"
+    LATEST = "latest"
+
+
+class ObservationLevel(StrEnum):
+    """Amount of state in each step reply."""
+
+    MINIMAL = "minimal"
+    STANDARD = "standard"
+    FULL = "full"
+
+
+class OutOfRange(StrEnum):
+    """Handling of a set-point outside the range of its actuator. Client-side only."""
+
+    ERROR = "error"
+    """Raise an error."""
+    CLAMP = "clamp"
+    """Use the nearest value in the range."""
+    ALLOW = "allow"
+    """Send it unchanged; MuJoCo clamps controls that have a range."""
+
+
+class PIEState(StrEnum):
+    """State of Play-In-Editor."""
+
+    READY = "ready"
+    COMPILE_FAILED = "compile_failed"
+    TIMEOUT = "timeout"
+    OFF = "off"
+    COMPILING = "compiling"
+
+
+class Transport(StrEnum):
+    """Transport of requests."""
+
+    ZMQ = "zmq"
+    SHM = "shm"
+
+
+def known(enum: type[E], value: str) -> E | str:
+    """Return the member of `enum` equal to `value`, or `value` itself if it is unknown."""
+    try:
+        return enum(value)
+    except ValueError:
+        return value

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 __all__ = ["PUBLIC_SUFFIX", "SECRET_SUFFIX", "KeyFileError", "KeyPair", "public_key", "public_keys", "read_pair"]
 

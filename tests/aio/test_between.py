@@ -12,8 +12,8 @@ from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.base import Op
-from urlab_client.protocol.dialects import ALPHA, BETA, Dialect
 from urlab_client.server import SimulatedServer
+from urlab_client.server.dialects import ALPHA, BETA, Dialect
 
 JOBS = ("op_status",)
 CLAIMS = ("claim_control", "release_control")

@@ -19,15 +19,15 @@ from scripted import meta_ok
 from waiting import DEADLINE_S, in_time, until
 
 from urlab_client.aio import URLabClient, launch
-from urlab_client.protocol.base import Effect
-from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.errors import (
+from urlab_client.errors import (
     ClientClosed,
     NoActiveManager,
     OutcomeUnknown,
     ProtocolError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.base import Effect
+from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.registry import OPS
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
@@ -37,8 +37,7 @@ PAIRS = [(fault, name) for i, name in enumerate(OPS) for j, fault in enumerate(F
 
 
 async def arrived(scripted: Any, op: str) -> None:
-    while (await asyncio.to_thread(scripted.request))["op"] != op:
-        pass
+    await asyncio.to_thread(scripted.request, op)
 
 
 @pytest.mark.parametrize(("fault", "name"), PAIRS)

@@ -16,7 +16,7 @@ from ports import free_port
 from waiting import DEADLINE_S, in_time
 
 from urlab_client.aio import URLabClient
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 SUPPORT = Path(__file__).parents[1] / "support"
 KILLS = int(os.environ.get("URLAB_KILLS", "2"))

@@ -12,8 +12,8 @@ from publisher import Publisher
 from waiting import until
 
 from urlab_client.aio import URLabClient
-from urlab_client.aio.streams import Stream
-from urlab_client.protocol.errors import StreamOverflow
+from urlab_client.aio.streams.stream import Stream
+from urlab_client.errors import StreamOverflow
 
 SERVED = """
 import asyncio, os, signal, sys, threading, urlab_client, urlab_client.aio

@@ -20,15 +20,15 @@ from hypothesis import strategies as st
 from publisher import Publisher
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client.aio.live.camera_source import CameraSource
-from urlab_client.aio.live.event_bus import EventBus
-from urlab_client.aio.live.live_state import LiveState
-from urlab_client.aio.live.row_source import RowSource
-from urlab_client.aio.live.state_source import StateSource
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.camera_source import CameraSource
+from urlab_client.aio.streams.event_bus import EventBus
+from urlab_client.aio.streams.live_state import LiveState
+from urlab_client.aio.streams.row_source import RowSource
+from urlab_client.aio.streams.state_source import StateSource
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import (
+from urlab_client.enums import CameraMode
+from urlab_client.errors import (
     ClientClosed,
     ConcurrentReadError,
     ProtocolError,
@@ -36,18 +36,12 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import PlayStarted, ServerConnected, ServerLost, ServerReconnected
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import (
-    PlayStarted,
-    RowSample,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    StateSnapshot,
-)
-from urlab_client.protocol.picture_memory import PictureMemory
+from urlab_client.protocol.messages.streams import RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.pictures import PictureMemory
 
 sys.path.append(str(Path(__file__).parents[1] / "protocol"))
 import vectors

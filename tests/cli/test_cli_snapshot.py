@@ -14,8 +14,8 @@ from PIL import Image
 from urlab_client import URLabClient
 from urlab_client._installation import install_command
 from urlab_client.cli import main
+from urlab_client.enums import StepMode
 from urlab_client.protocol.base import DialectName
-from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 

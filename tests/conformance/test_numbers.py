@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from urlab_client.aio.client_types import Verdict
 from urlab_client.enums import ControlMode, OutOfRange
-from urlab_client.protocol.client_types import Verdict
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 BOT = """

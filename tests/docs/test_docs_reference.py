@@ -16,7 +16,7 @@ import gen_cli
 import gen_docs
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.cli import _parser
-from urlab_client.protocol.errors import RPC_ERRORS
+from urlab_client.errors import RPC_ERRORS
 from urlab_client.protocol.messages.scene import EnsureManager
 from urlab_client.protocol.registry import OPS
 
@@ -64,7 +64,7 @@ def test_every_error_code_has_a_row() -> None:
 
 
 def test_the_kinds_of_errors_are_complete() -> None:
-    from urlab_client.protocol import errors
+    from urlab_client import errors
 
     classes = {cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.URLabError)}
     expected = {f"`{cls.__name__}`" for cls in classes - set(RPC_ERRORS.values()) - {errors.URLabError}}

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from urlab_client.enums import CameraMode
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.protocol.enums import CameraMode
 from urlab_client.randomise import Randomisation, Vary
 from urlab_client.server import SimulatedServer
 

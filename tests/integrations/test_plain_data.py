@@ -21,33 +21,27 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from starlette.testclient import TestClient
 
 import urlab_client.protocol
+from urlab_client.aio.client_types import Diagnosis, Finding, ServerInfo, Verdict
+from urlab_client.errors import UnknownArticulation
+from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.integrations.policy.runner import PolicyRun
 from urlab_client.integrations.record.writer import RecorderStats
 from urlab_client.integrations.view.view import ViewStats
 from urlab_client.protocol.base import Request
-from urlab_client.protocol.client_types import Diagnosis, Finding, ServerInfo, Verdict
-from urlab_client.protocol.descriptions import Pose, SceneDescription
-from urlab_client.protocol.errors import UnknownArticulation
 from urlab_client.protocol.messages.session import ArticulationInfo, ArticulationState, Clock, HelloOk
-from urlab_client.protocol.messages.streams import (
-    CameraSample,
-    ClientEvent,
-    RowSample,
-    ServerLost,
-    StateSnapshot,
-)
-from urlab_client.protocol.pixels import CameraImage
-from urlab_client.protocol.plain_reading import kinds_of
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow
-from urlab_client.protocol.scene_types import ActorHierarchyNode, BlueprintInfo
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.shm import Header, Publication
 from urlab_client.protocol.topics import StreamTopic
-from urlab_client.protocol.types import CameraPose, SimOptions
+from urlab_client.values.descriptions import Pose, SceneDescription
+from urlab_client.values.pictures import CameraImage
+from urlab_client.values.plain import Serializable, kinds_of
+from urlab_client.values.scene_types import ActorHierarchyNode, BlueprintInfo
+from urlab_client.values.types import CameraPose, SimOptions
 
 # What transports and robots are sent; no call returns any of it.
 SENT = (Request, Header, Publication, StreamTopic)
-SENT_MODULE = "urlab_client.protocol.control_messages"
+SENT_MODULE = "urlab_client.server.streams.control_messages"
 
 
 def structs() -> list[type[Struct]]:

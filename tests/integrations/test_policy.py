@@ -16,6 +16,7 @@ from waiting import until
 
 from urlab_client import URLabClient, URLabError, aio
 from urlab_client._installation import install_command
+from urlab_client.enums import StepMode
 from urlab_client.integrations import policy as policies
 from urlab_client.integrations.policy import (
     Policy,
@@ -27,7 +28,6 @@ from urlab_client.integrations.policy import (
     run,
     run_blocking,
 )
-from urlab_client.protocol.enums import StepMode
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 PD = {"quadruped": ControllerConfig()}

@@ -13,6 +13,7 @@ import pytest
 
 from urlab_client import URLabClient
 from urlab_client.cli import main
+from urlab_client.enums import CameraMode
 from urlab_client.integrations.gym import PushPictures, URLabEnv
 from urlab_client.integrations.policy import (
     OnnxDictNetwork,
@@ -23,7 +24,6 @@ from urlab_client.integrations.policy import (
     parse_spec,
     run_blocking,
 )
-from urlab_client.protocol.enums import CameraMode
 from urlab_client.server import SimulatedServer
 
 PUSH = Path(__file__).parents[2] / "examples" / "policies" / "push.onnx"

@@ -28,6 +28,10 @@ from PIL import Image
 
 import urlab_client
 from urlab_client.cli import main
+from urlab_client.console.messages import state_message
+from urlab_client.console.pictures import _jpeg_of
+from urlab_client.console.recordings import _described
+from urlab_client.console.replay import _opened, _present, _Robot, _snapshot
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
@@ -51,11 +55,7 @@ from urlab_client.integrations.record import (
 )
 from urlab_client.randomise import Randomisation
 from urlab_client.server import SimulatedServer
-from urlab_client.server.physics import recording
-from urlab_client.web.messages import state_message
-from urlab_client.web.pictures import _jpeg_of
-from urlab_client.web.recordings import _described
-from urlab_client.web.replay import _opened, _present, _Robot, _snapshot
+from urlab_client.simulation import joint_recording as recording
 
 STATE = schema_name(ArticulationMessage)
 MIB = 1 << 20

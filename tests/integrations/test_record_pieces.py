@@ -16,7 +16,7 @@ import pytest
 from children import in_background
 from made_recordings import Robot, write_recording
 
-from urlab_client._whole_files import replaced
+from urlab_client._platform.files import replaced
 from urlab_client.cli import main
 from urlab_client.integrations.record import Run, export, read_run, tables
 from urlab_client.integrations.record.transitions import transitions_of

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from waiting import DEADLINE_S, until
 
+from urlab_client.errors import URLabError
 from urlab_client.mcp import transports
 from urlab_client.mcp.call import Call
-from urlab_client.protocol.errors import URLabError
 
 
 def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:

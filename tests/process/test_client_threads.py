@@ -10,8 +10,8 @@ FIRST_USE = """
 import os, sys, threading
 import msgspec
 from urlab_client.protocol.codec import decode_reply
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.dialects import ALPHA
+from urlab_client.errors import ProtocolError
+from urlab_client.server.dialects import ALPHA
 from urlab_client.server.rpc.requests import RequestReader
 
 HELLO = {"op": "hello_ok", "session_id": "", "urlab_version": "", "mujoco_version": "", "articulations": [{}]}

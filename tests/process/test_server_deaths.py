@@ -20,7 +20,7 @@ from served import Served
 from waiting import in_time, until
 
 from urlab_client.aio import URLabClient
-from urlab_client.protocol.errors import NotReady, URLabConnectionError, URLabRPCError, URLabTimeoutError
+from urlab_client.errors import NotReady, URLabConnectionError, URLabRPCError, URLabTimeoutError
 
 TIMEOUT_S = 0.3
 LOST = (URLabTimeoutError, URLabConnectionError, URLabRPCError)

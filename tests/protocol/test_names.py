@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client.protocol.names import NameMap, UnknownName, owner_of, split_prefix
+from urlab_client.values.names import NameMap, UnknownName, owner_of, split_prefix
 
 
 def two_robots_and_an_arm() -> NameMap[int]:

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import msgspec
 import pytest
 
+from urlab_client.errors import RPC_ERRORS, URLabRPCError, rpc_error
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
-from urlab_client.protocol.errors import RPC_ERRORS, URLabRPCError, rpc_error
 from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, dialect_ops, registry
 
 

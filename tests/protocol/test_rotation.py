@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import (
+from urlab_client.values.rotation import (
+    Quat,
+    Vec3,
     euler_to_quat,
     normalized,
     quat_to_euler,

@@ -12,17 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from urlab_client.protocol.control_messages import (
-    ActuatorInfo,
-    CameraEndpoint,
-    ControlPayload,
-    JointGains,
-    decode_gains,
-    encode_gains,
-)
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.pixels import decode_camera, encode_camera
+from urlab_client.enums import CameraMode
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
 from urlab_client.protocol.topics import (
     StreamTopic,
@@ -32,6 +23,15 @@ from urlab_client.protocol.topics import (
     resolve_endpoint,
     scene_filter,
 )
+from urlab_client.server.streams.control_messages import (
+    ActuatorInfo,
+    CameraEndpoint,
+    ControlPayload,
+    JointGains,
+    decode_gains,
+    encode_gains,
+)
+from urlab_client.values.pictures import decode_camera, encode_camera
 
 OF_COMPONENT = [TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR, TopicKind.CAMERA]
 OF_ARTICULATION = [TopicKind.TWIST, TopicKind.ACTIONS, TopicKind.CONTROL, TopicKind.SET_GAINS]

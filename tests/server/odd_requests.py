@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from hypothesis import strategies as st
 
-from urlab_client.protocol.dialects import BETA
+from urlab_client.server.dialects import BETA
 
 every_kind = st.recursive(
     st.none()

@@ -17,8 +17,9 @@ from ports import free_ports
 from waiting import eventually
 from wire import server_threads
 
-from urlab_client import AuthenticationFailed, URLabClient
+from urlab_client import URLabClient
 from urlab_client.cli import main
+from urlab_client.errors import AuthenticationFailed
 from urlab_client.keys import KeyFileError, KeyPair, public_key, read_pair
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.server import CurveServer, SimulatedServer, UnprotectedServer
@@ -260,7 +261,7 @@ def test_a_binary_model_from_a_server_with_a_key_is(monkeypatch: pytest.MonkeyPa
 def test_a_server_from_afar_with_nothing_but_a_binary_model(monkeypatch: pytest.MonkeyPatch) -> None:
     _as_from_afar(monkeypatch)
     from urlab_client import URLabError
-    from urlab_client.aio.session import Session
+    from urlab_client.aio.session.session import Session
 
     hello = Session.hello
 

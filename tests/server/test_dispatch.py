@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from odd_requests import mangled, plain_request
 from wire import Wire, check_numbers, pack, write_level
 
+from urlab_client.enums import PIEState, Transport
 from urlab_client.protocol.base import Needs
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
-from urlab_client.protocol.dialects import ALPHA, BETA
-from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.messages.runtime import SetPaused, SetPausedOk
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
@@ -27,6 +26,7 @@ from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.config import ServerConfig
 from urlab_client.server.core import ServerCore
+from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.refusal import Refusal

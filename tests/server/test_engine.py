@@ -19,14 +19,15 @@ from hypothesis import strategies as st
 from scenes import ASSETS, BALL, BOT, hasty, make_scene
 from waiting import eventually
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.handlers.runtime import parse_control_source, parse_mode
 from urlab_client.server.physics import engine as engine_module
 from urlab_client.server.physics import pacing
-from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
+from urlab_client.server.physics.controllers import ControlSource
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 
 DT = 0.002
 DEADLINE = 30.0

@@ -23,19 +23,19 @@ from scenes import hasty
 from waiting import attempts
 from wire import Wire, pack
 
-from urlab_client import ProtocolError, URLabRPCError
+from urlab_client import URLabRPCError
+from urlab_client.errors import RPC_ERRORS, ProtocolError
 from urlab_client.protocol.base import DialectName, Needs
 from urlab_client.protocol.codec import decode_reply
-from urlab_client.protocol.control_messages import ActuatorInfo, ControlPayload, decode_gains
-from urlab_client.protocol.dialects import ALPHA, DIALECTS
-from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.protocol.messages.session import HelloOk, StepOk
 from urlab_client.protocol.registry import OPS
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import STATE_FULL, StreamTopic, TopicKind
 from urlab_client.server import ControllerConfig, Limits, SimulatedServer
+from urlab_client.server.dialects import ALPHA, DIALECTS
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
+from urlab_client.server.streams.control_messages import ActuatorInfo, ControlPayload, decode_gains
 
 FRAMES = 2_000 * FACTOR
 """For each direction of the codec."""

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import ASSETS, BALL, BOT, make_scene
 
-from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, ArticulationState, Step
 from urlab_client.server.assets.actors import Actor, ActorKind, ConversionSettings, Mesh
 from urlab_client.server.physics.engine import Engine

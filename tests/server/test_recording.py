@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import Wire
 
-from urlab_client.server.physics import recording
-from urlab_client.server.physics.recording import Frame, JointLayout, decode_csv, decode_json, encode_json
+from urlab_client.simulation import joint_recording as recording
+from urlab_client.simulation.joint_recording import Frame, JointLayout, decode_csv, decode_json, encode_json
 
 Serve = Callable[..., Wire]
 
@@ -260,9 +260,9 @@ SAVER = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from urlab_client._whole_files import write_whole
-from urlab_client.server.physics import recording
-from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
+from urlab_client._platform.files import write_whole
+from urlab_client.simulation.joint_recording import Frame, JointLayout, encode_json
+from urlab_client.simulation import joint_recording as recording
 
 layout = JointLayout.of([("j", 1, 1)])
 file, chance = Path(sys.argv[1]), random.Random(0)

@@ -14,8 +14,8 @@ from hypothesis.extra.numpy import arrays
 from scenes import BALL, BOT, make_scene
 from test_observations import RICH
 
+from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.session import Clock, Step, StepOk
 from urlab_client.server.assets.actors import Actor, ActorKind, ConversionSettings, Mesh
 from urlab_client.server.physics.engine import Engine

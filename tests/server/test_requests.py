@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from odd_requests import every_kind, mangled, plain_request
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES, encode_request
-from urlab_client.protocol.dialects import ALPHA, BETA
 from urlab_client.protocol.messages import runtime, scene
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
+from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader, need, usable

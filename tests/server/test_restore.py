@@ -13,8 +13,8 @@ from samples import filled
 from wire import Wire, pack
 
 from urlab_client.protocol.codec import encode_request
-from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import ControllerConfig, Delay, Drop, Faults, SimulatedServer
+from urlab_client.server.dialects import ALPHA
 
 Act = Callable[[Wire], object]
 

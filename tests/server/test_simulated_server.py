@@ -23,7 +23,7 @@ from waiting import eventually
 from wire import Wire, pack, server_threads, write_level
 
 from urlab_client import URLabClient
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode
 from urlab_client.server import ControllerConfig, ModelError, PortInUse, SimulatedServer, bundled_models
 from urlab_client.server import core as core_module
 from urlab_client.server.compile.scene import compile_scene

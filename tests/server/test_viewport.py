@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from wire import Wire, float32
 
-from urlab_client.protocol.rotation import rotate
 from urlab_client.server.editor.viewport import Track, Viewport
+from urlab_client.values.rotation import rotate
 
 POSE = {"location", "rotation_quat", "rotation_euler", "fov"}
 

@@ -19,8 +19,8 @@ from scenes import hasty as hasty_engine
 from wire import Wire, float32, write_level
 
 from urlab_client.protocol.base import Needs
-from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server.dialects import ALPHA
 
 Serve = Callable[..., Wire]
 

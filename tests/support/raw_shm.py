@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import msgspec
 
-from urlab_client._windows import NamedEvent
+from urlab_client._platform.windows import NamedEvent
 
 HEADER = struct.Struct("<IIIIQI")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.server import SimulatedServer
 
 __all__ = ["rest"]

@@ -26,11 +26,11 @@ from forked import Program, program
 from waiting import DEADLINE_S, eventually
 
 from urlab_client import URLabClient
-from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
-from urlab_client.protocol.names import NameMap
+from urlab_client.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.sync import _loop
 from urlab_client.sync._facade import Facade, FacadeRoot, wrap
 from urlab_client.sync._portal import Portal
+from urlab_client.values.names import NameMap
 
 
 async def answer(value: object = 42) -> object:
@@ -541,7 +541,7 @@ class TestGarbageCollection:
 def child(script: str) -> Program | subprocess.Popen[str]:
     prelude = """
         import asyncio, logging, os, signal, sys, threading
-        from urlab_client.protocol.errors import ClientClosed, ForkedError
+        from urlab_client.errors import ClientClosed, ForkedError
         from urlab_client.sync import _facade, _loop
         from urlab_client.sync._portal import Portal
 

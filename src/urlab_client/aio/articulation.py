@@ -9,28 +9,28 @@ import numpy as np
 
 from urlab_client.aio.arguments import mapping, require
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.controllers import URLabController, make_controller
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.aio.motion import Motion
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.control import CLAIM_S
+from urlab_client.aio.session.session import Session
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.enums import ControlMode, OutOfRange
+from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.descriptions import (
+from urlab_client.protocol.messages.session import ControllerInfo
+from urlab_client.values.descriptions import (
     ArticulationDescription,
     ControllerDescription,
     EntityDescription,
     Pose,
 )
-from urlab_client.protocol.enums import ControlMode, OutOfRange
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.session import ControllerInfo
-from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.rotation import rotate
+from urlab_client.values.names import NameMap
+from urlab_client.values.rotation import rotate
 
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])

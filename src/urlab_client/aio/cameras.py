@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.live_state import LatestPicture
-from urlab_client.aio.live.publishers import Publishers, SharedFrame
-from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.protocol.descriptions import CameraDescription
-from urlab_client.protocol.enums import CameraMode, known
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.streams.live_state import LatestPicture
+from urlab_client.aio.streams.publishers import Publishers, SharedFrame
+from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
+from urlab_client.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.picture_memory import PictureMemory
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.values.descriptions import CameraDescription
+from urlab_client.values.pictures import PictureMemory, Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 

@@ -9,19 +9,19 @@ from msgspec.structs import replace
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.client_types import ClientConfig, ServerInfo
 from urlab_client.aio.model.mirror import binary_model
-from urlab_client.aio.session import Session
+from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
-from urlab_client.protocol.client_types import ClientConfig, ServerInfo
+from urlab_client.enums import StepMode
+from urlab_client.errors import NoSession
 from urlab_client.protocol.codec import encode_message
-from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription, SceneDescription
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoSession
 from urlab_client.protocol.messages.session import NOT_SENT
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.names import NameMap, unknown_name
-from urlab_client.protocol.observer import ClientObserver
+from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
+from urlab_client.values.names import NameMap, unknown_name
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel

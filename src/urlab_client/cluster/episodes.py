@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.cluster.leases import LeasePool
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 Policy = Callable[[Any, np.random.Generator], Any]
 """`(observation, rng) -> action`, in the spaces of the environment: flat arrays, or dictionaries of arrays with

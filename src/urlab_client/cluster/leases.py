@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Final
 
-from urlab_client.protocol.errors import LeaseBusy, URLabError
+from urlab_client.errors import LeaseBusy, URLabError
 from urlab_client.sync.client import URLabClient
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown

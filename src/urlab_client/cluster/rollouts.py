@@ -17,7 +17,7 @@ import anyio.to_thread
 from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Setup, seed_of
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.cluster.worker_pool import WorkerPool
-from urlab_client.protocol.errors import URLabError, refused_for_good
+from urlab_client.errors import URLabError, refused_for_good
 
 log: logging.Logger = logging.getLogger("urlab_client.cluster")
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from urlab_client.cluster.episodes import Episode, Job, Policy, Setup, seed_of
 from urlab_client.cluster.leases import Lease
+from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.env import URLabEnv
-from urlab_client.protocol.errors import refused_for_good
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 

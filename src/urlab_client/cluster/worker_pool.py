@@ -9,7 +9,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from urlab_client.cluster.worker import Worker
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.protocol.enums import ControllerKind
-from urlab_client.protocol.observer import ClientObserver
+from urlab_client.aio.observer import ClientObserver
+from urlab_client.enums import ControllerKind
 
 if TYPE_CHECKING:
     import mujoco

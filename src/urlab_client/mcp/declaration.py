@@ -15,7 +15,7 @@ from mcp.types import Tool, ToolAnnotations
 from msgspec import Struct
 
 from urlab_client.mcp.results import Moment
-from urlab_client.protocol.schemas import prose, schemas
+from urlab_client.values.schemas import prose, schemas
 
 _Function = Callable[..., Awaitable[Any]]
 

@@ -6,11 +6,11 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from urlab_client.errors import ImportFailed
 from urlab_client.mcp.call import Call
 from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.results import Edited
-from urlab_client.protocol.errors import ImportFailed
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.values.names import did_you_mean
 
 __all__: list[str] = []
 

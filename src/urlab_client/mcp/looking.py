@@ -8,10 +8,10 @@ from typing import Annotated
 import anyio.to_thread
 from msgspec import Meta
 
+from urlab_client.aio.client_types import Diagnosis
 from urlab_client.mcp.call import Call
 from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.results import Contacts, Log, Picture, RobotState, World
-from urlab_client.protocol.client_types import Diagnosis
 
 Robot = Annotated[str, Meta(description="Name or actor id of a robot, as `look` lists it.")]
 

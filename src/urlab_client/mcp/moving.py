@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from urlab_client.enums import StepMode
 from urlab_client.mcp.call import Call
 from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.looking import Robot
 from urlab_client.mcp.results import Done, Recorded
-from urlab_client.protocol.enums import StepMode
 
 __all__: list[str] = []
 

@@ -16,17 +16,15 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Quat, Vec3
 
 Floats: TypeAlias = NDArray[np.float64]
 """A vector of numbers on the wire; here an array of shape `(n,)`."""
 
-Vec3: TypeAlias = tuple[float, float, float]
-Quat: TypeAlias = tuple[float, float, float, float]
-
 
 DialectName: TypeAlias = Literal["alpha", "beta"]
-"""The supported wire dialects of the plugin; see `protocol.dialects`."""
+"""The supported wire dialects of the plugin; see `server.dialects`."""
 
 
 INT32_MIN: Final = -(2**31)

@@ -23,8 +23,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import force_setattr
 
+from urlab_client.errors import ProtocolError, rpc_error
 from urlab_client.protocol.base import Needs, Op, Reply, Request
-from urlab_client.protocol.errors import ProtocolError, rpc_error
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatusOk
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS

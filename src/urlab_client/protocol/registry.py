@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from types import MappingProxyType
 
-from urlab_client.protocol import errors
+from urlab_client import errors
 from urlab_client.protocol.base import DialectName, Op
 from urlab_client.protocol.messages import (
     cameras,

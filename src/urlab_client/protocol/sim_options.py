@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import replace
 
-from urlab_client.protocol.types import SimOptions
+from urlab_client.values.types import SimOptions
 
 _POSITIVE: Final = ("timestep", "impratio")
 _NOT_NEGATIVE: Final = (

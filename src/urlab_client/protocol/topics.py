@@ -8,8 +8,8 @@ from functools import lru_cache
 
 from msgspec import Struct
 
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import ProtocolError
+from urlab_client.values.layouts import BytesLike
 
 
 class TopicKind(StrEnum):

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, Self, get_args
 import msgspec
 from msgspec import Struct
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 
 MODEL_TEXT: Final = "urlab_randomise"
 """Name of the custom text element of a server's compiled model that contains its declaration as JSON."""

@@ -15,10 +15,9 @@ from typing import Any, Final
 import mujoco
 
 from urlab_client._mujoco import copy_options
+from urlab_client.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.dialects import Dialect
-from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.randomise.declaration import MODEL_TEXT
 from urlab_client.server.assets.actors import Actor
@@ -26,6 +25,7 @@ from urlab_client.server.assets.uploads import UPLOADS, Uploads
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.config import ServerConfig
+from urlab_client.server.dialects import Dialect
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
@@ -37,11 +37,11 @@ from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.refusal import CompileFailed
-from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
+from urlab_client.simulation.appearance import Appearance
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.errors import URLabError
 from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.editor.world import EditorWorld
 

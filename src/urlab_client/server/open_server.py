@@ -16,9 +16,8 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._landlock import is_available
-from urlab_client.protocol.control_messages import CameraEndpoint
-from urlab_client.protocol.enums import PIEState, Transport
+from urlab_client._sandbox.confinement import is_available
+from urlab_client.enums import PIEState, Transport
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.assets.content import ContentRoot
@@ -37,6 +36,7 @@ from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.snapshot import take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
+from urlab_client.server.streams.control_messages import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
 from urlab_client.server.streams.registration import Registration
 from urlab_client.server.system.health import Health

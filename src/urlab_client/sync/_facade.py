@@ -10,8 +10,8 @@ import inspect
 import warnings
 from typing import Any, Protocol, TypeVar, cast, overload
 
-from urlab_client.protocol.names import NameMap
 from urlab_client.sync._portal import Portal
+from urlab_client.values.names import NameMap
 
 A_co = TypeVar("A_co", covariant=True)
 F = TypeVar("F", bound="Facade")

@@ -30,7 +30,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from urlab_client.aio.background import background_thread
-from urlab_client.protocol.errors import ClientClosed, URLabError
+from urlab_client.errors import ClientClosed, URLabError
 from urlab_client.sync._caller_loop import CallerLoop
 from urlab_client.sync._signals import DeferredSignals
 

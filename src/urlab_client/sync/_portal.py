@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import Any, ParamSpec, Protocol, TypeVar
 
-from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
+from urlab_client.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed
 from urlab_client.sync._signals import DeferredSignals
 

@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from urlab_client.aio import articulation as aio
-from urlab_client.aio.control import CLAIM_S
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
+from urlab_client.aio.session.control import CLAIM_S
+from urlab_client.enums import ControlMode, OutOfRange
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription
-from urlab_client.protocol.enums import ControlMode, OutOfRange
-from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.controllers import URLabController
+from urlab_client.values.descriptions import ArticulationDescription, EntityDescription
+from urlab_client.values.names import NameMap
 
 
 class URLabEntity(Facade, twin=aio.URLabEntity):

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio import cameras as aio
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.publishers import SharedFrame
-from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
-from urlab_client.protocol.descriptions import CameraDescription
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.streams.publishers import SharedFrame
+from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.pixels import Pixels
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
+from urlab_client.values.descriptions import CameraDescription
+from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 

@@ -8,16 +8,16 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import client_state as aio
+from urlab_client.aio.client_types import ClientConfig, ServerInfo
+from urlab_client.aio.observer import ClientObserver
 from urlab_client.aio.transport.base import TransportStats
-from urlab_client.protocol.client_types import ClientConfig, ServerInfo
-from urlab_client.protocol.descriptions import SceneDescription
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
+from urlab_client.values.descriptions import SceneDescription
+from urlab_client.values.names import NameMap
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel

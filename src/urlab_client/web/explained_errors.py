@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from urlab_client.protocol.errors import (
+from urlab_client.console.lease import NotDriving
+from urlab_client.errors import (
     OutcomeUnknown,
     URLabConnectionError,
     URLabError,
     URLabRPCError,
     URLabTimeoutError,
 )
-from urlab_client.web.driving_lease import NotDriving
 
 
 def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:

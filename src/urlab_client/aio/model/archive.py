@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from urlab_client.protocol.messages.uploads import MAX_ASSETS
-from urlab_client.protocol.names import is_file_name
+from urlab_client.values.names import is_file_name
 
 _MAX_BYTES: Final = 1 << 30
 _MAX_PATH_BYTES: Final = 1000

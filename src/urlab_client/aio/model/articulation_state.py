@@ -15,9 +15,9 @@ import numpy as np
 from urlab_client._mujoco import control_counts, control_starts
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, ArticulationLayout
 from urlab_client.aio.model.mirror import Mirror
+from urlab_client.enums import ControllerKind, ControlMode
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ControllerKind, ControlMode
-from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.session import (
     ArticulationCommand,
     ArticulationInfo,

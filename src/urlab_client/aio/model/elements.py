@@ -13,17 +13,17 @@ from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.aio.model.numbers import finite, finite_array, is_array
 from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
+from urlab_client.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.descriptions import (
+from urlab_client.protocol.messages.session import ArticulationInfo
+from urlab_client.values.descriptions import (
     ActuatorDescription,
     JointDescription,
     JointKind,
     SensorDescription,
     SetPointMeaning,
 )
-from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
-from urlab_client.protocol.messages.session import ArticulationInfo
-from urlab_client.protocol.names import NameMap
+from urlab_client.values.names import NameMap
 
 if TYPE_CHECKING:
     import mujoco

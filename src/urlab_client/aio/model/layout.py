@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.protocol.names import split_prefix
+from urlab_client.values.names import split_prefix
 
 if TYPE_CHECKING:
     import mujoco

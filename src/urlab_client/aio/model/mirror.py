@@ -16,10 +16,10 @@ import numpy as np
 
 from urlab_client._mujoco import forget_last_document, without_newer_attributes
 from urlab_client.aio.model.numbers import first_not_finite
+from urlab_client.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
-from urlab_client.protocol.types import SimOptions
+from urlab_client.values.types import SimOptions
 
 if TYPE_CHECKING:
     import mujoco
@@ -119,7 +119,7 @@ def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco
         model = mujoco.MjModel.from_xml_string(xml, dict(assets))
         forget_last_document()
         return model
-    from urlab_client.aio.model.compilation import compile_confined  # also run as a program
+    from urlab_client.aio.model.compilation import compile_confined  # rarely needed
 
     try:
         return _from_binary(compile_confined(xml, assets))

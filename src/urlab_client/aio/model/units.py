@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS
-from urlab_client.protocol.descriptions import JointKind, SetPointMeaning
+from urlab_client.values.descriptions import JointKind, SetPointMeaning
 
 if TYPE_CHECKING:
     import mujoco

@@ -15,8 +15,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
 
+from urlab_client.errors import OutcomeUnknown, UnknownUpload
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelCommitOk,
     UploadModelManifest,
 )
-from urlab_client.protocol.types import UploadProgress
+from urlab_client.values.types import UploadProgress
 
 if TYPE_CHECKING:
     import mujoco
@@ -123,7 +123,7 @@ async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) ->
         try:
             upload_id = await _send_files(model, call, on_progress)
             break
-        except (UnknownUpload, ConnectionLost, OutcomeUnknown):
+        except (UnknownUpload, OutcomeUnknown):
             if attempt == _ATTEMPTS:
                 raise
     else:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, Vector, as_quat, as_vec3, fill, target_by
 from urlab_client.protocol.messages.debug import (
     ClearMarkers,
@@ -50,8 +50,8 @@ from urlab_client.protocol.messages.viewport import (
     TrackActor,
     Untrack,
 )
-from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
-from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
+from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.values.types import CameraPose, KeyframeInfo, MocapPose
 
 __all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportNamespace"]
 

@@ -6,12 +6,12 @@ import math
 from functools import partial
 from pathlib import Path
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, fill
 from urlab_client.aio.namespaces._ops import ReplayOps
-from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.session.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.protocol.errors import RecordingAlreadyActive, RecordingNotActive
+from urlab_client.errors import RecordingAlreadyActive, RecordingNotActive
 from urlab_client.protocol.messages.recording import (
     RecordingClear,
     RecordingSave,
@@ -23,7 +23,7 @@ from urlab_client.protocol.messages.recording import (
     ReplayStart,
     ReplayStop,
 )
-from urlab_client.protocol.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
+from urlab_client.values.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
 
 _RECORDING = "recording"
 _FRAMES = "recorded frames"

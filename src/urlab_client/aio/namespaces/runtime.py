@@ -10,19 +10,19 @@ import msgspec
 import numpy as np
 
 from urlab_client.aio.arguments import mapping, require
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.jobs import OnProgress
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
-from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.session.jobs import OnProgress
+from urlab_client.aio.session.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.wire_names import as_written, for_the_server
+from urlab_client.enums import StepMode
+from urlab_client.errors import UnknownOp
 from urlab_client.protocol.base import Floats, Reply, Request
 from urlab_client.protocol.codec import building
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import UnknownOp
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,
     CameraDelayInForce,
@@ -41,7 +41,7 @@ from urlab_client.protocol.messages.runtime import (
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.sim_options import check_sim_options, in_small_letters
-from urlab_client.protocol.types import ContactsResult, SimOptions
+from urlab_client.values.types import ContactsResult, SimOptions
 
 R = TypeVar("R", bound=Reply)
 

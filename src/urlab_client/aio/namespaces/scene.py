@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, TypeVar
 import anyio
 
 from urlab_client.aio.arguments import require
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
-from urlab_client.aio.namespaces.lasting import SceneEdit
+from urlab_client.aio.namespaces.contexts import SceneEdit
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
+from urlab_client.enums import PIEState
+from urlab_client.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.enums import PIEState
-from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
     CreateLevel,
@@ -34,8 +34,8 @@ from urlab_client.protocol.messages.scene import (
     SpawnGrid,
     SpawnLight,
 )
-from urlab_client.protocol.rotation import IDENTITY, euler_to_quat
-from urlab_client.protocol.scene_types import (
+from urlab_client.values.rotation import IDENTITY, euler_to_quat
+from urlab_client.values.scene_types import (
     SceneActor,
     SceneSnapshot,
     URLabAsset,
@@ -43,7 +43,7 @@ from urlab_client.protocol.scene_types import (
     URLabLightHandle,
     URLabSpawnHandle,
 )
-from urlab_client.protocol.types import JobStatus, UploadProgress
+from urlab_client.values.types import JobStatus, UploadProgress
 
 if TYPE_CHECKING:
     import mujoco

@@ -13,16 +13,15 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.camera_source import CameraSource, HasCamera
-from urlab_client.aio.session import Turn
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import learn_mode, stopped_live
 from urlab_client.aio.state.step_pictures import first_picture_s
+from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
 from urlab_client.aio.transport.subscriber import MessageHandler
-from urlab_client.protocol.codec import op_of
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import (
+from urlab_client.enums import StepMode
+from urlab_client.errors import (
     ModeLocked,
     NoActiveManager,
     PictureTimeout,
@@ -30,11 +29,12 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.messages.session import Meta, Step
 from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.pixels import decode_camera, picture_stamp
+from urlab_client.values.layouts import BytesLike
+from urlab_client.values.pictures import decode_camera, picture_stamp
 
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05

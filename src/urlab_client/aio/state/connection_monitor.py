@@ -12,14 +12,14 @@ import logging
 from collections.abc import Callable
 
 from urlab_client.aio.background import background_task
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription
-from urlab_client.protocol.errors import NoActiveManager, URLabError, URLabRPCError
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.errors import NoActiveManager, URLabError, URLabRPCError
+from urlab_client.events import ClientEvent, PlayStarted, ServerLost, ServerReconnected
 from urlab_client.protocol.messages.runtime import ListKeyframes
-from urlab_client.protocol.messages.streams import ClientEvent, PlayStarted, ServerLost, ServerReconnected
 from urlab_client.protocol.topics import STATE_FULL
+from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

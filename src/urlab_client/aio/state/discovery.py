@@ -12,14 +12,13 @@ from typing import Final
 
 import anyio.to_thread
 
-from urlab_client.aio.session import Turn
+from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
 from urlab_client.aio.transport.subscriber import MessageHandler
-from urlab_client.protocol.codec import decode_reply, op_of
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import (
+from urlab_client.enums import StepMode
+from urlab_client.errors import (
     NoActiveManager,
     NotReady,
     ProtocolError,
@@ -27,9 +26,11 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabVersionMismatch,
 )
-from urlab_client.protocol.layouts import BytesLike
+from urlab_client.events import PlayStarted
+from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
-from urlab_client.protocol.messages.streams import PlayStarted, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import StateSnapshot, StreamPolicy
+from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

@@ -14,10 +14,10 @@ from msgspec import Struct
 from urlab_client.aio.controllers import check_controller
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.session import CameraInfo, EntityInfo, HelloOk
-from urlab_client.protocol.names import owner_of
-from urlab_client.protocol.pixels import check_picture_size
+from urlab_client.values.names import owner_of
+from urlab_client.values.pictures import check_picture_size
 
 if TYPE_CHECKING:
     import mujoco

@@ -5,15 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.session import STOP, Turn
+from urlab_client.aio.client_types import Resync
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.session.session import STOP, Turn
 from urlab_client.aio.state.discovery import Discovery, look
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.protocol.client_types import Resync
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoSession, SessionTakenOver, URLabRPCError
+from urlab_client.enums import StepMode
+from urlab_client.errors import NoSession, SessionTakenOver, URLabRPCError
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

@@ -14,24 +14,26 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.live.live_state import LatestPicture, LiveState
-from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.live.step_streams import StepStreams
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.motion import Motion
-from urlab_client.aio.session import Session
+from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
-from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, CameraTiming, StepMode
-from urlab_client.protocol.errors import (
+from urlab_client.aio.streams.live_state import LatestPicture, LiveState
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.step_streams import StepStreams
+from urlab_client.enums import CameraMode, CameraTiming, StepMode
+from urlab_client.errors import (
     NoActiveManager,
     NoSession,
     ProtocolError,
     SessionTakenOver,
     URLabRPCError,
 )
+from urlab_client.events import PlayEnded, SessionLost, SessionOpened
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import (
     ArticulationState,
     CameraFrame,
@@ -41,11 +43,10 @@ from urlab_client.protocol.messages.session import (
     StateReply,
     StepOk,
 )
-from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.observer import ClientObserver
-from urlab_client.protocol.pixels import Pixels, decode_camera
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.sim_options import check_sim_options
-from urlab_client.protocol.types import SimOptions
+from urlab_client.values.pictures import Pixels, decode_camera
+from urlab_client.values.types import SimOptions
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

@@ -22,7 +22,7 @@ from urlab_client.protocol.messages.runtime import (
     SetMocapPose,
     SetTwist,
 )
-from urlab_client.protocol.names import UnknownName, compiled_names
+from urlab_client.values.names import UnknownName, compiled_names
 
 if TYPE_CHECKING:
     import mujoco

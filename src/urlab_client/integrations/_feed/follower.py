@@ -16,16 +16,16 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.aio.observer import ClientObserver
+from urlab_client.enums import StepMode
+from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.names import did_you_mean
-from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._portal import Portal
+from urlab_client.values.names import did_you_mean
 
 log = logging.getLogger("urlab_client.feed")
 
@@ -45,9 +45,6 @@ class Follower(ClientObserver):
         camera_hz: Maximum number of pictures per second of simulation time.
         needs_model: Hint for the error if there is no local model; None if none is needed.
         buffer: Number of published states that may wait so that none is missed; 0 for only the newest.
-
-    Raises:
-        ValueError: `cameras` is a single name.
     """
 
     def __init__(
@@ -81,12 +78,7 @@ class Follower(ClientObserver):
         self._live = False
 
     def check(self) -> FollowedScene:
-        """Describe the scene.
-
-        Raises:
-            URLabError: There was no handshake yet, or the local model is missing.
-            KeyError: A camera is unknown.
-        """
+        """Describe the scene."""
         if not self._client.urlab_version:
             raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:

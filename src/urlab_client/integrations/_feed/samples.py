@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from urlab_client.enums import CameraMode
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
@@ -16,12 +17,9 @@ from urlab_client.integrations._feed.messages import (
     values,
 )
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
-from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.picture_files import encoded, jpeg, pillow_image
-from urlab_client.protocol.picture_memory import PictureMemory
-from urlab_client.protocol.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import PictureMemory, Pixels, decode_camera, encoded, jpeg, pillow_image
 
 if TYPE_CHECKING:
     from urlab_client.randomise.variation import EpisodeDraws

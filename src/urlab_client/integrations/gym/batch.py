@@ -17,6 +17,8 @@ from urlab_client._mujoco import batch_class
 from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.enums import ControllerKind
+from urlab_client.errors import UnknownKeyframe, URLabError
 from urlab_client.integrations.gym.batch_variation import BatchVariation
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of, first_camera
@@ -43,21 +45,14 @@ from urlab_client.integrations.gym.task import (
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.integrations.gym.warp_batch import WarpBatch
-from urlab_client.protocol.enums import ControllerKind
-from urlab_client.protocol.errors import UnknownKeyframe, URLabError
-from urlab_client.protocol.names import compiled_names
-from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import declared_in
-from urlab_client.server.physics.controllers import (
-    Actuated,
-    Controller,
-    ControllerConfig,
-    PassthroughController,
-    PDController,
-)
+from urlab_client.simulation.controller_config import ControllerConfig
+from urlab_client.simulation.controllers import Actuated, Controller, PassthroughController, PDController
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.names import compiled_names
+from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 

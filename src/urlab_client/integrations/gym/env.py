@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option
+from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.names import NameMap
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.names import NameMap
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""

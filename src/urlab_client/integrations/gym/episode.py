@@ -16,6 +16,8 @@ from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.enums import CameraMode, ObservationLevel, StepMode
+from urlab_client.errors import URLabError
 from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
@@ -29,14 +31,12 @@ from urlab_client.integrations.gym.spaces import (
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.integrations.gym.wire_variation import WireVariation
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
-from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
+from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 
 def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode
 
 if TYPE_CHECKING:
     import mujoco

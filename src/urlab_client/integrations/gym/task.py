@@ -17,7 +17,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.names import unknown_name
+from urlab_client.values.names import unknown_name
 
 Bools = NDArray[np.bool_]
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
+from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
@@ -26,7 +27,6 @@ from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone, joined
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError, refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 

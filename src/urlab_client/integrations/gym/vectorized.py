@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
 from urlab_client.integrations.gym.task import States, Task
-from urlab_client.protocol.errors import refused_for_good
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]

@@ -17,12 +17,12 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.names import split_prefix, unknown_name
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.names import split_prefix, unknown_name
+from urlab_client.values.plain import Serializable
 
 Vector = Sequence[float] | Floats
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.model.elements import Actuator, Joint, Sensor
+from urlab_client.enums import CameraMode
+from urlab_client.errors import URLabError
 from urlab_client.integrations.policy.spec import (
     AngularVelocity,
     BaseHeight,
@@ -33,10 +35,8 @@ from urlab_client.integrations.policy.spec import (
     SensorTerm,
 )
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.pixels import observed_pixels
 from urlab_client.sync.articulation import URLabArticulation
+from urlab_client.values.pictures import observed_pixels
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 

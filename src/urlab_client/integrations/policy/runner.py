@@ -12,15 +12,15 @@ from msgspec import Struct
 
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.defaults import DEFAULT
+from urlab_client.enums import ActuatorType, ControllerKind, ControlMode, StepMode
+from urlab_client.errors import URLabError
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.plain import Serializable
 
 _STANDSTILL_S: Final = 5.0
 _SMOOTHING_S: Final = 0.5

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from urlab_client.enums import CameraMode, StepMode
+from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, StepMode
-from urlab_client.protocol.errors import URLabError
 
 
 class PolicyFileError(URLabError, ValueError):

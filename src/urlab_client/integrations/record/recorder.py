@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.numbers import finite_array
+from urlab_client.errors import URLabError
 from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
-from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient

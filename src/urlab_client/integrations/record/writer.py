@@ -20,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import (
     ContactsMessage,
     EntityMessage,
@@ -45,11 +46,10 @@ from urlab_client.integrations._feed.samples import (
     picture_message,
 )
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
-from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.picture_memory import PictureMemory
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.values.pictures import PictureMemory
+from urlab_client.values.plain import Serializable
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
 

@@ -9,10 +9,10 @@ import numpy as np
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
 from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.errors import URLabError
 from urlab_client.integrations.ik import IkSolution, InverseKinematics
 from urlab_client.integrations.ik.solver import Vector, own_sites
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
 
 _MAX_LEAD_M: Final = 0.1

@@ -11,14 +11,14 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations.teleop.hand import HandControl
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task

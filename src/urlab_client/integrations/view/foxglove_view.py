@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Literal, overload
 import numpy as np
 from msgspec import Struct
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import (
     ContactsMessage,
     FrameTransforms,
@@ -26,7 +27,6 @@ from urlab_client.integrations._feed.samples import CameraPicture, State, articu
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
-from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:

@@ -17,16 +17,16 @@ from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.plain import Serializable
 
 log: logging.Logger = logging.getLogger("urlab_client.view")
 

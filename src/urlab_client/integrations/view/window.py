@@ -8,10 +8,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.samples import CameraPicture
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
-from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:

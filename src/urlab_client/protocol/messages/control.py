@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
+from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, doc
-from urlab_client.protocol.errors import UNCLAIMED
 
 __all__ = ["OPS", "UNCLAIMED", "ClaimControl", "ClaimControlOk", "ReleaseControl", "ReleaseControlOk"]
 

@@ -6,7 +6,8 @@ from typing import Annotated, Final
 
 from msgspec import field
 
-from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Color, EulerDeg, Op, Quat, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Color, EulerDeg, Op, Reply, Request, doc
+from urlab_client.values.rotation import Quat, Vec3
 
 Ttl = Annotated[float, doc("Lifetime, seconds: 0 for a single frame, negative until `clear_markers`.")]
 Tag = Annotated[str | None, doc("Accepted but not used; markers cannot be cleared by tag.")]

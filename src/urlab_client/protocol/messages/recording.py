@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request, doc
-from urlab_client.protocol.types import RecordingSummary, ReplayStatus
+from urlab_client.values.types import RecordingSummary, ReplayStatus
 
 
 class RecordingStartOk(Reply, tag="recording_start_ok", kw_only=True):

@@ -20,8 +20,8 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.serializable import Serializable
-from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
+from urlab_client.values.plain import Serializable
+from urlab_client.values.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):

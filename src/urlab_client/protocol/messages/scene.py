@@ -23,8 +23,8 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.scene_types import ActorHierarchyNode
-from urlab_client.protocol.serializable import Serializable
+from urlab_client.values.plain import Serializable
+from urlab_client.values.scene_types import ActorHierarchyNode
 
 
 class LevelReply(Reply, kw_only=True):

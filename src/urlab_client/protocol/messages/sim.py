@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
+from urlab_client.enums import PIEState
 from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Effect, Op, Reply, Request, doc
-from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.session import HelloOk
 
 

@@ -19,7 +19,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.types import CameraPose
+from urlab_client.values.types import CameraPose
 
 
 class CameraReply(Reply, kw_only=True):

@@ -13,10 +13,9 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import IDENTITY
 from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.limits import Limits
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3
 
 ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 UNIT_SCALE: Final[Vec3] = (1.0, 1.0, 1.0)
@@ -64,15 +63,7 @@ class Mesh(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
 
 class ConversionSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a static mesh becomes a MuJoCo body.
-
-    Attributes:
-        static: No free joint: the body is fixed.
-        complex_mesh: Convex decomposition instead of one hull.
-        coacd_threshold: Concavity threshold of that decomposition.
-        driven_by_unreal: Mocap body that follows the actor.
-        friction: Sliding, torsional, rolling.
-    """
+    """How a static mesh becomes a MuJoCo body."""
 
     static: bool = False
     complex_mesh: bool = False

@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.values.names import did_you_mean
 
 BUNDLED_PREFIX: Final = "bundled:"
 """How a saved level names a bundled model, whose path differs from machine to machine."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from urlab_client.protocol.enums import StepMode
+from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
@@ -28,9 +28,9 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelChunk,
     UploadModelManifest,
 )
-from urlab_client.protocol.names import is_file_name
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
+from urlab_client.values.names import is_file_name
 
 DOCUMENT: Final = "model.xml"
 """Name of the document when it is imported; no other file may have it."""
@@ -114,9 +114,6 @@ class Uploads:
 
         Returns:
             Its id, whether the document is needed, and the names of the assets that are.
-
-        Raises:
-            Refusal: `bad_request`, `payload_too_large`; `internal_error` if nothing can be stored.
         """
         assets, total_bytes = manifest.assets, manifest.total_bytes
         _check_hash(manifest.xml_sha256, "xml_sha256")
@@ -208,9 +205,6 @@ class Uploads:
 
         Yields:
             The document, and the requested step mode.
-
-        Raises:
-            Refusal: `bad_request`, with the upload still open; `unknown_upload`.
         """
         if not upload_id:
             raise Refusal("bad_request", "upload_id is empty")

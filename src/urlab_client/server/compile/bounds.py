@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import MODEL_FILE, compiled_file
-from urlab_client.protocol.base import Vec3
-from urlab_client.protocol.rotation import rotate
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.importer import mujoco_messages, one_line
 from urlab_client.server.compile.static_meshes import add_mesh
 from urlab_client.server.refusal import CompileFailed
+from urlab_client.values.rotation import Vec3, rotate
 
 Floats = NDArray[np.float64]
 

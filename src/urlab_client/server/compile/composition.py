@@ -8,11 +8,11 @@ from typing import Final
 import mujoco
 
 from urlab_client._mujoco import merge_assets
-from urlab_client.protocol.rotation import wxyz
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
 from urlab_client.server.compile.static_meshes import add_light, add_static_mesh
+from urlab_client.values.rotation import wxyz
 
 
 def compose(

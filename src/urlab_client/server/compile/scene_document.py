@@ -14,11 +14,11 @@ from xml.etree import ElementTree as ET
 import mujoco
 
 from urlab_client._mujoco import flat_model
-from urlab_client.protocol.rotation import wxyz
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.compile.composition import aims_at_world, attachable, empty_scene, populate
 from urlab_client.server.compile.mjcf_options import copy_options
+from urlab_client.values.rotation import wxyz
 
 _FILE: Final = re.compile(r'\b(file\w*)="([^"]*)"')
 

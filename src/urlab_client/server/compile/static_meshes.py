@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import mujoco
 
-from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh
 from urlab_client.server.assets.decomposition import convex_parts
+from urlab_client.values.rotation import rotate, wxyz
 
 FULL_BRIGHTNESS: Final = 5000.0
 """Intensity that corresponds to MuJoCo's full diffuse colour; the engine's default."""

@@ -6,10 +6,9 @@ import math
 from collections.abc import Iterable
 from ctypes import c_float
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import euler_to_quat, normalized
 from urlab_client.server.assets.actors import UNIT_SCALE
 from urlab_client.server.refusal import Refusal
+from urlab_client.values.rotation import Quat, Vec3, euler_to_quat, normalized
 
 
 def require(value: str, name: str) -> None:

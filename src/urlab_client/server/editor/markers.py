@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.server.limits import Limits
+from urlab_client.values.rotation import Quat, Vec3
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -135,9 +135,7 @@ class Drawings:
         """Draw.
 
         Args:
-            primitives: What to draw.
             ttl: Seconds to live; 0 for the next frame alone, negative until cleared.
-            in_play: In the play world, rather than the edited one.
         """
         now = self._clock()
         expires = math.inf if ttl < 0.0 else now + ttl if ttl > 0.0 else None

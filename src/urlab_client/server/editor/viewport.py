@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import euler_to_quat, normalized, quat_to_euler, rotate, swap_frame
+from urlab_client.values.rotation import Quat, Vec3, euler_to_quat, normalized, quat_to_euler, rotate, swap_frame
 
 ASPECT: Final = 16.0 / 9.0
 """Width by height of the viewport."""

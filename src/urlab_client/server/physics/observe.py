@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.enums import ObservationLevel
 from urlab_client.protocol.base import INT32_MAX
-from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import EntityIndex
@@ -142,7 +142,6 @@ class Observer:
         """Prepare for a scene.
 
         Args:
-            scene: The scene.
             controls: `Articulations.controls` of the engine that steps it; holds the twists.
             channels: The user channels; None for none.
         """
@@ -159,9 +158,7 @@ class Observer:
         """Return the fields that all replies and messages with a state share.
 
         Args:
-            level: Which fields the articulations have.
             time: `mjData.time`, seconds.
-            step: Step counter of the session.
         """
         return StateFields(
             time=time,

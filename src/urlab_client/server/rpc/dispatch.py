@@ -15,9 +15,9 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 import msgspec
 from msgspec import Struct
 
+from urlab_client.enums import Transport
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.enums import Transport
 from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS
@@ -124,12 +124,7 @@ class Dispatcher:
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Create the dispatcher of a server.
-
-        Args:
-            core: State that the handlers share.
-            table: The handlers.
-        """
+        """Create the dispatcher of a server."""
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)

@@ -16,9 +16,8 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
-from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.topics import STATE_FULL, TopicKind
@@ -27,6 +26,7 @@ from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.streams.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
 from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
 from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
@@ -82,12 +82,7 @@ class Tick:
 
 
 class Broadcast:
-    """Turns the ticks of one play session into messages.
-
-    Attributes:
-        running: The simulation.
-        full_wanted: Whether the snapshot is subscribed to.
-    """
+    """Turns the ticks of one play session into messages."""
 
     def __init__(
         self,
@@ -98,9 +93,7 @@ class Broadcast:
         """Prepare the messages of a scene; `want` selects which are encoded.
 
         Args:
-            running: The simulation.
             hand_over: Passes a tick to the sending thread; called under the engine's lock.
-            memory: Shared memory that also gets snapshots, when it wants them.
         """
         self.running = running
         self._hand_over = hand_over

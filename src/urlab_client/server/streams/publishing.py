@@ -16,13 +16,13 @@ from typing import Any, Final
 
 import zmq
 
-from urlab_client._uninterrupted import uninterrupted
-from urlab_client.protocol.control_messages import CameraEndpoint
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client._platform.signals import uninterrupted
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
+from urlab_client.server.streams.control_messages import CameraEndpoint
 from urlab_client.server.streams.streamed_commands import StreamedCommand, read_commands
 from urlab_client.server.system.health import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
@@ -82,14 +82,9 @@ class StreamServer:
         """Bind the sockets; `start` begins to serve.
 
         Args:
-            cameras: Returns the endpoints of a scene's cameras, for the info stream.
             health: Notified when the thread dies.
-            host: IP address of the interface.
             state_port: TCP port; 0 selects a free port, as for the other ports.
-            ctrl_port: TCP port.
-            info_port: TCP port.
             curve_keys: Who may connect; None for anyone who can reach the interface.
-            memory: Shared memory that also gets the snapshots.
 
         Raises:
             PortInUse: A port is in use.

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from urlab_client._whole_files import write_whole
+from urlab_client._platform.files import write_whole
 from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.system.health import Health, ended
@@ -24,8 +24,6 @@ class Registration:
         """Configure the registration; `start` writes the file.
 
         Args:
-            directory: The registry.
-            describe: Returns the contents of the file.
             health: Notified when the thread dies.
         """
         self._directory = directory

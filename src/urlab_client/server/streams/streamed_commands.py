@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 
 from urlab_client._mujoco import actuator_count, control_counts, control_starts
-from urlab_client.protocol.control_messages import (
+from urlab_client.server.physics.controllers import ArticulationControl
+from urlab_client.server.streams.control_messages import (
     ActuatorInfo,
     CameraEndpoint,
     ControlPayload,
     JointGains,
     decode_gains,
 )
-from urlab_client.server.physics.controllers import ArticulationControl
 
 NO_LIMIT: Final = 100.0
 """Control range of an actuator without one."""
@@ -40,7 +40,6 @@ class Actuators:
         """Store set-points. Unknown ids are ignored; an actuator with several inputs gets its first.
 
         Args:
-            command: The set-points.
             owned: Returns whether an articulation is owned by a client that drives it by requests; its set-points are
                 ignored, too.
         """

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Final, TypeVarTuple
 
-from urlab_client._background import daemon
+from urlab_client._platform.threads import daemon
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -82,8 +82,6 @@ class Health:
         """Return a daemon thread, not started, whose death by an exception is reported.
 
         Args:
-            name: Its name.
-            run: Its body.
             arguments: Arguments of `run`.
             on_death: Called with the message after the report, on that thread, to fail what waits for it.
         """

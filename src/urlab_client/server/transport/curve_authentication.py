@@ -18,8 +18,8 @@ from typing import Final
 import zmq
 import zmq.utils.z85
 
+from urlab_client.errors import URLabError
 from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
-from urlab_client.protocol.errors import URLabError
 from urlab_client.server.system.health import Health
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")

@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 
 import zmq
 
-from urlab_client._uninterrupted import uninterrupted
+from urlab_client._platform.signals import uninterrupted
 from urlab_client.server.limits import Limits
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.serving_thread import ServingThread

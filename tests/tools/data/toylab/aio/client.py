@@ -10,7 +10,7 @@ from typing import Self
 from toylab.aio.namespaces import Scene
 from toylab.aio.robots import Body, Controller, Robot, make_controller
 from toylab.aio.session import DEFAULT, Session, Timeout
-from urlab_client.protocol.names import NameMap
+from urlab_client.values.names import NameMap
 
 __all__ = ["Client"]
 

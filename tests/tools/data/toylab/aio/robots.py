@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from toylab.aio.session import DEFAULT, Session, Timeout
-from urlab_client.protocol.names import NameMap
+from urlab_client.values.names import NameMap
 
 if TYPE_CHECKING:
     from toylab.aio.streams import Stream

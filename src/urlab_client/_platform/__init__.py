@@ -1,0 +1,1 @@
+"""What touches the operating system: threads, child processes, signals, files, processors, Windows."""

@@ -1,0 +1,1 @@
+"""Values that the clients return, and their forms as plain data."""

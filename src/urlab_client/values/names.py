@@ -1,0 +1,254 @@
+"""Names: look-up by name or alias, which articulation a compiled name belongs to, and names of files. No I/O.
+
+For the wrappers of both clients, whose maps of articulations, joints and so on are `NameMap`s, and for uploads.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
+
+T = TypeVar("T")
+D = TypeVar("D")
+
+WINDOWS_DEVICES: Final = frozenset(
+    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
+)
+"""Names that Windows keeps for devices, whatever follows their first dot."""
+
+_LISTED = 20
+_NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
+_MAX_FILE_NAME_BYTES: Final = 240
+
+
+class UnknownName(KeyError):
+    """A name that a `NameMap` does not have, or an alias of several of its entries.
+
+    `args[0]` is the message, as `str()` gives it.
+
+    Attributes:
+        kind: What was looked for, for example `articulation`.
+        name: The name that was asked for.
+        matches: The keys an ambiguous alias could mean; empty otherwise.
+        known: All keys, in the map's order.
+        suggestions: Keys and aliases spelled alike, best first.
+        owner: What it was looked for in, for example the key of an articulation; empty for the whole world.
+    """
+
+    kind: str
+    name: object
+    matches: tuple[str, ...]
+    known: tuple[str, ...]
+    suggestions: tuple[str, ...]
+    owner: str
+
+    def __init__(
+        self,
+        kind: str,
+        name: object,
+        matches: tuple[str, ...],
+        known: tuple[str, ...],
+        suggestions: tuple[str, ...],
+        *,
+        owner: str = "",
+    ) -> None:
+        self.kind = kind
+        self.name = name
+        self.matches = matches
+        self.known = known
+        self.suggestions = suggestions
+        self.owner = owner
+        super().__init__(self._message())
+
+    def _message(self) -> str:
+        if self.matches:
+            what = f"{self.kind} {self.name!r}{f' of {self.owner}' if self.owner else ''}"
+            return f"{what} is ambiguous: it could mean {_listed(self.matches, 'or')}."
+        text = f"{f'{self.owner} has ' if self.owner else ''}no {self.kind} {self.name!r}."
+        if self.suggestions:
+            text += f" Did you mean {_listed(self.suggestions, 'or')}?"
+        return f"{text} Known: {_listed(self.known, 'and')}." if self.known else f"{text} There are none."
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # a plain KeyError puts it in quotes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        kind = functools.partial(type(self), owner=self.owner)
+        return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str], *, owner: str = "") -> UnknownName:
+    """Return the exception for a name that is none of those, with the ones spelled alike."""
+    names = tuple(known)
+    close = difflib.get_close_matches(name, names) if isinstance(name, str) else []
+    return UnknownName(kind, name, (), names, tuple(close), owner=owner)
+
+
+def is_file_name(name: str) -> bool:
+    """Return whether a name is that of a file on every system: no path, no device, not too long."""
+    return (
+        name not in ("", ".", "..")
+        and not any(character in '/\\:*?"<>|' or ord(character) < ord(" ") for character in name)
+        and len(name.encode()) <= _MAX_FILE_NAME_BYTES
+        and name.partition(".")[0].rstrip(" ").upper() not in WINDOWS_DEVICES
+    )
+
+
+def cleaned_name(name: str) -> str:
+    """Return a name as the beta makes it public: ASCII letters, digits and underscores, not beginning with a digit."""
+    cleaned = _NOT_A_NAME.sub("_", name)
+    return f"_{cleaned}" if cleaned[:1].isdigit() else cleaned
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a sentence, after a blank, that suggests the names spelled most alike; empty where none is."""
+    close = difflib.get_close_matches(name, list(known))
+    return f" Did you mean {_listed(close, 'or')}?" if close else ""
+
+
+def _listed(names: Sequence[str], conjunction: str) -> str:
+    shown = [repr(name) for name in names[:_LISTED]]
+    if len(names) > _LISTED:
+        return f"{', '.join(shown)} {conjunction} {len(names) - _LISTED} more"
+    return f" {conjunction} ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
+
+
+class NameMap(dict[str, T]):
+    """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
+
+    `map[name]`, `map.get(name)` and `name in map` agree: an exact key first, else an alias. Length, iteration, `keys`,
+    `items` and comparison are those of a dict and know exact keys only. `copy()`, `|` and `dict(map)` make plain
+    dicts, which can be changed.
+
+    Args:
+        items: The entries by exact key.
+        aliases: Per alias the keys it stands for, for example a MJCF model name and its instances.
+        kind: What the entries are, for messages.
+        owner: What has them, for messages; empty for the whole world.
+
+    Raises:
+        ValueError: If an alias stands for a key that is not there.
+    """
+
+    kind: str
+    """What the entries are."""
+    owner: str
+    """What has them; empty for the whole world."""
+
+    def __init__(
+        self,
+        items: Mapping[str, T] | Iterable[tuple[str, T]] = (),
+        aliases: Mapping[str, Sequence[str]] | None = None,
+        kind: str = "entry",
+        owner: str = "",
+    ) -> None:
+        super().__init__(items)
+        self.kind = kind
+        self.owner = owner
+        self._aliases: dict[str, tuple[str, ...]] = {}
+        for alias, keys in (aliases or {}).items():
+            for key in keys:
+                if not super().__contains__(key):
+                    raise ValueError(f"alias {alias!r} stands for {key!r}, but no {kind} has that name")
+            if keys and not super().__contains__(alias):
+                self._aliases[alias] = tuple(dict.fromkeys(keys))
+
+    @property
+    def aliases(self) -> dict[str, tuple[str, ...]]:
+        """The keys that each alias stands for; aliases that are also keys are left out."""
+        return dict(self._aliases)
+
+    def _key(self, name: object) -> str | None:
+        """Return the key that `name` or its alias means, None when there is none or more than one."""
+        if super().__contains__(name):
+            return cast("str", name)
+        match self._aliases.get(cast("str", name)):
+            case (key,):
+                return key
+            case _:
+                return None
+
+    def __missing__(self, name: str) -> T:
+        key = self._key(name)
+        if key is None:
+            raise self._unknown(name)
+        return super().__getitem__(key)
+
+    def __contains__(self, name: object) -> bool:
+        return self._key(name) is not None
+
+    @overload
+    def get(self, key: str, default: None = None, /) -> T | None: ...
+    @overload
+    def get(self, key: str, default: T, /) -> T: ...
+    @overload
+    def get(self, key: str, default: D, /) -> T | D: ...
+    def get(self, key: str, default: Any = None, /) -> Any:
+        """Return the entry that `key` or its alias means, else `default`."""
+        found = self._key(key)
+        return default if found is None else super().__getitem__(found)
+
+    def _unknown(self, name: object) -> UnknownName:
+        known = tuple(self)
+        matches = self._aliases.get(cast("str", name), ())
+        unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
+        suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
+        return UnknownName(self.kind, name, matches, known, tuple(suggestions), owner=self.owner)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return NameMap, (dict(self), self._aliases, self.kind, self.owner)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""
+        return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")
+
+    if not TYPE_CHECKING:  # any call is refused, whatever the parameters of the overridden method
+        __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
+
+
+def owner_of(name: str, prefixes: AbstractSet[str]) -> str | None:
+    """Return the prefix that a compiled name `<prefix>_<local name>` carries, None when it carries none.
+
+    The longest wins: `robot_2_elbow` belongs to `robot_2`, not to `robot`, when both exist. Only names are compared;
+    a name that an unprefixed body happens to share with a prefix cannot be told apart here.
+    """
+    end = name.rfind("_", 0, len(name) - 1)
+    while end > 0:
+        if name[:end] in prefixes:
+            return name[:end]
+        end = name.rfind("_", 0, end)
+    return None
+
+
+def split_prefix(names: Iterable[str], prefixes: Collection[str]) -> list[tuple[str | None, str]]:
+    """Split compiled names into owner and local name, as `owner_of` does for one.
+
+    Args:
+        names: Compiled names.
+        prefixes: Articulation keys, without the trailing underscore.
+
+    Returns:
+        Per name, in order, the prefix and what follows its underscore; `(None, name)` for a name that carries none.
+    """
+    known = frozenset(prefixes)
+    owned = ((owner_of(name, known), name) for name in names)
+    return [(owner, name if owner is None else name[len(owner) + 1 :]) for owner, name in owned]
+
+
+def compiled_names(name: str, prefixes: Mapping[str, str]) -> set[str]:
+    """Return what a user may mean by a name in the compiled model, besides that very name.
+
+    Args:
+        name: The name an articulation's author gave, or that with the articulation's key and `_` in front.
+        prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
+    """
+    local = {f"{prefix}_{name}" for prefix in prefixes.values()}
+    keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
+    return local | keyed
