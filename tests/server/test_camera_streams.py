@@ -14,10 +14,10 @@ import zmq
 from waiting import eventually
 from wire import Wire
 
-from urlab_client.protocol.pixels import camera_header
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.streams import camera_streams
+from urlab_client.values.pictures import camera_header
 
 ROBOT = """
 <mujoco model="robot">
