@@ -33,9 +33,6 @@ _SILENT = 0.9  # of that time, and nothing refused the attempt
 _RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
 
-NOTICED_S: Final = (HEARTBEAT_MS + SILENCE_MS) / 1000
-"""Seconds after which a connection to a silent peer is closed."""
-
 FAILED_HANDSHAKES: Final = (
     zmq.Event.HANDSHAKE_FAILED_AUTH,
     zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
