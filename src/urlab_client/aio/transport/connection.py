@@ -152,9 +152,9 @@ class Connection:
         *,
         tell: Tell | None = None,
     ) -> None:
-        self.endpoint = endpoint
+        self.endpoint: str = endpoint
         self._loop = loop
-        self._socket = socket
+        self.socket: Socket = socket
         self._note = note
         self._attempts = Attempts(loop.time())
         self._retrying = False
@@ -185,7 +185,7 @@ class Connection:
 
     def watch(self, on_readable: Callable[[], object], *, on_demand: bool = False) -> Watch:
         """Call `on_readable` whenever the socket is readable; see `watch_socket`."""
-        watch = watch_socket(self._loop, self._socket, on_readable, on_demand=on_demand)
+        watch = watch_socket(self._loop, self.socket, on_readable, on_demand=on_demand)
         self._watches.append(watch)
         return watch
 
@@ -213,8 +213,8 @@ class Connection:
         if self._closed:
             return
         with contextlib.suppress(zmq.ZMQError):  # ZeroMQ has already dropped the endpoint
-            self._socket.disconnect(self.endpoint)
-        self._socket.connect(self.endpoint)
+            self.socket.disconnect(self.endpoint)
+        self.socket.connect(self.endpoint)
 
     def close(self) -> None:
         """Close the socket. Idempotent."""
@@ -223,9 +223,9 @@ class Connection:
         self._closed = True
         for watch in self._watches:
             watch.close()
-        self._socket.disable_monitor()
+        self.socket.disable_monitor()
         self._monitor.close(linger=0)
-        self._socket.close(linger=0)
+        self.socket.close(linger=0)
 
 
 class Attempts:
