@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -167,15 +166,13 @@ class EnvEpisode:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 
-    async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
-        """Apply an action for `n_substeps` and return the observation after it.
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+        """Apply set-points for `n_substeps` and return the observation after them.
 
-        `forces` act on bodies during the action, N, world frame, shape (3,).
+        Args:
+            set_points: Set-points of each articulation, shape (n_ctrl,).
+            forces: Forces on bodies meanwhile, N, world frame, shape (3,).
         """
-        return await self.act(self.mapping.set_points(action), forces)
-
-    async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
-        """Step like `step`, given the set-points of each articulation, shape (n_ctrl,)."""
         for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
@@ -357,7 +354,7 @@ def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | Non
     """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
     if settings.render_mode is None:
         return None
-    if settings.render_camera is not None:
+    if settings.render_camera:
         return settings.render_camera
     for key, articulation in client.articulations.items():
         for name, view in articulation.cameras.items():
