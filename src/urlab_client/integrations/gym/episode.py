@@ -16,7 +16,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._episode_variation import variation_of
+from urlab_client.integrations._variation import WireVariation, server_variation
 from urlab_client.integrations.gym.settings import EpisodeSettings
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
@@ -28,7 +28,6 @@ from urlab_client.integrations.gym.spaces import (
     with_cameras,
 )
 from urlab_client.integrations.gym.task import Start, States, TaskScene, add_observed, with_task
-from urlab_client.integrations.gym.wire_variation import WireVariation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
@@ -101,7 +100,7 @@ class EnvEpisode:
         self._goal: dict[str, Floats] = {}
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
-        self._variation = variation_of(client, model, layouts)
+        self._variation = server_variation(client, model, layouts)
         self.over_wire: WireVariation | None = None
         if self._variation is None and self.randomise is not None and self.randomise.vary:
             before = None if earlier is None else earlier.over_wire
