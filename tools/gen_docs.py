@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -329,8 +330,8 @@ def exports(module: str) -> dict[str, str]:
     places = {name: imported.get(name, f"{module}.{name}") for name in names}
     for name, place in places.items():
         package, _, own = place.rpartition(".")
-        if package != module and source(package).name == "__init__.py":
-            places[name] = exports(package)[own]
+        if package != module and re.search(r"^__all__ = ", source(package).read_text(encoding="utf-8"), re.MULTILINE):
+            places[name] = exports(package).get(own, place)
     return places
 
 
