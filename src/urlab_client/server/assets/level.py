@@ -238,8 +238,10 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
             if confined_to is not None and not confined_to.open_to_clients(file):
                 raise ValueError(f"mesh {file} lies outside the folders that clients may read")
             mesh = msgspec.structs.replace(mesh, file=str(file))
+    shared = _shared(entry)
+    shared["label"] = entry.label or entry.name
     return Actor(
-        **_shared(entry) | {"label": entry.label or entry.name},
+        **shared,
         rotation=normalized(entry.rotation_quat),
         own_tags=entry.tags,
         blueprint=blueprints[entry.blueprint] if entry.blueprint else None,
