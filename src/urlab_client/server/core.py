@@ -46,6 +46,10 @@ from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.threads import Health
 from urlab_client.simulation.appearance import Appearance
 
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
+
 
 class ServerSession:
     """State that the server keeps between requests, apart from the world.
@@ -137,11 +141,6 @@ class DriverLease:
 
     def _holds(self) -> bool:
         return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
-
-
-logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
