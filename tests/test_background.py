@@ -53,7 +53,7 @@ AWAITED = {
     "web/application.py:_pictures": "likewise",
     "web/application.py:_poses": "likewise",
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
-    "integrations/gym/threaded_batch.py:__init__": "a pool, whose results the caller reads",
+    "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
     "cli/mcp.py:_serve_stdio": "waits for the task and raises its error",
 }
 """Functions that make tasks or threads without the helpers, and who sees their end."""

@@ -291,6 +291,22 @@ def test_without_articulations_there_are_no_rows(play: Play, tmp_path: Path) -> 
     assert len(snapshot(tick).entities) == 1
 
 
+def test_a_message_that_fails_costs_the_others_nothing(
+    play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_: JointRow) -> bytes:
+        raise ValueError("no such row")
+
+    monkeypatch.setattr(JointRow, "encode", fail)
+    bench = play("bot", unpaused=True)
+    socket = bench.subscribe(b"")
+    tick = next(ticks(socket))
+    assert [topic for topic, _ in tick] == [*(row for row in ROWS if row != b"bot/joint/j"), b"state/full"]
+    assert snapshot(tick).per_articulation.keys() == {"bot"}
+    assert "no such row" in caplog.text
+    assert bench.server.failure is None
+
+
 # What it costs
 
 
