@@ -188,7 +188,7 @@ class Follower(ClientObserver):
             return None
 
     def _unknown_cameras(self) -> str:
-        """Raise if cameras are missing."""
+        """Return which requested cameras are missing; empty if none."""
         wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
         missing = [name for name in wanted if self._camera(name) is None]
         there = ", ".join(self._every_camera()) or "none"
