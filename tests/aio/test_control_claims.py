@@ -19,7 +19,7 @@ from urlab_client import (
 from urlab_client.aio import URLabClient
 from urlab_client.aio.control import process_owner
 from urlab_client.protocol.messages.control import ReleaseControl
-from urlab_client.web.explained_errors import explain_error
+from urlab_client.web.endpoints import explain_error
 
 OURS = process_owner()
 

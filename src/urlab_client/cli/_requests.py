@@ -11,7 +11,7 @@ from typing import Any
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from urlab_client.web.route_group import JOB
+from urlab_client.web.endpoints import JOB
 
 log: logging.Logger = logging.getLogger("urlab_client.web")
 

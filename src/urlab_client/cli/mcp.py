@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import secrets
 import sys
@@ -11,13 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, count, make_client, one_of, seconds
-from urlab_client.cli._common import CommandError, import_mujoco
+from urlab_client.cli._common import CommandError, import_mujoco, sigterm_interrupts
 from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
+    from urlab_client.console.session import ConsoleSession
     from urlab_client.mcp import Agent
     from urlab_client.web import Access
 
@@ -128,9 +130,7 @@ def run(arguments: McpArguments) -> int:
     if arguments.models is not None and not arguments.models.is_dir():
         raise CommandError(f"--models {arguments.models}: no such folder")
     import_mujoco()
-    from urlab_client.cli._pages import graceful_exit
-
-    with graceful_exit():
+    with contextlib.suppress(KeyboardInterrupt), sigterm_interrupts():
         asyncio.run(_serve(arguments))
     return 0
 
@@ -153,42 +153,38 @@ def _check_permissions(arguments: McpArguments) -> None:
 
 async def _serve(arguments: McpArguments) -> None:
     from urlab_client.aio import URLabClient
+    from urlab_client.console.session import ConsoleSession
     from urlab_client.mcp import Agent, Limits
-    from urlab_client.web import Access, app
+    from urlab_client.mcp.transports import serve_stdio
 
-    access = Access(hosts=host_names(arguments))
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
         if arguments.address.startswith("sim://"):  # a failure here is final, whereas a running server may start later
             await client.discover()
-        console = app(
-            client,
-            access=access,
-            handshake=None if arguments.handshake is None else arguments.handshake.read_bytes,
-            recordings=arguments.recordings,
-        )
+        handshake = None if arguments.handshake is None else arguments.handshake.read_bytes
+        session = ConsoleSession(client, recordings=arguments.recordings, handshake=handshake)
         limits = Limits(
             drive=arguments.allow_drive,
             edit=arguments.allow_edit,
             sim_seconds=arguments.max_seconds,
             wall_seconds=arguments.max_wall,
         )
-        agent = Agent(console, limits, models=_models(arguments.models))
-        async with console.router.lifespan_context(console):
+        agent = Agent(session, limits, models=_models(arguments.models))
+        async with session.open():
             if arguments.http:
-                await _serve_http(arguments, agent, console, access)
+                await _serve_http(arguments, agent, session)
+            elif arguments.console:
+                await _serve_stdio_and_console(arguments, agent, session)
             else:
-                await _serve_stdio(arguments, agent, console, access)
+                await serve_stdio(agent)
 
 
-async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_stdio_and_console(arguments: McpArguments, agent: Agent, session: ConsoleSession) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import serve_stdio
 
-    if not arguments.console:
-        await serve_stdio(agent)
-        return
+    access, console = _console(arguments, session)
     with bound(arguments.host, _console_port(arguments)) as listener:
         served = asyncio.create_task(serve_stdio(agent))
         ended = asyncio.Event()
@@ -203,16 +199,25 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
         await served  # raises its failure
 
 
+def _console(arguments: McpArguments, session: ConsoleSession) -> tuple[Access, Starlette]:
+    from urlab_client.web import Access
+    from urlab_client.web.application import application_of
+
+    access = Access(hosts=host_names(arguments))
+    return access, application_of(session, access)
+
+
 def _console_port(arguments: McpArguments) -> int:
     # A second agent on this machine serves a console, too. A port that was given is another object than the default.
     return 0 if arguments.port is AGENT_PORT else arguments.port
 
 
-async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_http(arguments: McpArguments, agent: Agent, session: ConsoleSession) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import http_application
     from urlab_client.web import Access
 
+    access, console = _console(arguments, session)
     given = os.environ.get(_TOKEN, "").split()
     tokens = given or [secrets.token_urlsafe(32) for _ in range(arguments.agents)]
     with bound(arguments.host, arguments.port) as listener:

@@ -12,13 +12,14 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio.to_thread
 from msgspec import Struct
 
 from urlab_client._extras import MissingExtra, need
-from urlab_client.console.stoppable import Progress, stoppable
+from urlab_client.console.file_jobs import Progress, run_job, write_chunks
+from urlab_client.console.messages import Conversion, RunningRecording
 from urlab_client.errors import URLabError
 
 if TYPE_CHECKING:
@@ -36,20 +37,6 @@ _LARGEST_FILE = 4 << 30
 _CAMERA_HZ = 30.0
 
 
-class RunningRecording(Struct):
-    """The recording that is under way: its file's name, seconds of real time, states and pictures so far, bytes.
-
-    `failed` says that it can no longer be written.
-    """
-
-    name: str
-    seconds: float
-    states: int
-    pictures: int
-    bytes: int
-    failed: bool
-
-
 class RecordingView(Struct):
     """One recording of the folder; `at` is Unix time in seconds."""
 
@@ -58,13 +45,22 @@ class RecordingView(Struct):
     at: float
 
 
-class Conversion(Struct):
-    """A recording that is being converted for download, and how much of it has been read, 0 to 1."""
+class RecordingContents(Struct):
+    """What is in a recording: length in seconds, robots, cameras, and why the file is incomplete, if it is.
+
+    `lost` counts states and pictures that came too fast to be written. `unavailable` holds the formats that the
+    recording cannot be converted to here, each with what is missing.
+    """
 
     name: str
-    kind: str
-    camera: str
-    share: float = 0.0
+    bytes: int
+    at: float
+    seconds: float
+    robots: list[str]
+    cameras: list[str]
+    damage: str
+    lost: int
+    unavailable: dict[str, str]
 
 
 class Recordings:
@@ -83,7 +79,7 @@ class Recordings:
         self._began = 0.0
         self._task: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
-        self._described: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._described: dict[str, tuple[float, RecordingContents]] = {}
 
     @property
     def running(self) -> RunningRecording | None:
@@ -159,7 +155,7 @@ class Recordings:
             raise ValueError("no recording runs, so the outcome of an episode cannot be recorded: start one first")
         await self._recorder.mark(outcome)
 
-    async def stop(self) -> dict[str, Any]:
+    async def stop(self) -> RecordingContents:
         """End the recording and describe it.
 
         Raises:
@@ -207,7 +203,7 @@ class Recordings:
             raise KeyError(f"no recording is called {name!r}")
         return file
 
-    async def describe(self, name: str) -> dict[str, Any]:
+    async def describe(self, name: str) -> RecordingContents:
         """Return name, size, length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
         `unavailable` holds the formats that it cannot be converted to here, each with what is missing.
@@ -246,12 +242,12 @@ class Recordings:
 
             self.conversions.append(conversion)
             try:
-                await stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
+                await run_job(lambda told: _convert(file, target, kind, camera, told), progress)
             finally:
                 self.conversions.remove(conversion)
             yield target
 
-    async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> dict[str, Any]:
+    async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> RecordingContents:
         """Add a recording that was made elsewhere, and describe it.
 
         Raises:
@@ -266,14 +262,8 @@ class Recordings:
             raise ValueError(f"there is a recording {name!r} already")
         partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # concurrent uploads may have the same name
         try:
-            size = 0
-            with partial.open("xb") as file:
-                async for chunk in chunks:
-                    size += len(chunk)
-                    if size > _LARGEST_FILE:
-                        raise ValueError(f"a recording is at most {_LARGEST_FILE} bytes")
-                    await anyio.to_thread.run_sync(file.write, chunk)
-            await stoppable(lambda told: _described(partial, told))
+            await write_chunks(partial, chunks, _LARGEST_FILE, "a recording")
+            await run_job(lambda told: _described(partial, told))
             if target.exists():  # by now
                 raise ValueError(f"there is a recording {name!r} already")
             partial.rename(target)
@@ -305,20 +295,20 @@ def open_run(file: Path) -> Run:
     return read_run(file)
 
 
-def _described(file: Path, progress: Progress | None = None) -> dict[str, Any]:
+def _described(file: Path, progress: Progress | None = None) -> RecordingContents:
     summary = open_run(file).summary(progress)
     cameras = [name.removeprefix("/camera/") for name in summary.topics if name.startswith("/camera/")]
-    return {
-        "name": file.name,
-        "bytes": file.stat().st_size,
-        "at": file.stat().st_mtime,
-        "seconds": round(summary.duration_s, 3),
-        "robots": [name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
-        "cameras": [name for name in cameras if not name.endswith("/calibration")],
-        "damage": summary.damage,
-        "lost": summary.dropped_states + summary.dropped_frames,
-        "unavailable": _unavailable(),
-    }
+    return RecordingContents(
+        name=file.name,
+        bytes=file.stat().st_size,
+        at=file.stat().st_mtime,
+        seconds=round(summary.duration_s, 3),
+        robots=[name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
+        cameras=[name for name in cameras if not name.endswith("/calibration")],
+        damage=summary.damage,
+        lost=summary.dropped_states + summary.dropped_frames,
+        unavailable=_unavailable(),
+    )
 
 
 def _unavailable() -> dict[str, str]:

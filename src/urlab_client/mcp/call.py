@@ -123,7 +123,7 @@ class Call:
         Raises:
             URLabConnectionError: The session did not open; the message says why.
         """
-        with self.console.bell() as changed, anyio.move_on_after(_CONNECT_S):
+        with self.console.view.watch() as changed, anyio.move_on_after(_CONNECT_S):
             while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
                 changed.clear()
                 await changed.wait()
@@ -175,7 +175,7 @@ class Call:
             raise
         finally:
             reporting.cancel()
-            self.console.tell()
+            self.console.view.notify()
 
     async def _report(self) -> None:
         start = self.client.sim_time

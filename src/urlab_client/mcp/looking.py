@@ -88,6 +88,6 @@ async def log(call: Call, since: int | None = None) -> Log:
         since: Number of the last entry that you know. Without it you get the entries since your last call of `log`.
     """
     start = call.caller.told if since is None else since
-    entries = [entry for entry in call.console.entries if entry.n > start]
+    entries = call.console.view.entries_after(start)
     call.caller.told = entries[-1].n if entries else start
     return Log(entries=entries, next=call.caller.told)

@@ -130,4 +130,4 @@ async def record(call: Call, action: Literal["start", "stop"], cameras: bool = F
     """
     if action == "start":
         return Recorded(await call.console.recordings.start(cameras=cameras), running=True)
-    return msgspec.convert(await call.console.recordings.stop(), Recorded)
+    return msgspec.convert(await call.console.recordings.stop(), Recorded, from_attributes=True)
