@@ -1,6 +1,7 @@
 """Python clients for URLab, the Unreal plugin that embeds MuJoCo.
 
-`URLabClient` in this package is the blocking client; the async client is `urlab_client.aio.URLabClient`.
+`URLabClient` in this package is the blocking client; the async client is `urlab_client.aio.URLabClient`. Here are the
+names that most programs need; `urlab_client.errors`, `.types`, `.events` and `.enums` have all of them.
 Names are loaded on first access, so importing the package is cheap.
 """
 
@@ -8,17 +9,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from urlab_client.aio.client_types import (
-        CallOutcome,
-        CallRecord,
-        ClientConfig,
-        Diagnosis,
-        Finding,
-        Resync,
-        ServerInfo,
-        Verdict,
-    )
-    from urlab_client.aio.observer import ClientObserver
     from urlab_client.enums import (
         ActuatorType,
         CameraMode,
@@ -31,116 +21,26 @@ if TYPE_CHECKING:
         Transport,
     )
     from urlab_client.errors import (
-        ActorHierarchyFailed,
-        AddQuickConvertFailed,
-        AuthenticationFailed,
-        BadMode,
-        BadRequest,
-        BadValue,
         ClientClosed,
-        ConcurrentReadError,
         ConnectionLost,
         ControlClaimed,
-        ControllerSchemaViolation,
-        CreateLevelFailed,
-        DestroyAssetFailed,
-        DestroyFailed,
-        DimMismatch,
-        DuplicateFailed,
-        FindActorsFailed,
-        ForkedError,
-        GameThreadTimeout,
-        GetActorBoundsFailed,
-        HashMismatch,
-        ImportFailed,
-        InternalError,
-        InvalidCount,
-        InvalidMode,
-        LeaseBusy,
-        ListActorsFailed,
-        ListBlueprintsFailed,
-        LoadLevelFailed,
-        MissingField,
-        MissingOp,
-        ModeLocked,
         NoActiveManager,
-        NoBounds,
-        NoController,
-        NoEngine,
-        NoJoints,
-        NoSession,
         NotControlOwner,
-        NotInEditor,
-        NotMocapBody,
-        NotReady,
-        NotSettled,
-        NoTwistController,
-        NoViewport,
-        NoWorld,
         OutcomeUnknown,
-        PathNotReadable,
-        PathNotWritable,
-        PayloadTooLarge,
-        PictureTimeout,
-        ProtocolError,
-        ReadOnlyClient,
-        RecordingAlreadyActive,
-        RecordingNotActive,
-        RemoveQuickConvertFailed,
-        ReplayRequiresStepped,
-        ReplaySessionNotFound,
-        ReplyTooLarge,
-        SaveLevelFailed,
-        SelectFailed,
         ServerRestarted,
         ServerUnreachable,
         SessionTakenOver,
-        SetActorTransformFailed,
-        ShuttingDown,
-        SnapshotFailed,
-        SpawnFailed,
-        StepTimeout,
         StreamOverflow,
-        TooManyCells,
-        UnknownActor,
-        UnknownArticulation,
-        UnknownBody,
-        UnknownJob,
-        UnknownKeyframe,
-        UnknownOp,
-        UnknownUpload,
-        Unsupported,
+        UnknownName,
         URLabConnectionError,
         URLabError,
         URLabPIEError,
         URLabRPCError,
         URLabTimeoutError,
         URLabVersionMismatch,
-        WrongTransport,
     )
-    from urlab_client.protocol.messages.cameras import (
-        CameraDelay,
-        CameraDelayInForce,
-        CameraStreaming,
-        CameraTransports,
-    )
-    from urlab_client.protocol.messages.streams import (
-        CameraSample,
+    from urlab_client.events import (
         ClientEvent,
-        PlayEnded,
-        PlayStarted,
-        RowSample,
-        ServerAnswers,
-        ServerConnected,
-        ServerLost,
-        ServerReconnected,
-        ServerSilent,
-        SessionLost,
-        SessionOpened,
-        StateSnapshot,
-        StreamPolicy,
-        StreamStats,
-        TaskFailed,
     )
     from urlab_client.sync import (
         DEFAULT,
@@ -157,70 +57,36 @@ if TYPE_CHECKING:
         URLabPDController,
         check_address,
     )
-    from urlab_client.values.descriptions import (
-        ActuatorDescription,
-        ArticulationDescription,
-        CameraDescription,
-        ControllerDescription,
-        EntityDescription,
-        JointDescription,
-        Pose,
-        SceneDescription,
-        SensorDescription,
-    )
-    from urlab_client.values.names import UnknownName
-    from urlab_client.values.scene_types import (
-        ActorBounds,
-        ActorHierarchyNode,
+    from urlab_client.types import (
         ActorInfo,
         BlueprintInfo,
-        SceneActor,
-        SceneSnapshot,
-        URLabAsset,
-        URLabBlueprint,
-        URLabLightHandle,
-        URLabSpawnHandle,
-    )
-    from urlab_client.values.types import (
-        CameraPose,
-        Contact,
-        ContactsResult,
-        JobStatus,
-        KeyframeInfo,
-        MocapPose,
+        CameraSample,
+        ClientObserver,
         PIEStartResult,
         PIEStatus,
         RecordingHandle,
         RecordingSummary,
         ReplaySession,
         ReplayStatus,
+        RowSample,
         SimOptions,
-        UploadProgress,
+        StateSnapshot,
+        URLabAsset,
+        URLabBlueprint,
+        URLabLightHandle,
+        URLabSpawnHandle,
     )
 
 __version__: str
 
-# Where a name is looked for, the light modules first. A test holds them against the imports above.
-_HOMES = (
-    "urlab_client.enums",
-    "urlab_client.errors",
-    "urlab_client.values.names",
-    "urlab_client.aio.observer",
-    "urlab_client.aio.client_types",
-    "urlab_client.values.descriptions",
-    "urlab_client.values.scene_types",
-    "urlab_client.values.types",
-    "urlab_client.protocol.messages.cameras",
-    "urlab_client.protocol.messages.streams",
-    "urlab_client.sync",
-)
-_PACKAGES = ("aio", "protocol", "sync")
+# Where a name is looked for, the light modules first. Earlier programs import from here what only these modules list.
+_HOMES = ("enums", "errors", "types", "events", "sync")
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PACKAGES:
+    if name in {"aio", "protocol", *_HOMES}:
         return import_module(f"urlab_client.{name}")
-    if name not in __all__:
+    if name.startswith("_") and name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = _load(name)
     return value
@@ -231,160 +97,61 @@ def _load(name: str) -> Any:
         # Reading the installed metadata costs milliseconds that most programs need not pay.
         return import_module("importlib.metadata").version("urlab-client")
     try:
-        return next(getattr(module, name) for module in map(import_module, _HOMES) if hasattr(module, name))
-    except (ImportError, StopIteration) as error:
+        for home in _HOMES:
+            module = import_module(f"urlab_client.{home}")
+            if name in module.__all__:
+                return getattr(module, name)
+    except ImportError as error:
         # A file is missing or belongs to another package. Failures of a dependency are raised unchanged.
         if found := import_module("urlab_client._installation").conflict():
             raise ImportError(f"cannot load urlab_client.{name}: {found}") from error
         raise
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PACKAGES, *__all__})
+    return sorted({*__all__, "aio", "enums", "errors", "events", "sync", "types"})
 
 
 __all__ = [
     "DEFAULT",
-    "ActorBounds",
-    "ActorHierarchyFailed",
-    "ActorHierarchyNode",
     "ActorInfo",
     "Actuator",
-    "ActuatorDescription",
     "ActuatorType",
-    "AddQuickConvertFailed",
-    "ArticulationDescription",
-    "AuthenticationFailed",
-    "BadMode",
-    "BadRequest",
-    "BadValue",
     "BlueprintInfo",
     "Body",
-    "CallOutcome",
-    "CallRecord",
-    "CameraDelay",
-    "CameraDelayInForce",
-    "CameraDescription",
     "CameraMode",
-    "CameraPose",
     "CameraSample",
-    "CameraStreaming",
     "CameraTiming",
-    "CameraTransports",
     "ClientClosed",
-    "ClientConfig",
     "ClientEvent",
     "ClientObserver",
-    "ConcurrentReadError",
     "ConnectionLost",
-    "Contact",
-    "ContactsResult",
     "ControlClaimed",
     "ControlMode",
-    "ControllerDescription",
     "ControllerKind",
-    "ControllerSchemaViolation",
-    "CreateLevelFailed",
-    "DestroyAssetFailed",
-    "DestroyFailed",
-    "Diagnosis",
-    "DimMismatch",
-    "DuplicateFailed",
-    "EntityDescription",
-    "FindActorsFailed",
-    "Finding",
-    "ForkedError",
-    "GameThreadTimeout",
-    "GetActorBoundsFailed",
-    "HashMismatch",
-    "ImportFailed",
-    "InternalError",
-    "InvalidCount",
-    "InvalidMode",
-    "JobStatus",
     "Joint",
-    "JointDescription",
-    "KeyframeInfo",
-    "LeaseBusy",
-    "ListActorsFailed",
-    "ListBlueprintsFailed",
-    "LoadLevelFailed",
-    "MissingField",
-    "MissingOp",
-    "MocapPose",
-    "ModeLocked",
     "NoActiveManager",
-    "NoBounds",
-    "NoController",
-    "NoEngine",
-    "NoJoints",
-    "NoSession",
-    "NoTwistController",
-    "NoViewport",
-    "NoWorld",
     "NotControlOwner",
-    "NotInEditor",
-    "NotMocapBody",
-    "NotReady",
-    "NotSettled",
     "ObservationLevel",
     "OutcomeUnknown",
     "PIEStartResult",
     "PIEState",
     "PIEStatus",
-    "PathNotReadable",
-    "PathNotWritable",
-    "PayloadTooLarge",
-    "PictureTimeout",
-    "PlayEnded",
-    "PlayStarted",
-    "Pose",
-    "ProtocolError",
-    "ReadOnlyClient",
-    "RecordingAlreadyActive",
     "RecordingHandle",
-    "RecordingNotActive",
     "RecordingSummary",
-    "RemoveQuickConvertFailed",
-    "ReplayRequiresStepped",
     "ReplaySession",
-    "ReplaySessionNotFound",
     "ReplayStatus",
-    "ReplyTooLarge",
-    "Resync",
     "RowSample",
-    "SaveLevelFailed",
-    "SceneActor",
-    "SceneDescription",
-    "SceneSnapshot",
-    "SelectFailed",
     "Sensor",
-    "SensorDescription",
-    "ServerAnswers",
-    "ServerConnected",
-    "ServerInfo",
-    "ServerLost",
-    "ServerReconnected",
     "ServerRestarted",
-    "ServerSilent",
     "ServerUnreachable",
-    "SessionLost",
-    "SessionOpened",
     "SessionTakenOver",
-    "SetActorTransformFailed",
-    "ShuttingDown",
     "SimOptions",
-    "SnapshotFailed",
-    "SpawnFailed",
     "StateSnapshot",
     "StepMode",
-    "StepTimeout",
     "Stream",
     "StreamOverflow",
-    "StreamPolicy",
-    "StreamStats",
-    "TaskFailed",
-    "TooManyCells",
     "Transport",
     "URLabArticulation",
     "URLabAsset",
@@ -402,18 +169,7 @@ __all__ = [
     "URLabSpawnHandle",
     "URLabTimeoutError",
     "URLabVersionMismatch",
-    "UnknownActor",
-    "UnknownArticulation",
-    "UnknownBody",
-    "UnknownJob",
-    "UnknownKeyframe",
     "UnknownName",
-    "UnknownOp",
-    "UnknownUpload",
-    "Unsupported",
-    "UploadProgress",
-    "Verdict",
-    "WrongTransport",
     "__version__",
     "check_address",
 ]

@@ -26,7 +26,7 @@ from urlab_client.aio.transport import readiness
 from urlab_client.aio.transport.poller import Poller
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.errors import ServerRestarted, ServerUnreachable, URLabError
-from urlab_client.protocol.messages.streams import ClientEvent, ServerReconnected, TaskFailed
+from urlab_client.events import ClientEvent, ServerReconnected, TaskFailed
 from urlab_client.server import SimulatedServer
 
 

@@ -15,17 +15,9 @@ from scripted_beta import BETA_OPS, ROBOT, ScriptedBeta, error
 from waiting import DEADLINE_S
 
 import urlab_client
-from urlab_client import (
-    DestroyFailed,
-    OutcomeUnknown,
-    ProtocolError,
-    StepMode,
-    StepTimeout,
-    URLabRPCError,
-    URLabTimeoutError,
-    URLabVersionMismatch,
-)
+from urlab_client import OutcomeUnknown, StepMode, URLabRPCError, URLabTimeoutError, URLabVersionMismatch
 from urlab_client.aio import Stream, URLabClient
+from urlab_client.errors import DestroyFailed, ProtocolError, StepTimeout
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.server import SimulatedServer
 from urlab_client.values.types import JobStatus

@@ -14,7 +14,7 @@ from bare_loop import run_bare
 from urlab_client import ServerUnreachable, URLabTimeoutError
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import connection_status
-from urlab_client.protocol.messages.streams import ServerLost, ServerSilent
+from urlab_client.events import ServerLost, ServerSilent
 
 Main = Callable[[URLabClient], Coroutine[Any, Any, None]]
 

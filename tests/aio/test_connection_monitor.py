@@ -18,7 +18,7 @@ from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
 from urlab_client.aio.transport import connection_status
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,

@@ -11,13 +11,10 @@ from scripted import ScriptedServer, client_of, names
 from scripted_beta import ScriptedBeta, error
 from waiting import DEADLINE_S
 
-from urlab_client import (
-    ControlClaimed,
-    NotControlOwner,
-    UnknownArticulation,
-)
+from urlab_client import ControlClaimed, NotControlOwner
 from urlab_client.aio import URLabClient
 from urlab_client.aio.control import process_owner
+from urlab_client.errors import UnknownArticulation
 from urlab_client.protocol.messages.control import ReleaseControl
 from urlab_client.web.endpoints import explain_error
 

@@ -20,7 +20,7 @@ from waiting import DEADLINE_S, eventually, until
 import urlab_client
 from urlab_client.aio import URLabClient
 from urlab_client.errors import ClientClosed, URLabError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     PlayEnded,
     PlayStarted,
     ServerConnected,

@@ -19,7 +19,7 @@ from waiting import DEADLINE_S, eventually, gives_up, until
 from urlab_client import ClientClosed, OutcomeUnknown, URLabTimeoutError
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import readiness
-from urlab_client.protocol.messages.streams import ServerAnswers, ServerLost, ServerSilent
+from urlab_client.events import ServerAnswers, ServerLost, ServerSilent
 from urlab_client.server import SimulatedServer
 
 # Wine takes a hundred times as long for each as Linux.

@@ -11,7 +11,6 @@ import pytest
 import zmq
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client import Verdict
 from urlab_client.aio import URLabClient
 from urlab_client.errors import (
     RPC_ERRORS,
@@ -25,6 +24,7 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.protocol.messages.session import Step
+from urlab_client.types import Verdict
 
 PAUSED = {"op": "set_paused_ok", "paused": True}
 LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}

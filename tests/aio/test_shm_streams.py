@@ -24,7 +24,7 @@ from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
-from urlab_client.values.picture_memory import PictureMemory
+from urlab_client.values.pictures import PictureMemory
 
 STATE = b"state/full"
 WIDTH, HEIGHT = 32, 24

@@ -12,10 +12,10 @@ import msgspec
 import pytest
 from hello import hello_ok
 
-from urlab_client import ProtocolError
 from urlab_client.aio import URLabClient
 from urlab_client.aio import client as client_module
 from urlab_client.aio.model import compilation
+from urlab_client.errors import ProtocolError
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BODY = '<body><freejoint/><geom size=".1"/></body>'

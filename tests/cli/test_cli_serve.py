@@ -14,9 +14,10 @@ from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, signals_kept
 from forked import program
 from waiting import eventually
 
-from urlab_client import ModeLocked, URLabClient, URLabPDController
+from urlab_client import URLabClient, URLabPDController
 from urlab_client.cli import main
 from urlab_client.enums import CameraMode, StepMode
+from urlab_client.errors import ModeLocked
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from urlab_client import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
 from urlab_client.enums import ActuatorType, CameraMode
+from urlab_client.errors import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
 from urlab_client.server import ControllerConfig
 
 BOT = """

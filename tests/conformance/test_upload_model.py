@@ -8,9 +8,11 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from urlab_client import ImportFailed, UnknownOp, UploadProgress, URLabAsset, URLabClient, URLabTimeoutError
+from urlab_client import URLabAsset, URLabClient, URLabTimeoutError
 from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.errors import ImportFailed, UnknownOp
 from urlab_client.server import Cut, Delay, Drop, Faults, SimulatedServer
+from urlab_client.types import UploadProgress
 
 MESH = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 ROBOT = """

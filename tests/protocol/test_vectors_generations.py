@@ -38,7 +38,7 @@ from urlab_client.protocol.messages.session import HelloOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
-from urlab_client.values import pixels
+from urlab_client.values import pictures
 
 REPLIES = {op.reply_name: op for op in OPS.values()} | {"set_mode_ok": OPS["set_mode"]}
 
@@ -232,12 +232,12 @@ def test_picture_headers(name: str) -> None:
     said = vector.decoded
     if vector.expect == "reject":
         with pytest.raises(ProtocolError):
-            pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+            pictures.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
         return
-    frame = pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+    frame = pictures.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
     bare = bytes.fromhex(said["pixels_hex"])
     assert np.array_equal(
-        frame.pixels, pixels.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
+        frame.pixels, pictures.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
     )
     assert (frame.frame_id, frame.sim_time, frame.capture_time) == (
         said["frame_id"],
@@ -251,7 +251,7 @@ def test_a_published_picture(generation: str, name: str) -> None:
     vector = vectors.load(name, generation)
     topic, payload = vector.frames
     assert topic.decode() == vector.decoded["topic"]
-    assert pixels.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
+    assert pictures.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
 
 
 # What the answers say about the server.

@@ -24,7 +24,7 @@ from urlab_client.server.streams.control_messages import (
     encode_gains,
     gains_by_parameter,
 )
-from urlab_client.values.pixels import decode_camera, encode_camera
+from urlab_client.values.pictures import decode_camera, encode_camera
 
 # What the codec, not these layouts, is responsible for.
 CODEC_FAMILIES = ("rpc_", "msgpack_", "msg_state_full")

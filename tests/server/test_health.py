@@ -15,8 +15,9 @@ import pytest
 from waiting import DEADLINE_S, eventually
 from wire import Wire
 
-from urlab_client import InternalError, ServerUnreachable, URLabClient, URLabPIEError
+from urlab_client import ServerUnreachable, URLabClient, URLabPIEError
 from urlab_client.enums import PIEState
+from urlab_client.errors import InternalError
 from urlab_client.keys import KeyPair
 from urlab_client.protocol.messages.scene import CreateLevelOk
 from urlab_client.server import CurveServer, Drop, Faults, SimulatedServer

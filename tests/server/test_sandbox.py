@@ -18,9 +18,10 @@ import msgspec
 import pytest
 from wire import Wire
 
-from urlab_client import ImportFailed, URLabTimeoutError
+from urlab_client import URLabTimeoutError
 from urlab_client._sandbox.landlock import is_available
 from urlab_client.aio import URLabClient
+from urlab_client.errors import ImportFailed
 from urlab_client.server import Limits, ModelError, SimulatedServer, open_server
 from urlab_client.server.assets import sandbox
 from urlab_client.server.refusal import Refusal

@@ -14,8 +14,7 @@ from urlab_client.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import PictureMemory, Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 

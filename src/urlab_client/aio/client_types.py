@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 from urlab_client.aio.features import Features
 from urlab_client.enums import StepMode, Transport
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 
 class Verdict(StrEnum):

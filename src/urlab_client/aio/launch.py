@@ -30,9 +30,9 @@ from urlab_client.aio.background import Tell, background_task, background_thread
 from urlab_client.aio.transport.base import LateReply, TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import Hello, HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent
 
 log: logging.Logger = logging.getLogger("urlab_client.launch")
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 import urlab_client
-from urlab_client._extras import MissingExtra
+from urlab_client._installation import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError

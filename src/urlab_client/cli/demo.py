@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client._platform.files import replaced
 from urlab_client.cli._arguments import Commands, add_dialect, count
 from urlab_client.cli._common import CommandError, import_mujoco, one_line, output

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._common import CommandError, check_ending, progress_bar
 from urlab_client.values.names import did_you_mean

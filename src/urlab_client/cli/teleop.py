@@ -145,7 +145,7 @@ def run(arguments: TeleopArguments) -> int:
 
 
 def _task(name: str) -> Task:
-    from urlab_client._extras import need
+    from urlab_client._installation import need
 
     need("gymnasium", extra="gym")
     from urlab_client.integrations.gym import TASKS

@@ -19,7 +19,7 @@ from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import CameraMode, StepMode
 from urlab_client.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
-from urlab_client.values.picture_files import jpeg
+from urlab_client.values.pictures import jpeg
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient

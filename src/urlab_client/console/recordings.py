@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import anyio.to_thread
 from msgspec import Struct
 
-from urlab_client._extras import MissingExtra, need
+from urlab_client._installation import MissingExtra, need
 from urlab_client.console.file_jobs import Progress, run_job, write_chunks
 from urlab_client.console.messages import Conversion, RunningRecording
 from urlab_client.errors import URLabError

@@ -30,7 +30,7 @@ from urlab_client.console.replay import Replay
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,

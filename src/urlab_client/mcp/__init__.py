@@ -3,7 +3,7 @@
 Requires the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs with their own client or transport.
 """
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 
 need("mcp", "mcap", "PIL", extra="mcp")
 

@@ -18,7 +18,7 @@ from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 

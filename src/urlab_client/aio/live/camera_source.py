@@ -18,8 +18,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.protocol.shm import camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.pixels import decode_camera
+from urlab_client.values.pictures import PictureMemory, decode_camera
 
 FIRST_PICTURE_S = 30.0
 """Seconds that a server may take for its first picture, because it initialises OpenGL first."""

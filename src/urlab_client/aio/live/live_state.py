@@ -15,7 +15,7 @@ from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 

@@ -22,7 +22,7 @@ from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 
 class SharedFrame:

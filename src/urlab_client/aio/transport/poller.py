@@ -20,8 +20,8 @@ from weakref import WeakMethod
 from urlab_client.aio.background import Tell, background_thread
 from urlab_client.aio.transport.readiness import watch_socket
 from urlab_client.errors import URLabError
+from urlab_client.events import ClientEvent
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.messages.streams import ClientEvent
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 

@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 import zmq
 
 from urlab_client.aio.background import Tell, background_thread
-from urlab_client.protocol.messages.streams import ClientEvent
+from urlab_client.events import ClientEvent
 
 # Interval of the thread's checks whether the loop was closed while clients were open.
 _CHECK_MS: Final = 1000

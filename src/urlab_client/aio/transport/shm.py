@@ -34,10 +34,10 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")

@@ -35,17 +35,10 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
 from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-)
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 

@@ -57,7 +57,7 @@ from urlab_client.server.physics.controllers import (
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import compiled_names
-from urlab_client.values.pixels import Pixels, observed_pixels, to_rgb
+from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 

@@ -30,7 +30,7 @@ from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.drawing import Stage
 from urlab_client.server.render.opengl import Backend, need_backend
 from urlab_client.server.render.tints import Tints
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import Pixels, decode_camera
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""

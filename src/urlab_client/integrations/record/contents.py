@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from urlab_client.integrations._feed.messages import EpisodeMessage, OutcomeMessage
 from urlab_client.protocol.base import Floats
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 _NS = 1e9
 _GAP_FACTOR = 3.0

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client._platform.files import replaced
 from urlab_client.integrations.record import tables
 from urlab_client.integrations.record.contents import Table

@@ -12,7 +12,7 @@ from PIL import Image
 
 from urlab_client.integrations._feed.messages import CompressedImage, RawImage
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.values.pixels import Pixels, without_alpha
+from urlab_client.values.pictures import Pixels, without_alpha
 
 _MOST_PIXELS = 8192 * 8192
 

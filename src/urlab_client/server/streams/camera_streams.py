@@ -28,7 +28,7 @@ from urlab_client.server.system.health import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
-from urlab_client.values.pixels import camera_header
+from urlab_client.values.pictures import camera_header
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
