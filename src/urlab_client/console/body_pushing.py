@@ -82,29 +82,17 @@ class BodyPushing:
         self._until = 0.0
 
     async def bodies(self) -> BodyList:
-        """Return the bodies and where they are.
-
-        Raises:
-            ValueError: The model or its first state has not arrived.
-        """
+        """Return the bodies and where they are."""
         shown = await self._now()
         return BodyList([_view(shown, body) for body in range(1, shown.model.nbody)], *_sphere(shown))
 
     async def body(self, body: int) -> BodyView:
-        """Return one body.
-
-        Raises:
-            ValueError: There is no such body, no model, or no state yet.
-        """
+        """Return one body."""
         shown = await self._now()
         return _view(shown, _checked(shown, body))
 
     async def pick(self, ray: Pick) -> Picked:
-        """Return the first hit of a ray.
-
-        Raises:
-            ValueError: The ray has no direction or is not finite, or no model or state has arrived.
-        """
+        """Return the first hit of a ray."""
         import mujoco
 
         shown = await self._now()
@@ -123,13 +111,7 @@ class BodyPushing:
         return Picked(_view(shown, body), local.tolist(), point.tolist())
 
     async def push(self, viewer: Viewer, push: Push) -> None:
-        """Start or renew a push.
-
-        Raises:
-            NotDriving: Another viewer has the controls.
-            ValueError: The body cannot be pushed, or not at present.
-            URLabError: As `step` raises.
-        """
+        """Start or renew a push."""
         shown = await self._now()
         robot = self._robot(shown, _checked(shown, push.body))
         if not np.isfinite([*push.local, *push.target]).all():
@@ -180,11 +162,7 @@ class BodyPushing:
         return shown
 
     def _robot(self, shown: Shown, body: int) -> URLabArticulation:
-        """Return whose body it is.
-
-        Raises:
-            ValueError: The body does not belong to a robot.
-        """
+        """Return whose body it is."""
         robot = self._client.articulations.get(_owner(shown, body))
         if robot is None:
             raise ValueError(f"{_name(shown, body)} does not belong to a robot. Only bodies of robots can be pushed.")

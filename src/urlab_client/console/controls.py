@@ -52,11 +52,7 @@ _PERIOD_S = 1 / 60
 
 
 def parse(op: Op, body: bytes) -> Request[Any]:
-    """Decode a request from JSON.
-
-    Raises:
-        ValueError: The JSON does not match the op's declaration.
-    """
+    """Decode a request from JSON."""
     try:
         request = msgspec.json.decode(body or b"{}", type=op.request, dec_hook=from_wire_array)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -114,12 +110,7 @@ class Controls:
         return key in self._seeded
 
     async def do(self, viewer: Viewer, request: Request[Any]) -> object:
-        """Perform an op for a viewer.
-
-        Raises:
-            NotDriving: The op changes something, and another viewer has the controls.
-            URLabError: As the client raises.
-        """
+        """Perform an op for a viewer."""
         op = op_of(request)
         if isinstance(request, SetPaused) and request.paused:
             self._lease.interrupt(viewer)  # any viewer may stop
@@ -152,12 +143,9 @@ class Controls:
                 pass
 
     def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
-        """Set set-points by articulation and actuator. In live mode the newest are sent immediately.
+        """Set set-points by articulation and actuator, or none if a name or a number is wrong.
 
-        Raises:
-            NotDriving: Another viewer has the controls.
-            KeyError: An articulation or actuator is unknown; nothing was set.
-            ValueError: A value is not a finite number; nothing was set.
+        In live mode the newest are sent immediately.
         """
         found = {key: (self._client.articulations[key], given) for key, given in values.items()}
         for art, given in found.values():
@@ -207,12 +195,7 @@ class Controls:
                     self._view.note("error", "console", "set-points", str(error))
 
     async def step(self, viewer: Viewer, n_steps: int) -> SteppedTo:
-        """Step in direct mode, with the set-points and pictures of the cameras that are watched.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: The mode is another one.
-        """
+        """Step in direct mode, with the set-points and pictures of the cameras that are watched."""
         if self._client.step_mode is not StepMode.DIRECT:
             raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
@@ -227,11 +210,7 @@ class Controls:
         return SteppedTo(reply.time, reply.step)
 
     async def run(self, viewer: Viewer, running: bool) -> None:
-        """Run or stop physics in any mode; any viewer may stop it.
-
-        Raises:
-            NotDriving: It was to run, and somebody else has the controls.
-        """
+        """Run or stop physics in any mode; any viewer may stop it."""
         if running:
             self._lease.use(viewer)
         else:

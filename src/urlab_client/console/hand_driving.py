@@ -44,13 +44,7 @@ class HandDriving:
         self._ordered = asyncio.Event()
 
     def command(self, viewer: Viewer, order: Hand) -> None:
-        """Move a hand for a moment.
-
-        Raises:
-            NotDriving: Another viewer has the controls.
-            KeyError: There is no such articulation or site.
-            ValueError: A number is not finite, the robot has no hand that can be moved, or the extra is missing.
-        """
+        """Move a hand for a moment."""
         for what, values in (("linear", order.linear), ("angular", order.angular), ("gripper", (order.gripper,))):
             if not np.isfinite(values).all():
                 raise ValueError(f"{what} takes finite numbers, not {list(values)}")

@@ -48,15 +48,7 @@ class WouldReplace(Exception):
 
 
 async def receive_model(name: str, chunks: AsyncIterator[bytes]) -> FlatModel:
-    """Receive a model, and check and compile it in a confined process.
-
-    Args:
-        name: The file's name, which ends with `.xml` or `.zip`.
-        chunks: Its bytes.
-
-    Raises:
-        ValueError: It is neither, exceeds a limit, names files that did not come with it, or MuJoCo rejects it.
-    """
+    """Receive a model, and check and compile it in a confined process."""
     if not is_file_name(name) or PurePosixPath(name).suffix.lower() not in {".xml", ".zip"}:
         raise ValueError(f"{name!r} is not the name of a model: send an .xml file, or a .zip archive with one")
     with tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True) as folder:
@@ -70,16 +62,6 @@ async def make_blueprint(client: URLabClient, name: str, model: FlatModel, repla
 
     A server of this user on this machine imports it from the disk, under the name of its file. Another one receives it
     over the wire, if it accepts uploads.
-
-    Args:
-        client: The client.
-        name: The file's name.
-        model: The model.
-        replace: Name of the blueprint that may be replaced; empty for none.
-
-    Raises:
-        WouldReplace: Another blueprint would be replaced.
-        URLabError: The server rejects the model.
     """
     stem = re.sub(r"\W", "_", PurePosixPath(name).stem)[:_NAME_CHARACTERS]
     with tempfile.TemporaryDirectory(prefix=_PREFIX, dir=_import_folder(), ignore_cleanup_errors=True) as folder:

@@ -64,12 +64,7 @@ class RecordingContents(Struct):
 
 
 class Recordings:
-    """The recordings of one console.
-
-    Args:
-        client: The client.
-        folder: Folder of the files; created with the first one.
-    """
+    """The recordings of one console."""
 
     def __init__(self, client: URLabClient, folder: Path) -> None:
         self.folder = folder
@@ -98,13 +93,7 @@ class Recordings:
         )
 
     async def start(self, *, cameras: bool) -> str:
-        """Start a recording and return its file's name.
-
-        Raises:
-            ValueError: A recording is running.
-            URLabError: The client has no session, or no play session is running.
-            OSError: The file cannot be created.
-        """
+        """Start a recording and return its file's name."""
         if self._task is not None:
             raise ValueError("a recording runs already: stop it first")
         from urlab_client.integrations.record import record
@@ -146,22 +135,13 @@ class Recordings:
             self._recorder = None
 
     async def mark(self, outcome: EpisodeOutcome) -> None:
-        """Record the outcome of the current episode.
-
-        Raises:
-            ValueError: No recording is running.
-        """
+        """Record the outcome of the current episode."""
         if self._recorder is None:
             raise ValueError("no recording runs, so the outcome of an episode cannot be recorded: start one first")
         await self._recorder.mark(outcome)
 
     async def stop(self) -> RecordingContents:
-        """End the recording and describe it.
-
-        Raises:
-            ValueError: No recording is running.
-            URLabError: The recording could not be written.
-        """
+        """End the recording and describe it."""
         recorder = self._recorder
         if recorder is None:
             raise ValueError("no recording runs")
@@ -193,11 +173,7 @@ class Recordings:
         return sorted(views, key=lambda view: view.at, reverse=True)
 
     def path(self, name: str) -> Path:
-        """Return the file of a recording.
-
-        Raises:
-            KeyError: There is none of that name.
-        """
+        """Return the file of a recording."""
         file = self.folder / name
         if not _NAME.fullmatch(name) or not file.is_file():
             raise KeyError(f"no recording is called {name!r}")
@@ -207,10 +183,6 @@ class Recordings:
         """Return name, size, length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
         `unavailable` holds the formats that it cannot be converted to here, each with what is missing.
-
-        Raises:
-            KeyError: There is none of that name.
-            URLabError: The file is not a recording.
         """
         file = self.path(name)
         changed = file.stat().st_mtime
@@ -221,13 +193,7 @@ class Recordings:
 
     @contextlib.asynccontextmanager
     async def converted(self, name: str, kind: str, camera: str = "") -> AsyncGenerator[Path]:
-        """Yield a recording as a file of another format, which is deleted afterwards.
-
-        Raises:
-            KeyError: There is no such recording, or no such camera in it.
-            ValueError: There is no such format.
-            URLabError: The file is not a recording, or a library for that format is not installed.
-        """
+        """Yield a recording as a file of another format, which is deleted afterwards."""
         file = self.path(name)
         if kind not in KINDS:
             raise ValueError(f"a recording is converted to {', '.join(KINDS)}, not {kind!r}")
@@ -248,12 +214,7 @@ class Recordings:
             yield target
 
     async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> RecordingContents:
-        """Add a recording that was made elsewhere, and describe it.
-
-        Raises:
-            ValueError: The name is not that of a recording or is taken, or the file is too large.
-            URLabError: The file is not a recording; it is not kept.
-        """
+        """Add a recording that was made elsewhere, and describe it."""
         if not _NAME.fullmatch(name):
             raise ValueError(f"{name!r} is not a valid name of a recording: it must end in .mcap or .json")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -272,12 +233,7 @@ class Recordings:
         return await self.describe(name)
 
     def remove(self, name: str) -> None:
-        """Delete a recording.
-
-        Raises:
-            KeyError: There is none of that name.
-            ValueError: It is being recorded.
-        """
+        """Delete a recording."""
         if self._recorder is not None and self._recorder.path.name == name:
             raise ValueError(f"{name} is being recorded: stop that first")
         self.path(name).unlink()
@@ -285,11 +241,7 @@ class Recordings:
 
 
 def open_run(file: Path) -> Run:
-    """Open a recording.
-
-    Raises:
-        URLabError: The file is not a recording.
-    """
+    """Open a recording."""
     from urlab_client.integrations.record import read_run
 
     return read_run(file)

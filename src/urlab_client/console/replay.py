@@ -119,12 +119,7 @@ class Replay:
         return self._start + self._at + _ROUNDING_S
 
     async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
-        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start.
-
-        Raises:
-            URLabError: The file is damaged at this position.
-            OSError: The file cannot be read.
-        """
+        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start."""
         run, at = self._run, self._moment
         if run is None:
             return None
@@ -132,12 +127,7 @@ class Replay:
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
-        """Return states of the last seconds before the replay's position, evenly spaced, oldest first.
-
-        Raises:
-            ValueError: No recording is replayed.
-            URLabError: The file is damaged at this position.
-        """
+        """Return states of the last seconds before the replay's position, evenly spaced, oldest first."""
         run, robots, start, at = self._run, self._robots, self._start, self._at
         if run is None:
             raise ValueError("no recording is replayed")
@@ -153,15 +143,7 @@ class Replay:
         return await _read(read)
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
-        """Show a recording from its start.
-
-        Args:
-            file: The recording.
-            placing: Whether to place the simulation's robots, too; its mode is puppet meanwhile.
-
-        Raises:
-            URLabError: The file is not a recording, or not one of the current robots; or as the client raises.
-        """
+        """Show a recording from its start."""
         run, (start, end), names, cameras = await _read(lambda: _opened(file))
         if not names:
             raise URLabError(f"{file.name} holds no states of robots.")
@@ -183,11 +165,7 @@ class Replay:
     async def change(
         self, *, at: float | None = None, playing: bool | None = None, rate: float | None = None
     ) -> ReplayView:
-        """Seek, play or pause, and set the pace; None leaves a value unchanged.
-
-        Raises:
-            ValueError: No recording is replayed, or a number is out of range.
-        """
+        """Seek, play or pause, and set the pace; None leaves a value unchanged."""
         if self._run is None:
             raise ValueError("no recording is replayed")
         if rate is not None:

@@ -56,11 +56,8 @@ _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 class ConsoleSession:
     """See the module.
 
-    Args:
-        client: The client; the console opens its session and keeps it.
-        recordings: Folder for recordings.
-        lease_seconds: How long a viewer keeps the controls without using them.
-        handshake: Callback that returns the handshake of a read-only client; None for a client that opens the session.
+    A client that is not read-only opens the session itself. A read-only one adopts the session of another client, whose
+    handshake the callback returns.
 
     Attributes:
         link: The connection to the server.
@@ -138,11 +135,7 @@ class ConsoleSession:
     # The connection
 
     async def opened(self) -> None:
-        """Wait until the session has been opened for the first time.
-
-        Raises:
-            ServerUnreachable: The server cannot be reached; nothing was sent.
-        """
+        """Wait until the session has been opened for the first time."""
         with self.view.watch() as changed:
             while not self._ready.is_set():
                 if self.link.reason:  # a first attempt has failed; each has its own deadline

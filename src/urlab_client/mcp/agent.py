@@ -23,7 +23,7 @@ from urlab_client.console.lease import NotDriving
 from urlab_client.console.messages import encode
 from urlab_client.console.session import ConsoleSession
 from urlab_client.errors import ServerRestarted, SessionTakenOver, URLabError
-from urlab_client.mcp import editing, looking, moving
+from urlab_client.mcp import tools
 from urlab_client.mcp.call import RESTARTED, TAKEN_OVER, Call, Caller, Limits, Stopped
 from urlab_client.mcp.declaration import Declared, Needs, declared
 from urlab_client.mcp.results import Moment
@@ -41,7 +41,7 @@ _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
 }
-_TOOLS = declared(looking, moving, editing)
+_TOOLS = declared(tools)
 _LARGE = 1e3
 _MOST_CALLERS = 100  # each client of the older protocol opens a session, and may not report its end
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError, RecursionError)

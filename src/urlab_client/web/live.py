@@ -72,11 +72,7 @@ async def _converse(send: Callable[[], Awaitable[None]], listen: Callable[[], Aw
 
 
 async def _receive_text(socket: WebSocket) -> str:
-    """Return the next text that a browser sends.
-
-    Raises:
-        WebSocketDisconnect: The browser is gone, or it sent a binary frame, for which the socket is closed.
-    """
+    """Return the next text that a browser sends."""
     message = await socket.receive()
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message["code"], message.get("reason"))
