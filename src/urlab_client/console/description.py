@@ -145,8 +145,7 @@ def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -
         limits = joint.limits
     home, model = 0.0, client.model
     if model is not None and said.takes == "position" and joint is not None:
-        at = int(model.jnt_qposadr[joint.id])
-        home = float(_home(model)[at])
+        home = float(_home(model)[int(model.jnt_qposadr[joint.id])])
     place = actuator.ctrl_local.start
     return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
 

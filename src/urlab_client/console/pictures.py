@@ -175,10 +175,24 @@ class Feed:
             while True:
                 began = time.monotonic()
                 if self._client.step_mode is StepMode.LIVE:
-                    await self._take_from(frames)
+                    with contextlib.suppress(URLabTimeoutError):
+                        sample = await self._next(frames)
+                        await self._publish(sample.pixels, sample.recv_wall_time_ns, sample.sim_time)
                 else:
-                    await self._take_from_replies()
+                    pixels = self.camera.latest_frame  # of the newest reply
+                    if pixels is not None and pixels is not self._last:
+                        self._last = pixels
+                        await self._publish(pixels, time.time_ns(), self.camera.sim_time)
                 await anyio.sleep(max(0.0, began + _FASTEST_S - time.monotonic()))
+
+    async def _next(self, frames: Stream[CameraSample]) -> CameraSample:
+        try:
+            return await frames.receive(timeout=_LOOK_S)
+        except URLabTimeoutError:
+            # Newer servers publish nothing while physics is paused, and draw when they are asked to.
+            if not self._client.server.features.live_pictures_in_steps:
+                raise
+            return await self.camera.capture(timeout=_CAPTURE_S)
 
     async def _follow_recording(self) -> None:
         at = shown = -1.0
@@ -189,37 +203,17 @@ class Feed:
                 if found is not None and found[0] != shown:
                     shown = found[0]
                     encoded = await anyio.to_thread.run_sync(_jpeg_of, found[1], abandon_on_cancel=True)
-                    await self._show(encoded, time.time_ns(), shown, found[1].mode, recorded=True)
+                    head = PictureHead(self._seq + 1, time.time_ns() / 1e6, shown, found[1].mode, recorded=True)
+                    await self._show(encoded, head)
             await anyio.sleep(_FASTEST_S)
-
-    async def _take_from(self, frames: Stream[CameraSample]) -> None:
-        with contextlib.suppress(URLabTimeoutError):
-            try:
-                await self._take(await frames.receive(timeout=_LOOK_S))
-            except URLabTimeoutError:
-                # Newer servers publish nothing while physics is paused, and draw when they are asked to.
-                if self._client.server.features.live_pictures_in_steps:
-                    await self._take(await self.camera.capture(timeout=_CAPTURE_S))
-
-    async def _take(self, sample: CameraSample) -> None:
-        await self._publish(sample.pixels, sample.recv_wall_time_ns, sample.sim_time)
-
-    async def _take_from_replies(self) -> None:
-        pixels = self.camera.latest_frame
-        if pixels is not None and pixels is not self._last:
-            self._last = pixels
-            await self._publish(pixels, time.time_ns(), self.camera.sim_time)
 
     async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
         mode = str(self.camera.mode)
         encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, _QUALITY, abandon_on_cancel=True)
-        await self._show(encoded, received_ns, sim_time, mode, recorded=False)
+        await self._show(encoded, PictureHead(self._seq + 1, received_ns / 1e6, sim_time, mode))
 
-    async def _show(
-        self, encoded: bytes, received_ns: int, sim_time: float | None, mode: str, *, recorded: bool
-    ) -> None:
-        self._seq += 1
-        head = PictureHead(self._seq, received_ns / 1e6, sim_time, mode, recorded)
+    async def _show(self, encoded: bytes, head: PictureHead) -> None:
+        self._seq = head.seq
         async with self._changed:
             self._newest = EncodedPicture(head, encoded)
             self._changed.notify_all()

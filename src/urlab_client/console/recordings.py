@@ -25,7 +25,6 @@ from urlab_client.errors import URLabError
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
     from urlab_client.integrations._feed.messages import EpisodeOutcome
-    from urlab_client.integrations.record.reader import Run
     from urlab_client.integrations.record.recorder import AsyncRecorder
 
 KINDS = ("csv", "mp4", "npz")
@@ -240,15 +239,10 @@ class Recordings:
         self._described.pop(name, None)
 
 
-def open_run(file: Path) -> Run:
-    """Open a recording."""
+def _described(file: Path, progress: Progress | None = None) -> RecordingContents:
     from urlab_client.integrations.record import read_run
 
-    return read_run(file)
-
-
-def _described(file: Path, progress: Progress | None = None) -> RecordingContents:
-    summary = open_run(file).summary(progress)
+    summary = read_run(file).summary(progress)
     cameras = [name.removeprefix("/camera/") for name in summary.topics if name.startswith("/camera/")]
     return RecordingContents(
         name=file.name,
@@ -272,16 +266,15 @@ def _unavailable() -> dict[str, str]:
 
 
 def _convert(file: Path, target: Path, kind: str, camera: str, progress: Progress) -> None:
-    from urlab_client.integrations.record import export
+    from urlab_client.integrations.record import export, read_run
 
-    run = open_run(file)
+    run = read_run(file)
     try:
-        match kind:
-            case "csv":
-                export.write_csv(run, target, progress)
-            case "npz":
-                export.write_npz(run, target, progress=progress)
-            case _:
-                export.write_mp4(run, target, camera, progress)
+        if kind == "csv":
+            export.write_csv(run, target, progress)
+        elif kind == "npz":
+            export.write_npz(run, target, progress=progress)
+        else:
+            export.write_mp4(run, target, camera, progress)
     except MissingExtra as error:
         raise URLabError(str(error)) from None

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 import anyio.to_thread
@@ -22,7 +22,6 @@ from msgspec import Struct
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.console.messages import ReplayView
 from urlab_client.console.pictures import OF_SCENE, Cameras
-from urlab_client.console.recordings import open_run
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record.contents import RecordedArticulation, RecordedState
     from urlab_client.integrations.record.pictures import RecordedPicture
     from urlab_client.integrations.record.reader import Run
-
-_T = TypeVar("_T")
 
 _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
@@ -123,7 +120,7 @@ class Replay:
         run, at = self._run, self._moment
         if run is None:
             return None
-        found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(OF_SCENE), at))
+        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(camera.removeprefix(OF_SCENE), at))
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
@@ -140,11 +137,11 @@ class Replay:
                     found[state.time] = _snapshot(state, _present(state, robots), state.time - start)
             return [*found.values()]
 
-        return await _read(read)
+        return await anyio.to_thread.run_sync(read)
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
         """Show a recording from its start."""
-        run, (start, end), names, cameras = await _read(lambda: _opened(file))
+        run, (start, end), names, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
         if not names:
             raise URLabError(f"{file.name} holds no states of robots.")
         robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
@@ -231,7 +228,7 @@ class Replay:
             run, at = self._run, self._moment
             if run is None:
                 return
-            state = await _read(lambda: run.state_at(at))
+            state = await anyio.to_thread.run_sync(lambda: run.state_at(at))
             if state is None or self._run is not run:
                 return
             self._state = state
@@ -270,12 +267,10 @@ class Replay:
         await self._client.step(0, include_cameras=dict.fromkeys(self._shown_cameras.watched(), "latest") or False)
 
 
-async def _read(job: Callable[[], _T]) -> _T:
-    return await anyio.to_thread.run_sync(job)
-
-
 def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
-    run = open_run(file)
+    from urlab_client.integrations.record import read_run
+
+    run = read_run(file)
     cameras = (name if "/" in name else OF_SCENE + name for name in run.cameras())
     return run, run.time_range(), run.positions(), frozenset(cameras)
 
