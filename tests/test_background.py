@@ -36,7 +36,7 @@ PLAIN = {
 AWAITED = {
     "_platform/threads.py:daemon": "makes the threads of the helpers",
     "aio/background.py:background_task": "makes the tasks of the helpers",
-    "aio/session.py:probe": "waits for the task and returns its result",
+    "aio/session/session.py:probe": "waits for the task and returns its result",
     "aio/launch.py:_started": "waits for the task and raises its error",
     "sync/_loop.py:_drive": "the caller of the job waits for it; the job holds every error of its coroutine",
     "sync/_loop.py:_start_job": "likewise",
@@ -78,8 +78,7 @@ KILLED = {
         "urlab-server",
         "urlab-server-end",
         "urlab-server-log",
-        "urlab-shm",
-        "urlab-sockets",
+        "urlab-waiter",
         "urlab-watch",
     },
     "tests/sync/test_portal.py": {"urlab-io"},
@@ -87,7 +86,6 @@ KILLED = {
     "tests/integrations/test_failing_threads.py": {
         "urlab-environment",
         "urlab-feed",
-        "urlab-lerobot",
         "urlab-pictures",
         "urlab-record",
         "urlab-view",
@@ -147,7 +145,7 @@ def test_each_name_is_killed_by_a_test(sources: list[tuple[str, ast.Module]]) ->
     for file, tree in sources:
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and called(node) in HELPERS and node.args and (name := text(node.args[0])):
-                names.add((file.startswith("server/"), name))
+                names.add((file.startswith(("server/", "_sandbox/")), name))
     assert {name for _, name in names if not name.startswith("urlab-")} == set()
     killed = {(file.startswith("tests/server/"), name) for file, all_ in KILLED.items() for name in all_}
     assert killed == names

@@ -50,7 +50,11 @@ class Module(generated.Source):
         parts = path.relative_to(plan.package.parent).with_suffix("").parts
         self.name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         self.shown = path.relative_to(plan.shown).as_posix()
-        self.output = plan.package / "sync" / path.relative_to(plan.package / "aio")
+        # The mirror of a package below `aio` is one module.
+        below = path.relative_to(plan.package / "aio").parts
+        self.output = plan.package / "sync" / f"{below[0].removesuffix('.py')}.py"
+        self.mirror = f"{plan.package.name}.sync.{self.output.stem}"
+        self.alias = "aio" if len(below) == 1 else f"aio_{path.stem.lstrip('_')}"
         self.imports = dict(self._imports())
 
     def _imports(self) -> Iterator[tuple[str, tuple[str, str, bool]]]:

@@ -195,7 +195,7 @@ def render() -> dict[Path, str]:
     }
     imports = [
         "from __future__ import annotations\n",
-        "from urlab_client.aio.deadline import DEFAULT, Timeout",
+        "from urlab_client.aio.defaults import DEFAULT, Timeout",
         "from urlab_client.aio.namespaces._base import Namespace, Vector, as_quat, as_vec3, fill, target_by",
         *(f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(used.items())),
         *(f"from urlab_client.values.{module} import {', '.join(names)}" for module, names in types.items()),

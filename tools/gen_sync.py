@@ -8,6 +8,7 @@ Needs nothing installed but the pinned ruff. Sources are read, never imported.
 
 What becomes of a mirrored module:
 
+- A package below `aio` becomes one module.
 - A class with an async method, or one that hands out such a class, becomes a façade class of the same name that holds
   its async twin. Its base and derived classes do, too. Other classes are shared: imported from the source.
 - `async def` waits in the portal, `def` and properties delegate, an annotated attribute with a docstring becomes a
@@ -24,6 +25,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import generated
@@ -48,8 +50,7 @@ PLAN = Plan(
         "articulation.py",
         "controllers.py",
         "cameras.py",
-        "streams.py",
-        "namespaces/__init__.py",
+        "streams/stream.py",
         "namespaces/_ops.py",
         "namespaces/[!_]*.py",
     ),
@@ -103,6 +104,39 @@ class Renames:
         return "".join(lines)
 
 
+@dataclass
+class Parts:
+    """What one module adds to the text of its mirror."""
+
+    module: Module
+    imports: list[str]
+    typing_only: list[str]
+    exported: set[str]
+    body: list[str]
+
+
+def text_of(parts: Sequence[Parts]) -> str:
+    """Return the mirror of one module, or of all mirrored modules of a package."""
+    exported = sorted({name for part in parts for name in part.exported})
+    first = parts[0].module
+    typing_only = sorted({line for part in parts for line in part.typing_only})
+    alone = len(parts) == 1
+    shown = first.shown if alone else f"{first.shown.rpartition('/')[0]}/"
+    return "\n".join(
+        [
+            f"{HEADER}{shown}. Do not edit.",
+            "# Behaviour belongs in the source; blocking-only behaviour belongs in the modules of sync/ named _*.py.",
+            f'"""Blocking twins of `{first.name if alone else first.name.rpartition(".")[0]}`."""',
+            "from __future__ import annotations",
+            *sorted({line for part in parts for line in part.imports}),
+            *(["if TYPE_CHECKING:", *(f"    {line}" for line in typing_only)] if typing_only else []),
+            f"\n__all__ = {exported!r}\n" if exported else "",
+            *dict.fromkeys(text for part in parts for text in part.body),
+            "",
+        ]
+    )
+
+
 class Mirror:
     """Renders the mirror of one module."""
 
@@ -113,7 +147,7 @@ class Mirror:
         self.needed: set[str] = set()  # names that signatures use
         self.at_run_time: set[str] = set()  # classes that bodies use
 
-    def render(self) -> str:
+    def render(self) -> Parts:
         module = self.module
         for node in module.tree.body:
             if isinstance(node, ast.AsyncFunctionDef) and is_plain(node.name):
@@ -122,17 +156,9 @@ class Mirror:
         variables = self._type_variables()
         self.at_run_time.update(name for node in variables.values() for name in names_in(node))
         known = {*module.classes, *module.imports, *self.needed}
-        exported = sorted(name for name in module.exported if name in known)
-        head = [
-            f"{HEADER}{module.shown}. Do not edit.",
-            "# Behaviour belongs in the source; blocking-only behaviour belongs in the modules of sync/ named _*.py.",
-            f'"""Blocking twins of `{module.name}`."""',
-            "from __future__ import annotations",
-            *self._imports(exported, variables),
-            f"\n__all__ = {exported!r}\n" if exported else "",
-        ]
+        exported = {name for name in module.exported if name in known}
         copies = [f"{name} = {module.segment(node)}" for name, node in variables.items()]
-        return "\n".join([*head, *copies, *facades]) + "\n"
+        return Parts(module, *self._imports(exported, variables), exported, [*copies, *facades])
 
     # Imports and module-level names
 
@@ -141,13 +167,15 @@ class Mirror:
         assigned = self.module.assignments.items()
         return {name: node for name, node in assigned if name in self.needed and names_in(node)[:1] == ["TypeVar"]}
 
-    def _imports(self, exported: Sequence[str], variables: Collection[str]) -> list[str]:
+    def _imports(self, exported: Collection[str], variables: Collection[str]) -> tuple[list[str], list[str]]:
         module = self.module
         lines: set[str] = set()
         typing_only: set[str] = set()
         for local, (source, name, checked) in module.imports.items():
             if name in self.sources.facades:
-                source = source.replace(".aio.", ".sync.")  # noqa: PLW2901
+                source = self.sources.homes[name].mirror  # noqa: PLW2901
+                if source == module.mirror:
+                    continue
             line = f"from {source} import {name}" if name else f"import {source}"
             line += "" if local == (name or source) else f" as {local}"
             (typing_only if checked and local not in self.at_run_time else lines).add(line)
@@ -155,17 +183,14 @@ class Mirror:
         lines |= {f"from {module.name} import {name}" for name in own - self.sources.facades - {*variables}}
         if not self.sources.facades.isdisjoint(module.classes):
             package, _, leaf = module.name.rpartition(".")
-            lines |= {f"from {package} import {leaf} as aio", f"from {FACADE} import Facade, FacadeRoot"}
+            lines |= {f"from {package} import {leaf} as {module.alias}", f"from {FACADE} import Facade, FacadeRoot"}
         lines.discard("from __future__ import annotations")
-        return [
-            *sorted(lines),
-            *(["if TYPE_CHECKING:", *(f"    {line}" for line in typing_only)] if typing_only else []),
-        ]
+        return [*lines], [*typing_only]
 
     # Classes
 
     def _class(self, node: ast.ClassDef) -> str:
-        own = f"aio.{node.name}"
+        own = f"{self.module.alias}.{node.name}"
         bases, derived = self._bases(node)
         root = node.name == self.sources.plan.root
         if root or not derived:
@@ -203,7 +228,9 @@ class Mirror:
     def _constructor(self, cls: ast.ClassDef) -> str:
         for node in cls.body:
             if isinstance(node, ast.FunctionDef) and node.name == "__init__":
-                return self._function(node, "__init__", f"super().__init__(aio.{cls.name}({self._arguments(node)}))")
+                return self._function(
+                    node, "__init__", f"super().__init__({self.module.alias}.{cls.name}({self._arguments(node)}))"
+                )
         raise self.module.refuse(cls, f"{cls.name} is constructed by users: write its __init__ here")
 
     def _member(self, cls: ast.ClassDef, node: ast.stmt) -> str:
@@ -366,7 +393,10 @@ def generate(plan: Plan) -> dict[Path, str]:
     """Render every mirrored module."""
     sources = Sources(plan)
     renames = Renames(plan)
-    texts = {module.output: Mirror(sources, module, renames).render() for module in sources.modules.values()}
+    parts: dict[Path, list[Parts]] = {}
+    for module in sources.modules.values():
+        parts.setdefault(module.output, []).append(Mirror(sources, module, renames).render())
+    texts = {path: text_of(found) for path, found in parts.items()}
     if renames.unused:
         raise Refused(f"rename rules that nothing needs: {', '.join(sorted(renames.unused))}")
     members = {name for cls in sources.facades for name, _ in sources.members(cls)}

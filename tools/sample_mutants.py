@@ -2,7 +2,7 @@
 
     python tools/sample_mutants.py --record       # now and then: run all tests, and keep which of them run which lines
     python tools/sample_mutants.py --n 100 --seed 7
-    python tools/sample_mutants.py --n 100 --seed 7 --only aio/turn.py:79 tests/aio/test_turns.py
+    python tools/sample_mutants.py --n 100 --seed 7 --only aio/session/turn.py:79 tests/aio/test_turns.py
 
 mutmut's operators make the mutants (`pip install -e '.[mutants]'`). Lines are drawn evenly, so that a package counts by
 its size; strings, which are mostly prose, annotations and generated files are left alone. The tests that run a mutant's

@@ -18,7 +18,7 @@ from benchmarks.harness import Figure, Pair, Row
 from benchmarks.robots import recorded
 from urlab_client import aio
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
 from urlab_client.protocol.topics import STATE_FULL, camera_filter

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from urlab_client.aio.mutex import Mutex
+from urlab_client.aio.session.turn import Mutex
 
 
 async def waiting(mutex: Mutex, order: list[str], name: str) -> asyncio.Task[None]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from urlab_client.aio import streams
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams import stream as streams
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import URLabTimeoutError
 from urlab_client.events import ServerLost

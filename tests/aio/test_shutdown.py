@@ -12,7 +12,7 @@ from publisher import Publisher
 from waiting import until
 
 from urlab_client.aio import URLabClient
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.errors import StreamOverflow
 
 SERVED = """

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
+from urlab_client.aio.streams.buffer import BufferedMessage, StreamBuffer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
 TOPICS = [b"a", b"b", b"c"]
@@ -158,6 +158,20 @@ def test_a_gap_is_told_with_what_took_over(policy: StreamPolicy) -> None:
     entry = buffer.pop()
     assert entry is not None
     assert entry.gap is None
+
+
+@pytest.mark.parametrize("policy", [StreamPolicy.LATEST, StreamPolicy.LATEST_PER_KEY])
+@pytest.mark.parametrize("before", [None, "moved"])
+def test_a_gap_right_before_what_took_over_is_told(policy: StreamPolicy, before: str | None) -> None:
+    buffer = StreamBuffer(policy, 10, 1000)
+    if before:
+        buffer.note_gap(before)
+    buffer.push(b"a", b"", 0)
+    buffer.note_gap("reconnected")
+    buffer.push(b"a", b"", 0)
+    entry = buffer.pop()
+    assert entry is not None
+    assert (entry.seq, entry.dropped, entry.gap) == (2, 1, "reconnected"), "the latest gap is told"
 
 
 @pytest.mark.parametrize("limits", [(0, 1), (1, 0)])

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 from publisher import Publisher
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client.aio.live.camera_source import CameraSource
-from urlab_client.aio.live.event_bus import EventBus
-from urlab_client.aio.live.live_state import LiveState
-from urlab_client.aio.live.row_source import RowSource
-from urlab_client.aio.live.state_source import StateSource
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.camera_source import CameraSource
+from urlab_client.aio.streams.event_bus import EventBus
+from urlab_client.aio.streams.live_state import LiveState
+from urlab_client.aio.streams.row_source import RowSource
+from urlab_client.aio.streams.state_source import StateSource
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.enums import CameraMode
 from urlab_client.errors import (

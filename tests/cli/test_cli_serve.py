@@ -195,7 +195,7 @@ def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_broken_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    broken = write(tmp_path, "broken.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
+    broken = write(tmp_path, "broken  robot.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
     line = refused(capsys, broken)
     assert str(broken) in line
     assert "potato" in line

@@ -322,10 +322,12 @@ async def test_state_belongs_together_under_the_lock(connect: Any, serve: Any, b
 
         watcher = threading.Thread(target=watch)
         watcher.start()
-        for _ in range(40):
-            await client.step()
-        stop.set()
-        watcher.join(60)
+        try:
+            for _ in range(40):
+                await client.step()
+        finally:
+            stop.set()
+            watcher.join(60)
         assert torn == []
 
 

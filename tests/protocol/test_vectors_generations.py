@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import vectors
 
+from urlab_client._platform.processors import no_fence
 from urlab_client.aio.features import Features
 from urlab_client.enums import CameraMode
 from urlab_client.errors import (
@@ -219,7 +220,7 @@ def test_a_published_snapshot_and_its_region() -> None:
     assert topic == topics.STATE_FULL
     assert StateSnapshot.decode(payload).per_articulation.keys() == {"arm_a"}
     region = vectors.load("shm_region_state_full", "beta")
-    found = shm.attach(bytearray(region.data), fence=shm.no_fence).read_latest()
+    found = shm.attach(bytearray(region.data), fence=no_fence).read_latest()
     assert found is not None
     assert found.sequence == region.decoded["header"]["sequence"]
     assert StateSnapshot.decode(found.payload).per_articulation.keys() == {"arm_a"}

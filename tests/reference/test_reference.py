@@ -14,7 +14,7 @@ import pytest
 import urlab_client
 import urlab_client.aio
 from urlab_client import enums
-from urlab_client.aio.session_level import SESSION_LEVEL
+from urlab_client.aio.defaults import SESSION_LEVEL
 
 ROWS = tomllib.loads((Path(__file__).parent / "rows.toml").read_text(encoding="utf-8"))
 FLAVOURS = {"aio": urlab_client.aio, "sync": urlab_client}

@@ -261,7 +261,7 @@ def test_a_binary_model_from_a_server_with_a_key_is(monkeypatch: pytest.MonkeyPa
 def test_a_server_from_afar_with_nothing_but_a_binary_model(monkeypatch: pytest.MonkeyPatch) -> None:
     _as_from_afar(monkeypatch)
     from urlab_client import URLabError
-    from urlab_client.aio.session import Session
+    from urlab_client.aio.session.session import Session
 
     hello = Session.hello
 

@@ -213,9 +213,9 @@ def test_the_thread_that_waits_for_a_confined_compiler(
 ) -> None:
     wire = serve()
     with monkeypatch.context() as patch:
-        patch.setattr("urlab_client.server.assets.sandbox._REPLY_BYTES", "many")
+        patch.setattr("urlab_client._sandbox.process._SIZE", "many")
         assert wire.refused("import_xml", path=str(models / "bot.xml")) == "internal_error"
-    assert "urlab-sandbox died of TypeError" in caplog.text
+    assert "urlab-sandbox died of AttributeError" in caplog.text
     assert wire.ask("import_xml", path=str(models / "bot.xml"))["blueprint_short_name"] == "bot"
 
 

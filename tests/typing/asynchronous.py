@@ -41,7 +41,7 @@ from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayName
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.events import ClientEvent, PlayEnded
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk

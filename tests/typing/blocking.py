@@ -37,12 +37,16 @@ from urlab_client.events import ClientEvent, PlayEnded
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
-from urlab_client.sync.namespaces._ops import DebugNamespace, ViewportNamespace
-from urlab_client.sync.namespaces.outliner import OutlinerNamespace
-from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
-from urlab_client.sync.namespaces.runtime import RuntimeNamespace
-from urlab_client.sync.namespaces.scene import SceneNamespace
-from urlab_client.sync.namespaces.sim import SimNamespace
+from urlab_client.sync.namespaces import (
+    DebugNamespace,
+    OutlinerNamespace,
+    RecordingNamespace,
+    ReplayNamespace,
+    RuntimeNamespace,
+    SceneNamespace,
+    SimNamespace,
+    ViewportNamespace,
+)
 from urlab_client.sync.streams import Stream
 from urlab_client.types import CameraPose, ClientConfig, ContactsResult, Diagnosis, KeyframeInfo
 from urlab_client.values.names import NameMap

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from forked import COMMAND, program
+from msgspec.structs import replace
 from starlette.testclient import TestClient
 from test_web_api import mounted
 
@@ -169,10 +170,10 @@ def test_a_viewers_model_reads_nothing_of_the_consoles_machine(http: TestClient,
 @pytest.mark.parametrize("http", ["beta"], indirect=True)
 def test_a_viewers_model_takes_no_more_time_than_it_may(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     replicated = "<replicate count='100'>" * 4 + "<geom size='.1'/>" + "</replicate>" * 4
-    monkeypatch.setattr(compilation, "_UPLOAD_CPU_S", 1)
+    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, cpu_s=1))
     bomb = f"<mujoco><worldbody>{replicated}</worldbody></mujoco>"
     assert "1 s of processor time" in refusal(http.put("/api/models/m.xml", content=bomb))
-    monkeypatch.setattr(compilation, "_UPLOAD_WALL_S", 0)
+    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, wall_s=0))
     assert "took more than 0 s" in refusal(http.put("/api/models/m.xml", content=bomb))
     assert blueprints(http) == ["arm"]
 

@@ -8,10 +8,10 @@ if TYPE_CHECKING:
     from urlab_client.aio.cameras import URLabCameraView
     from urlab_client.aio.client import URLabClient
     from urlab_client.aio.controllers import URLabController, URLabPDController
-    from urlab_client.aio.deadline import DEFAULT
+    from urlab_client.aio.defaults import DEFAULT
     from urlab_client.aio.launch import check_address
     from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
-    from urlab_client.aio.streams import Stream
+    from urlab_client.aio.streams.stream import Stream
 
 _HOMES = {
     "URLabArticulation": "urlab_client.aio.articulation",
@@ -20,13 +20,13 @@ _HOMES = {
     "URLabClient": "urlab_client.aio.client",
     "URLabController": "urlab_client.aio.controllers",
     "URLabPDController": "urlab_client.aio.controllers",
-    "DEFAULT": "urlab_client.aio.deadline",
+    "DEFAULT": "urlab_client.aio.defaults",
     "check_address": "urlab_client.aio.launch",
     "Actuator": "urlab_client.aio.model.elements",
     "Body": "urlab_client.aio.model.elements",
     "Joint": "urlab_client.aio.model.elements",
     "Sensor": "urlab_client.aio.model.elements",
-    "Stream": "urlab_client.aio.streams",
+    "Stream": "urlab_client.aio.streams.stream",
 }
 
 

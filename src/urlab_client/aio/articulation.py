@@ -9,16 +9,16 @@ import numpy as np
 
 from urlab_client.aio.arguments import mapping, require
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.controllers import URLabController, make_controller
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.aio.motion import Motion
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.control import CLAIM_S
+from urlab_client.aio.session.session import Session
+from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.enums import ControlMode, OutOfRange
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats

@@ -1,4 +1,4 @@
-"""Tasks and threads in the background of a client: none ends unnoticed.
+"""The event loop of a client, and its tasks and threads in the background, none of which ends unnoticed.
 
 An unexpected end is logged, reported as an event, and passed on to whatever waits for it.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import sys
 import threading
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, TypeAlias, TypeVarTuple
@@ -114,3 +115,35 @@ def _noted(name: str, error: BaseException) -> URLabError:
 def _said(error: BaseException) -> str:
     text = str(error).rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def running_loop(
+    bound: asyncio.AbstractEventLoop | None = None, owner: str = "This client"
+) -> asyncio.AbstractEventLoop:
+    """Return the running event loop.
+
+    Args:
+        bound: The loop that the caller has been used on; None before its first use.
+        owner: Name of the caller for the error message.
+
+    Raises:
+        URLabError: No asyncio event loop is running, or another one than `bound`.
+    """
+    loop = asyncio._get_running_loop()  # noqa: SLF001  # unlike get_running_loop, never raises
+    if loop is None:
+        here = "this code runs on trio" if _on_trio() else "no event loop is running"
+        raise URLabError(
+            f"The async client runs on asyncio's event loop, but {here}.",
+            hint="Run it with asyncio.run() or anyio's asyncio backend. Elsewhere use the blocking client: under trio, "
+            "with trio.to_thread.run_sync().",
+        )
+    if bound is not None and bound is not loop:
+        raise URLabError(
+            f"{owner} belongs to another event loop.", hint="Create one per loop, or use the blocking client."
+        )
+    return loop
+
+
+def _on_trio() -> bool:
+    trio: Any = sys.modules.get("trio")
+    return trio is not None and trio.lowlevel.in_trio_run()

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.live_state import LatestPicture
-from urlab_client.aio.live.publishers import Publishers, SharedFrame
-from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.streams.live_state import LatestPicture
+from urlab_client.aio.streams.publishers import Publishers, SharedFrame
+from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
@@ -119,7 +119,8 @@ class URLabCameraView:
         """Stream the camera's pictures as the server publishes them.
 
         Servers of the alpha publish pictures in live mode only, the plugin without time or number. Newer servers
-        publish them in every mode, once per state: no pictures arrive while the simulation stands still.
+        publish them in every mode, once per state. While the simulation stands still, a camera that this call switches
+        on sends the present state if it has not sent it before; nothing else arrives.
 
         Args:
             policy: `latest`, or `all` within the limits of the buffer.

@@ -11,16 +11,13 @@ from copy import copy
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
-from urlab_client.aio.address import transport_to
 from urlab_client.aio.arguments import integer
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
-from urlab_client.aio.control import Control
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
 from urlab_client.aio.explain import diagnose
-from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.launch import transport_to
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.namespaces._ops import DebugNamespace, FarmNamespace, ViewportNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
@@ -28,8 +25,8 @@ from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayName
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.session import Session
-from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
+from urlab_client.aio.session.control import Control
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.capturing import Capturing
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.discovery import Discovery
@@ -39,10 +36,12 @@ from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import send_step, take_steps
-from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.curve import client_keys, is_local
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.streams.camera_switch import CameraSwitch
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
+from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.errors import URLabError
 from urlab_client.events import ClientEvent
@@ -170,7 +169,7 @@ class URLabClient(ClientState):
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
-        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = ServerRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         session = Session(

@@ -12,7 +12,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client_types import ClientConfig, ServerInfo
 from urlab_client.aio.model.mirror import binary_model
 from urlab_client.aio.observer import ClientObserver
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.enums import StepMode

@@ -8,14 +8,14 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.enums import ControllerKind, known
 from urlab_client.errors import ControllerSchemaViolation, ProtocolError
 from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
 
 if TYPE_CHECKING:
-    from urlab_client.aio.session import Session, Turn
+    from urlab_client.aio.session.session import Session, Turn
 
 _GAINS = ("kp", "kv", "torque_limit")
 

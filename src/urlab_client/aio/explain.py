@@ -14,10 +14,10 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_types import ClientConfig, Diagnosis, Finding, Verdict
-from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.launch import LaunchedTransport
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import ControlMode, PIEState, StepMode
 from urlab_client.errors import RPC_ERRORS, SessionTakenOver, URLabError

@@ -12,6 +12,7 @@ import contextlib
 import logging
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,7 +28,8 @@ from msgspec import Struct
 
 from urlab_client._platform.children import APART
 from urlab_client.aio.background import Tell, background_task, background_thread
-from urlab_client.aio.transport.base import LateReply, TransportStats
+from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
+from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
 from urlab_client.events import ClientEvent
@@ -68,10 +70,11 @@ def serve_arguments(address: str) -> list[str]:
     """
     models, options = _parsed(address)
     for key, _ in options:
-        if key in _OPENING:
+        name = key.partition("=")[0]  # `server-key%3DFILE` is one key, and sets the option, too
+        if name in _OPENING:
             raise ValueError(
-                f"{address!r}: '{key}' is for a server that others use, and this one is for its client alone; start it "
-                "with `urlab serve`"
+                f"{address!r}: '{name}' is for a server that others use, and this one is for its client alone; start "
+                "it with `urlab serve`"
             )
     arguments = [f"--{key}={value}" if value else f"--{key}" for key, value in options if key != _START_TIMEOUT]
     return [*models, *arguments]
@@ -448,3 +451,35 @@ async def _log_lines(stream: asyncio.StreamReader) -> None:
         if not line:
             return
         log.info("server: %s", line.decode(errors="replace").rstrip())
+
+
+_HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
+_LAST_PORT = 65535
+
+
+def transport_to(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
+    """Return the transport to a server at an address.
+
+    Args:
+        address: Address given by the user.
+        step_port: RPC port, if the address names none.
+        keys: CURVE keys for the server; None if it needs none.
+        shm: Whether a server that this process starts offers shared memory.
+
+    Raises:
+        ValueError: The address is malformed.
+    """
+    if address.startswith(SCHEME):
+        return LaunchedTransport(address, shm=shm)
+    scheme, separator, rest = address.partition("://")
+    if not separator or scheme not in {"tcp", "ipc"} or not rest:
+        raise ValueError(f"{address!r} is not a valid address; write tcp://HOST, ipc://PATH or sim://MODEL")
+    own_port = False
+    if scheme == "tcp":
+        host = _HOST.fullmatch(rest)
+        if host is None or not 0 < int(host["port"] or 1) <= _LAST_PORT:
+            raise ValueError(
+                f"{address!r} is not a valid address; write tcp://HOST or tcp://HOST:PORT, as in tcp://[::1]:5559"
+            )
+        own_port = host["port"] is not None
+    return ZmqTransport(address if own_port else f"{address}:{step_port}", keys)

@@ -12,12 +12,12 @@ from contextlib import aclosing
 from typing import TYPE_CHECKING, Protocol
 
 from urlab_client.aio.arguments import mapping
+from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_types import Diagnosis, Verdict
-from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.numbers import finite
-from urlab_client.aio.session import Session, server_restarted
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.session.session import Session, server_restarted
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.enums import OutOfRange, StepMode
 from urlab_client.errors import NotSettled, URLabTimeoutError
 from urlab_client.protocol.messages.session import StepOk

@@ -24,7 +24,7 @@ from urlab_client.values.pictures import jpeg
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient
     from urlab_client.console.replay import Replay
-    from urlab_client.integrations.record.pictures import RecordedPicture
+    from urlab_client.integrations.record.contents import RecordedPicture
 
 OF_SCENE = "-/"
 """Begins the path of a camera that belongs to no articulation."""

@@ -30,8 +30,7 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
-    from urlab_client.integrations.record.contents import RecordedArticulation, RecordedState
-    from urlab_client.integrations.record.pictures import RecordedPicture
+    from urlab_client.integrations.record.contents import RecordedArticulation, RecordedPicture, RecordedState
     from urlab_client.integrations.record.reader import Run
 
 _PERIOD_S = 1 / 60

@@ -1,6 +1,6 @@
 """The blocking façade: the async core's API without `await`, for scripts and notebooks."""
 
-from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.defaults import DEFAULT
 from urlab_client.aio.launch import check_address
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from urlab_client.aio import articulation as aio
-from urlab_client.aio.control import CLAIM_S
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
+from urlab_client.aio.session.control import CLAIM_S
 from urlab_client.enums import ControlMode, OutOfRange
 from urlab_client.protocol.base import Floats
 from urlab_client.sync._facade import Facade

@@ -11,9 +11,8 @@ from typing import Self, TypeVar
 
 from urlab_client.aio import client as aio
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, Diagnosis, Resync
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
-from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
+from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
+from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
@@ -22,12 +21,17 @@ from urlab_client.protocol.messages.streams import CameraSample, RowSample, Stat
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
-from urlab_client.sync.namespaces._ops import DebugNamespace, FarmNamespace, ViewportNamespace
-from urlab_client.sync.namespaces.outliner import OutlinerNamespace
-from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
-from urlab_client.sync.namespaces.runtime import RuntimeNamespace
-from urlab_client.sync.namespaces.scene import SceneNamespace
-from urlab_client.sync.namespaces.sim import SimNamespace
+from urlab_client.sync.namespaces import (
+    DebugNamespace,
+    FarmNamespace,
+    OutlinerNamespace,
+    RecordingNamespace,
+    ReplayNamespace,
+    RuntimeNamespace,
+    SceneNamespace,
+    SimNamespace,
+    ViewportNamespace,
+)
 from urlab_client.sync.streams import Stream
 
 R = TypeVar("R", bound=Reply)

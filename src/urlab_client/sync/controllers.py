@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from urlab_client.aio import controllers as aio
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.enums import ControllerKind
 from urlab_client.sync._facade import Facade
 

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
 
-from urlab_client.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
+from urlab_client.errors import OutcomeUnknown, UnknownUpload
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
@@ -123,7 +123,7 @@ async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) ->
         try:
             upload_id = await _send_files(model, call, on_progress)
             break
-        except (UnknownUpload, ConnectionLost, OutcomeUnknown):
+        except (UnknownUpload, OutcomeUnknown):
             if attempt == _ATTEMPTS:
                 raise
     else:

@@ -8,9 +8,9 @@ from typing import Literal, TypeVar, overload
 from msgspec import Struct
 
 from urlab_client.aio.arguments import numbers
-from urlab_client.aio.deadline import Timeout
-from urlab_client.aio.jobs import OnProgress
-from urlab_client.aio.session import Session
+from urlab_client.aio.defaults import Timeout
+from urlab_client.aio.session.jobs import OnProgress
+from urlab_client.aio.session.session import Session
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.values.rotation import Quat, Vec3
 

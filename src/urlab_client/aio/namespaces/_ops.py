@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, Vector, as_quat, as_vec3, fill, target_by
 from urlab_client.protocol.messages.debug import (
     ClearMarkers,

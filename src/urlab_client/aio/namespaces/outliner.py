@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._ops import OutlinerOps
 from urlab_client.protocol.messages.outliner import ActorRow, FindActors, ListActors
 from urlab_client.values.scene_types import ActorInfo

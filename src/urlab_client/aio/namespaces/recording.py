@@ -6,10 +6,10 @@ import math
 from functools import partial
 from pathlib import Path
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, fill
 from urlab_client.aio.namespaces._ops import ReplayOps
-from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.session.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.errors import RecordingAlreadyActive, RecordingNotActive
 from urlab_client.protocol.messages.recording import (

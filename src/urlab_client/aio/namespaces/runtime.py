@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from urlab_client.aio.arguments import mapping, require
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.jobs import OnProgress
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
-from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.session.jobs import OnProgress
+from urlab_client.aio.session.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.wire_names import as_written, for_the_server

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, TypeVar
 import anyio
 
 from urlab_client.aio.arguments import require
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
-from urlab_client.aio.namespaces.lasting import SceneEdit
+from urlab_client.aio.namespaces.contexts import SceneEdit
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.enums import PIEState
 from urlab_client.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.base import Reply, Request

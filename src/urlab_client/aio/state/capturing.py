@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.camera_source import CameraSource, HasCamera
-from urlab_client.aio.session import Turn
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import learn_mode, stopped_live
 from urlab_client.aio.state.step_pictures import first_picture_s
+from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.enums import StepMode
 from urlab_client.errors import (

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable
 
 from urlab_client.aio.background import background_task
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription
 from urlab_client.errors import NoActiveManager, URLabError, URLabRPCError

@@ -12,7 +12,7 @@ from typing import Final
 
 import anyio.to_thread
 
-from urlab_client.aio.session import Turn
+from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote

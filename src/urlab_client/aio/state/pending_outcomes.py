@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from urlab_client.aio.model.articulation_state import Carried, give_back
-from urlab_client.aio.session import Session, leaves_open
+from urlab_client.aio.session.session import Session, leaves_open
 from urlab_client.enums import StepMode
 from urlab_client.errors import ModeLocked, StepTimeout
 

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Iterable
 
 from urlab_client.aio.client_types import Resync
-from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.session import STOP, Turn
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.session.session import STOP, Turn
 from urlab_client.aio.state.discovery import Discovery, look
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from urlab_client.aio.arguments import mapping, text
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite
-from urlab_client.aio.session import Turn, leaves_open
+from urlab_client.aio.session.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.messages.session import Reset, ResetOk

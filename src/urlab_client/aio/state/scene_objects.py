@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping
 from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror
 from urlab_client.aio.motion import Motion
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.handshake import Examined
+from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, CameraInfo, HelloOk, StepOk
 from urlab_client.values.names import NameMap, UnknownName, unknown_name

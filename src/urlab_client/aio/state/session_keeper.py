@@ -13,10 +13,10 @@ import logging
 from typing import Final
 
 from urlab_client.aio.background import background_task
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.errors import ClientClosed, URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.events import ClientEvent, PlayStarted, ServerLost, SessionLost
 from urlab_client.protocol.messages.runtime import ListKeyframes

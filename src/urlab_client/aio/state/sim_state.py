@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.live.live_state import LatestPicture, LiveState
-from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.live.step_streams import StepStreams
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.observer import ClientObserver
-from urlab_client.aio.session import Session
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
+from urlab_client.aio.streams.live_state import LatestPicture, LiveState
+from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.step_streams import StepStreams
 from urlab_client.enums import CameraMode, CameraTiming, StepMode
 from urlab_client.errors import (
     NoActiveManager,

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator
 
 import anyio
 
-from urlab_client.aio.session import Turn, leaves_open
+from urlab_client.aio.session.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.errors import BadMode, ModeLocked

@@ -11,14 +11,14 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
-from urlab_client.aio.live.camera_source import FIRST_PICTURE_S
+from urlab_client.aio.streams.camera_source import FIRST_PICTURE_S
 from urlab_client.enums import CameraTiming
 from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
 
 if TYPE_CHECKING:
     from urlab_client.aio.cameras import URLabCameraView
+    from urlab_client.aio.session.turn import Turn
     from urlab_client.aio.state.sim_state import SimState
-    from urlab_client.aio.turn import Turn
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

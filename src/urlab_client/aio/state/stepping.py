@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from urlab_client.aio.arguments import mapping
 from urlab_client.aio.model.articulation_state import Carried, give_back
-from urlab_client.aio.session import Turn, leaves_open
+from urlab_client.aio.session.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
 from urlab_client.aio.state.step_mode import settle_mode

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.defaults import DEFAULT
 from urlab_client.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState

@@ -103,11 +103,8 @@ class CameraStreams:
 
         Args:
             health: Notified when the thread dies.
-            host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
             curve_keys: Who may connect; None for anyone who can reach the interface.
-            memory: Shared memory that also gets the images, in every mode.
-            dialect: Determines when images are sent, their topic and their header.
 
         Raises:
             PortInUse: The port is in use.

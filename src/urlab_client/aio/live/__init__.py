@@ -1,1 +1,0 @@
-"""Sources of published data for the streams: states, pictures and events."""

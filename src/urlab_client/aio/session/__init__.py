@@ -1,0 +1,1 @@
+"""The session with a server: turns, deadlines, claims, jobs."""

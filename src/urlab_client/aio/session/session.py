@@ -1,0 +1,507 @@
+"""One RPC session: grants turns, stamps requests, sets their deadlines and decodes the replies."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
+from contextlib import asynccontextmanager, contextmanager
+from contextvars import ContextVar
+from typing import Any, Final, TypeVar
+
+from urlab_client.aio.background import Tell, running_loop
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.features import Features
+from urlab_client.aio.session.call_records import CallRecords, Observe
+from urlab_client.aio.session.control import Control
+from urlab_client.aio.session.jobs import OnProgress, finish
+from urlab_client.aio.session.turn import Limits, Mutex, Settle, Turn, require_reply
+from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.errors import (
+    ConnectionLost,
+    GameThreadTimeout,
+    InternalError,
+    NoSession,
+    ReadOnlyClient,
+    ServerRestarted,
+    ServerUnreachable,
+    SessionTakenOver,
+    ShuttingDown,
+    StepTimeout,
+    UnknownOp,
+    URLabError,
+    URLabRPCError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
+from urlab_client.protocol.codec import (
+    check_finite,
+    check_request,
+    decode_answer,
+    decode_reply,
+    encode_request,
+    op_of,
+)
+from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
+from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
+
+__all__ = ["STOP", "Session", "Turn", "leaves_open", "server_restarted"]
+
+log: logging.Logger = logging.getLogger("urlab_client.session")
+
+R = TypeVar("R", bound=Reply)
+_HELLO = op_of(Hello)
+_COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
+"""Session whose scene the running task changes by several ops."""
+# These refusals leave open whether the op was executed. All others mean that it was not.
+_UNDECIDED = (StepTimeout, GameThreadTimeout, ShuttingDown, InternalError)
+
+STOP: Final = "end of play"
+"""The end of play among what may be `unsettled`."""
+
+_UNLISTED = frozenset({"hello", "meta"})  # every server offers them and none lists them
+
+
+class Session:
+    """A session with one server.
+
+    The server handles one request at a time anyway, and a second request must not be queued behind a first one that may
+    fail. Requests therefore wait here for the line to be free, where waiting is visible and cancellable. Requests that
+    depend on the client's state or change it also wait for a `turn`.
+
+    Attributes:
+        session_id: Id of the open session; empty without one.
+        greeted: Whether a handshake was sent, with any outcome.
+        features: Features of the server, as far as its replies have shown them.
+        control: The robots that this client owns.
+        read_only: Whether requests that need a session are refused.
+        on_opened: Callback invoked with the handshake of each new session, even if its caller had given up.
+        on_refusal: Callback invoked with each refusal before it is raised.
+        confirmed: Whether the server has answered within this session since the connection was established. After a
+            lost connection another server may listen, which only a refused or accepted session id shows.
+        was_down: Whether no server listened at the address for a while since the last answer within this session.
+        restarts: Number of sessions that ended because the server restarted.
+        tell: Publishes an event of the client.
+        unkept: Why the session is no longer kept open although `keep_session` is set; otherwise None.
+        unsettled: How to settle what the client mirrors and an abandoned request may have changed, by its name.
+        unsettled_on: Number of connections opened when the latest of these requests was abandoned.
+        line: Held while a request is in progress, from its encoding to its reply.
+        turns: Held by the current `Turn`.
+        editing: Held while the editor runs a job.
+        scene: Held by the task that changes the scene, for one op or for several that belong together.
+    """
+
+    def __init__(
+        self,
+        transport: RequestTransport,
+        *,
+        default_timeout: float | None,
+        json: bool = False,
+        observe: Observe | None = None,
+    ) -> None:
+        self.session_id: str = ""
+        self.greeted: bool = False
+        self.read_only: bool = False
+        self.features: Features = Features()
+        self.on_opened: Callable[[HelloOk], None] | None = None
+        self.on_refusal: Callable[[URLabRPCError], None] | None = None
+        self.confirmed: bool = False
+        self.was_down: bool = False
+        self.restarts: int = 0
+        self.tell: Tell = lambda _: None
+        self.unkept: URLabError | None = None
+        self.unsettled: dict[str, Settle] = {}
+        self.unsettled_on: int = 0
+        self._lost_to_restart = ""
+        self._transport = transport
+        self._call_records = None if observe is None else CallRecords(observe, transport)
+        self._way = self._call_records or transport
+        self._default_timeout = default_timeout
+        self._json = json
+        self.control: Control = Control(self)
+        self.line: Mutex = Mutex()
+        self.turns: Mutex = Mutex()
+        self.editing: Mutex = Mutex()
+        self.scene: Mutex = Mutex()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._queued = 0
+        self._aside: asyncio.Task[Reply] | None = None
+        # A handshake whose caller gave up after it was sent still opens a session.
+        self._given_up: asyncio.Future[bytes] | None = None
+        self._unanswered = False
+
+    @property
+    def transport(self) -> RequestTransport:
+        """The transport of the requests."""
+        return self._transport
+
+    async def call(
+        self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
+    ) -> R:
+        """Send a request that does not depend on the client's state; return its reply, or the result of its job.
+
+        Args:
+            request: Any request struct of `urlab_client.protocol.messages`.
+            timeout: Seconds for queueing, sending and the reply, including a job; None waits without limit.
+            on_progress: Callback invoked with the progress of a job.
+
+        Raises:
+            URLabRPCError: The server refused the request.
+            URLabConnectionError: The server cannot be reached, or the connection broke.
+            URLabTimeoutError: No reply arrived in time.
+            NoSession: No session is open; nothing was sent.
+            TypeError, ValueError: The request is malformed; nothing was sent.
+        """
+        op = op_of(request)
+        if on_progress is not None and not callable(on_progress):
+            raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
+        self.check_offered(op)
+        limits = self.limits(op, timeout, self.bound_loop().time())
+        if op.ns != "scene" or op.effect is Effect.READ or _COMPOSING.get() is self:
+            return await self._call(request, op, limits, on_progress)
+        await self.acquire(self.scene, op, limits[0])
+        try:
+            return await self._call(request, op, limits, on_progress)
+        finally:
+            self.scene.release()
+
+    @asynccontextmanager
+    async def composing(self, request: type[Request[Any]], timeout: Timeout) -> AsyncGenerator[None]:
+        """Keep other tasks from changing the scene while this one does so by several ops, of which `request` is first.
+
+        Raises:
+            URLabTimeoutError: Other tasks held the scene until the deadline of that op; nothing was sent.
+        """
+        op = op_of(request)
+        await self.acquire(self.scene, op, self.limits(op, timeout, self.bound_loop().time())[0])
+        outer = _COMPOSING.set(self)
+        try:
+            yield
+        finally:
+            _COMPOSING.reset(outer)
+            self.scene.release()
+
+    async def _call(self, request: Request[R], op: Op, limits: Limits, on_progress: OnProgress | None) -> R:
+        if op.needs is not Needs.EDITOR:
+            return await self._on_line(request, op, limits)
+        # One job at a time: the next editor op would wait for it anyway, and block the server in the meantime.
+        await self.acquire(self.editing, op, limits[0])
+        try:
+            await self.acquire(self.line, op, limits[0])
+            try:
+                answer = await self.exchange(request, op, limits)
+            finally:
+                self.line.release()
+            if not isinstance(answer, OpStarted):
+                return answer
+            status = op_of(OpStatus)
+            return await finish(
+                op,
+                op_reply(request, op),
+                answer,
+                lambda question: self._on_line(question, status, limits),
+                deadline=limits[0],
+                on_progress=on_progress,
+            )
+        finally:
+            self.editing.release()
+
+    async def _on_line(self, request: Request[R], op: Op, limits: Limits) -> R:
+        await self.acquire(self.line, op, limits[0])
+        try:
+            return require_reply(op, await self.exchange(request, op, limits))
+        finally:
+            self.line.release()
+
+    def turn(self, request: type[Request[Any]], *, timeout: Timeout = DEFAULT, each: bool = False) -> Turn:
+        """Return a turn for requests that depend on the client's state or change it.
+
+        Args:
+            request: Type of the first request, whose deadline also covers the wait for the turn.
+            timeout: Seconds for queueing and all requests together; None waits without limit. The default timeout
+                applies to each request separately.
+            each: Whether a given timeout also applies to each request separately.
+        """
+        op = op_of(request)
+        self.check_offered(op)
+        return Turn(self, op, timeout, each=each)
+
+    async def probe(self, request: Request[R], *, timeout: float) -> R | None:
+        """Send a background request if no other is in progress, and cancel it when another request comes.
+
+        Returns:
+            The reply, or None if the request was cancelled or not sent.
+        """
+        if self.line.locked() or self._queued or self._aside is not None:
+            return None  # two at a time could not both be cancelled for the next call
+        task = asyncio.create_task(self.call(request, timeout=timeout), name="urlab-probe")
+        self._aside = task
+        try:
+            await asyncio.wait((task,))
+            return None if task.cancelled() else task.result()
+        finally:
+            task.cancel()
+            self._aside = None
+
+    @contextmanager
+    def settling(self, what: str, settle: Settle) -> Generator[None]:
+        """Keep `settle` for `resync()` if the body leaves open whether the server executed its request."""
+        before = self._transport.stats.sent
+        try:
+            yield
+        except BaseException as error:
+            if not leaves_open(error):
+                self.unsettled.pop(what, None)
+            elif self._transport.stats.sent > before:
+                self.unsettled[what] = settle
+                self.unsettled_on = self._transport.stats.connects
+            raise
+        self.unsettled.pop(what, None)
+
+    async def hello(self, turn: Turn, request: Hello) -> HelloOk:
+        """Open a session; the previous one becomes invalid, here and for any other client."""
+        if self._json:
+            request.encoding = "json"
+        reply = await turn.call(request)
+        # A packaged build lacks the editor's ops, and an older server lacks newer ops.
+        try:
+            listed = [op.name for op in (await turn.call(Meta())).ops]
+        except UnknownOp:
+            listed = None
+        self.features = self.features.with_ops(listed).with_hello(reply)
+        return reply
+
+    async def aclose(self) -> None:
+        """Close the transport; waiting calls fail with `ClientClosed`."""
+        await self._transport.aclose()
+
+    def bound_loop(self) -> asyncio.AbstractEventLoop:
+        """Return the running loop, to which this session is bound.
+
+        Raises:
+            URLabError: The session is bound to another loop, or no asyncio loop is running.
+        """
+        bound = self._loop
+        if bound is None or asyncio._get_running_loop() is not bound:  # noqa: SLF001  # as in `running_loop`
+            bound = self._loop = running_loop(bound)
+        return bound
+
+    def check_offered(self, op: Op) -> None:
+        """Check that the server offers an op and that this client may send it.
+
+        Raises:
+            UnknownOp: The server does not list the op; nothing was sent.
+            ReadOnlyClient: The client is read-only; nothing was sent.
+        """
+        if self.read_only and op.name != "meta":
+            raise ReadOnlyClient(
+                f"{op.name}: this client is read-only. Nothing was sent.",
+                op=op.name,
+                hint="It has no session. Use the client that drives the server, or create one without read_only=True.",
+            )
+        listed = self.features.ops
+        if listed is not None and op.name not in listed and op.name not in _UNLISTED:
+            raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
+
+    def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
+        """Return the limits of a request.
+
+        Args:
+            op: Its op.
+            timeout: Timeout given by the caller.
+            since: Loop time from which the timeout counts.
+            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
+                default timeout.
+        """
+        default = self._default_timeout
+        if timeout is not DEFAULT:
+            deadline = None if timeout is None else since + timeout
+            return deadline, deadline
+        if default is None:
+            return None, None
+        # The reply to a slow op may take long, but a missing server shows much sooner.
+        seconds = (op.timeout if takes is None else takes) or 0.0
+        connect_by = since + default
+        return (since + seconds if seconds > default else connect_by), connect_by
+
+    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]:
+        """Send a request and return its answer. The caller must hold the line."""
+        if self.features.claims and isinstance(request, ControlRequest):
+            return self.control.send(request, self._ask, limits)
+        if self._call_records is not None:
+            return self._call_records.record(op, self._answer(request, op, limits))
+        return self._answer(request, op, limits)
+
+    async def _ask(self, request: Request[R], limits: Limits) -> R:
+        op = op_of(request)
+        answer = self._answer(request, op, limits)
+        records = self._call_records
+        return require_reply(op, await (answer if records is None else records.record(op, answer)))
+
+    async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
+        # A single coroutine, because each further one between a step and its socket slows down every step.
+        stamped = self.session_id
+        frame = encode_request(request, stamped, json=self._json)
+        if not op.hot:
+            check_finite(request)
+            if not self._json:
+                check_request(request, frame)
+        late = self._await_later if op is _HELLO else None
+        sent, began = self._transport.stats.sent, time.perf_counter()
+        try:
+            try:
+                deadline, connect_by = limits
+                answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+            except ConnectionLost as lost:
+                answer = await self._ask_again(frame, op, lost, limits)
+            finally:
+                if late is not None and self._transport.stats.sent > sent:
+                    self.greeted = self._unanswered = True  # `_unanswered` until the reply has been read
+            if log.isEnabledFor(logging.DEBUG):
+                took = 1e3 * (time.perf_counter() - began)
+                log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
+            return self._read(op_reply(request, op), op, stamped, answer)
+        except SessionTakenOver as refusal:
+            # An abandoned handshake of this client still opens a session. A request refused because of it was not
+            # executed, and is sent again in that session.
+            if not again and await self._settled(limits[0]) and self.session_id != stamped:
+                return await self._answer(request, op, limits, again=True)
+            if not stamped:
+                raise NoSession("no session is open.", op=op.name) from None
+            if self.on_refusal is not None:
+                self.on_refusal(refusal)
+            if self.was_down:
+                raise self._after_restart(stamped, op, refusal.message) from self.unkept
+            if self._unanswered:
+                raise _maybe_own_handshake(refusal) from None
+            raise
+
+    def _after_restart(self, stamped: str, op: Op, said: str) -> ServerRestarted:
+        if stamped != self._lost_to_restart:  # several requests may be refused for one restart
+            self._lost_to_restart = stamped
+            self.restarts += 1
+        return server_restarted(op.name, self._transport.endpoint, said)
+
+    def _read(self, kind: type[R], op: Op, stamped: str, answer: bytes) -> R | OpStarted:
+        """Decode the answer to a request that was sent in the session `stamped`, and update the session from it."""
+        try:
+            reply = decode_answer(op, kind, answer)
+        except URLabRPCError as refusal:
+            # A refusal of a request sent before the latest hello says nothing about the current session.
+            taken_over = isinstance(refusal, SessionTakenOver)
+            if self.on_refusal is not None and stamped == self.session_id and not taken_over:
+                self.on_refusal(refusal)
+            raise
+        if isinstance(reply, StateReply):
+            if (reply.arts is not None) is not self.features.arts:
+                self.features = self.features.with_reply(reply)
+        elif isinstance(reply, HelloOk):
+            self._open(reply)
+        if not self.confirmed:
+            self.confirmed = op.needs is not Needs.NOTHING and stamped == self.session_id
+            self.was_down = self.was_down and not self.confirmed
+        return reply
+
+    def _open(self, hello: HelloOk) -> None:
+        self.session_id = hello.session_id
+        self.confirmed = True
+        if self.was_down:
+            self.unsettled.clear()  # the server has been restarted
+        self.was_down = False
+        self._given_up = None
+        self._unanswered = False
+        if self.on_opened is not None:
+            self.on_opened(hello)
+
+    def _await_later(self, reply: asyncio.Future[bytes]) -> None:
+        """Adopt the session that an abandoned handshake opens, when its reply arrives."""
+        self._given_up = reply
+        reply.add_done_callback(self._take_later)
+
+    def _take_later(self, reply: asyncio.Future[bytes]) -> None:
+        if self._given_up is not reply or not reply.done():
+            return  # a later handshake has been answered in the meantime
+        self._given_up = None
+        if reply.cancelled():
+            return  # the connection was lost; `_unanswered` remembers it
+        try:
+            self._open(decode_reply(op_of(Hello), HelloOk, reply.result()))
+        except URLabError as error:
+            log.info("the reply to an abandoned handshake cannot be used: %s", error)
+
+    async def _settled(self, deadline: float | None) -> bool:
+        """Wait for the reply to an abandoned handshake; return whether none is outstanding."""
+        reply = self._given_up
+        if reply is not None:
+            left = None if deadline is None else max(0.0, deadline - asyncio.get_running_loop().time())
+            await asyncio.wait((reply,), timeout=left)
+            self._take_later(reply)
+        return self._given_up is None
+
+    async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, limits: Limits) -> bytes:
+        """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
+        late = self._await_later if op is _HELLO else None
+        while True:
+            log.debug("%s: sending the request again, because the connection was lost", op.name)
+            try:
+                deadline, connect_by = limits
+                return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+            except ConnectionLost as again:
+                lost = again
+            except ServerUnreachable as unreachable:
+                raise lost from unreachable
+
+    async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
+        """Wait for `line`, `turns`, `editing` or `scene`.
+
+        Raises:
+            URLabTimeoutError: Another call held it until the deadline; nothing was sent.
+        """
+        if lock.acquire_nowait():
+            return
+        waiting = self._wait_for(lock, op, deadline)
+        await (waiting if self._call_records is None else self._call_records.queued(op, waiting))
+
+    async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
+        if self._aside is not None:
+            self._aside.cancel()
+        self._queued += 1
+        try:
+            async with asyncio.timeout_at(deadline):
+                await lock.acquire()
+        except TimeoutError:
+            raise URLabTimeoutError(
+                f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",
+                op=op.name,
+                hint="A client sends one request at a time; use a second client or a longer timeout.",
+            ) from None
+        finally:
+            self._queued -= 1
+
+
+def leaves_open(error: BaseException) -> bool:
+    """Return whether a request that was sent and failed with this error may have been executed."""
+    if isinstance(error, URLabRPCError):
+        return isinstance(error, _UNDECIDED)
+    return not isinstance(error, (ServerUnreachable, TypeError, ValueError))
+
+
+def op_reply(request: Request[R], op: Op) -> type[R]:
+    """Return the reply struct of a request, with the type that the request declares."""
+    return op.reply  # type: ignore[return-value]  # Op cannot carry R: the registry holds ops of every R
+
+
+def server_restarted(what: str, endpoint: str, said: str = "") -> ServerRestarted:
+    """Return the error of an op that a restart of the server ended, with the server's message `said`."""
+    words = f" ({said})" if said else ""
+    text = f"the server at {endpoint} has restarted and does not know the session{words}."
+    return ServerRestarted(text, op=what)
+
+
+def _maybe_own_handshake(refusal: SessionTakenOver) -> SessionTakenOver:
+    return SessionTakenOver(
+        refusal.code,
+        f"{refusal.message.rstrip('.')}. An abandoned handshake of this client may have opened another session.",
+        op=refusal.op,
+    )

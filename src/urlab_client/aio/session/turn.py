@@ -1,0 +1,245 @@
+"""Turns: exclusive access to the client's state, for tasks whose requests depend on it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeAlias, TypeVar, cast
+
+from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.errors import ProtocolError
+from urlab_client.protocol.base import Needs, Op, Reply, Request
+from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.messages.jobs import OpStarted
+
+R = TypeVar("R", bound=Reply)
+T = TypeVar("T")
+
+
+Limits: TypeAlias = tuple[float | None, float | None]
+"""Loop times of two deadlines, for the reply and for the connection; None waits without limit."""
+
+
+class _TurnSession(Protocol):
+    """The part of `Session` that a turn needs; see there."""
+
+    line: Mutex
+    turns: Mutex
+    editing: Mutex
+
+    @property
+    def transport(self) -> RequestTransport: ...
+
+    def bound_loop(self) -> asyncio.AbstractEventLoop: ...
+
+    def check_offered(self, op: Op) -> None: ...
+
+    def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits: ...
+
+    async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None: ...
+
+    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]: ...
+
+
+class Turn:
+    """Exclusive access of one task to the client's state, and to the connection for requests that depend on it.
+
+    Within a turn a request is built, sent and accounted for, and its reply updates the state. Requests that do not
+    depend on the client's state may be sent in between only during `aside`.
+    """
+
+    __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
+
+    def __init__(self, session: _TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
+        self._session = session
+        self._op = op
+        self._timeout: Timeout = timeout
+        self._each = each
+        self._asked: Limits | None = None
+        self._first = True
+        self._ready = False
+        self._began = session.bound_loop().time()
+        self._before = 0  # requests that had been sent before the latest `call`
+        self._left = False
+
+    def begin_nowait(self) -> bool:
+        """Begin if no other task has a turn and no request is in progress; return whether the turn has begun."""
+        session, op = self._session, self._op
+        self._asked = session.limits(op, self._timeout, self._began)
+        if op.needs is Needs.EDITOR or not session.turns.acquire_nowait():
+            return False
+        if not session.line.acquire_nowait():
+            session.turns.release()
+            return False
+        self._ready = True
+        return True
+
+    async def begin(self) -> None:
+        """Wait for the turn.
+
+        Raises:
+            URLabTimeoutError: Other tasks had their turns until the deadline; nothing was sent.
+        """
+        session, op = self._session, self._op
+        limits = self._asked or session.limits(op, self._timeout, self._began)
+        self._asked = limits
+        await session.acquire(session.turns, op, limits[0])
+        try:
+            await self._take_line(limits[0])
+        except BaseException:
+            session.turns.release()
+            raise
+
+    def end(self) -> None:
+        """End the turn, so that the next one can begin."""
+        if self._ready:
+            self._give_line()
+        self._session.turns.release()
+
+    async def __aenter__(self) -> Self:
+        await self.begin()
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.end()
+
+    @property
+    def sent(self) -> bool:
+        """Whether the request of the latest `call` was sent, so that the server may have executed it."""
+        return self._session.transport.stats.sent > self._before if self._ready else self._left
+
+    def call(self, request: Request[R], *, takes: float | None = None) -> Coroutine[Any, Any, R]:
+        """Send a request, built since the last wait of this turn, and return its reply.
+
+        Args:
+            request: The request.
+            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
+                default timeout.
+
+        Raises:
+            URLabError: See `Session.call`.
+        """
+        session, op, limits = self._session, self._op, self._asked
+        self._before = session.transport.stats.sent
+        if limits is None or takes is not None or type(request) is not op.request:
+            op = op_of(request)
+            session.check_offered(op)
+            limits = self._limits(op, takes)
+        self._asked = None
+        self._first = False
+        answer = session.exchange(request, op, limits)
+        if op.needs is Needs.EDITOR:
+            return _await_reply(op, answer)
+        return cast("Coroutine[Any, Any, R]", answer)  # the server answers only the editor's ops with a job
+
+    def deadline(self, takes: float) -> float:
+        """Return the loop time until which this turn may wait for something that takes `takes` seconds."""
+        by = asyncio.get_running_loop().time() + takes
+        limit = None if self._timeout is DEFAULT else self._limits(self._op)[0]
+        return by if limit is None else min(by, limit)
+
+    async def aside(self, work: Awaitable[T]) -> T:
+        """Let requests that do not depend on the client's state pass while awaiting `work`, which sends nothing."""
+        self._give_line()
+        result = await work
+        await self._take_line(self._limits(self._op)[0])
+        return result
+
+    async def _take_line(self, deadline: float | None) -> None:
+        session, op = self._session, self._op
+        editing = op.needs is Needs.EDITOR
+        if editing:
+            await session.acquire(session.editing, op, deadline)
+        try:
+            await session.acquire(session.line, op, deadline)
+        except BaseException:
+            if editing:
+                session.editing.release()
+            raise
+        self._ready = True
+
+    def _give_line(self) -> None:
+        self._left = self._session.transport.stats.sent > self._before
+        self._ready = False
+        self._session.line.release()
+        if self._op.needs is Needs.EDITOR:
+            self._session.editing.release()
+
+    def _limits(self, op: Op, takes: float | None = None) -> Limits:
+        # The wait for the turn counts for the first request, and for all requests if one timeout covers them.
+        counted = self._first or (self._timeout is not DEFAULT and not self._each)
+        since = self._began if counted else asyncio.get_running_loop().time()
+        return self._session.limits(op, self._timeout, since, takes)
+
+
+Settle: TypeAlias = Callable[[Turn], Awaitable[object]]
+"""Makes certain, within a turn, what a request with an unknown outcome was about."""
+
+
+async def _await_reply(op: Op, answer: Awaitable[R | OpStarted]) -> R:
+    return require_reply(op, await answer)
+
+
+def require_reply(op: Op, answer: R | OpStarted) -> R:
+    """Return the reply to an op that may not run as a job.
+
+    Raises:
+        ProtocolError: The server has started a job instead.
+    """
+    if isinstance(answer, OpStarted):
+        raise ProtocolError(f"{op.name}: the server started {answer.job_id} instead of replying.", op=op.name)
+    return answer
+
+
+class Mutex:
+    """Mutual exclusion of tasks, first come, first served.
+
+    Unlike `asyncio.Lock` it can be taken without a coroutine, and it is handed over: a task that is woken holds it.
+    """
+
+    __slots__ = ("_held", "_waiting")
+
+    def __init__(self) -> None:
+        self._held = False
+        self._waiting: deque[asyncio.Future[None]] = deque()
+
+    def locked(self) -> bool:
+        """Return whether the lock is held."""
+        return self._held
+
+    def acquire_nowait(self) -> bool:
+        """Take the lock if it is free, and return whether it was."""
+        if self._held:
+            return False
+        self._held = True
+        return True
+
+    async def acquire(self) -> None:
+        """Wait for the lock and take it."""
+        if not self._held:
+            self._held = True
+            return
+        handed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.append(handed)
+        try:
+            await handed
+        except asyncio.CancelledError:
+            if handed.cancelled():
+                self._waiting.remove(handed)
+            else:  # the lock was handed over in the same loop iteration in which the caller was cancelled
+                self.release()
+            raise
+
+    def release(self) -> None:
+        """Hand the lock to the task that has waited longest, or free it."""
+        for handed in self._waiting:
+            if not handed.done():
+                self._waiting.remove(handed)
+                handed.set_result(None)
+                return
+        self._held = False

@@ -1,0 +1,1 @@
+"""Published data: streams, what feeds them, and the state and pictures that arrive without a request."""
