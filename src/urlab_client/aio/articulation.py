@@ -237,7 +237,7 @@ class URLabArticulation(URLabEntity):
                 for name, info in topics.items()
             }
             for name, info in topics.items():
-                views[name].info = info
+                views[name].camera.info = info
             self._cameras = NameMap(views, kind="camera", owner=self.prefix)
         return self._cameras
 

@@ -29,6 +29,7 @@ from urlab_client.aio.session.control import Control
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.capturing import Capturing
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.resetting import take_reset
@@ -38,6 +39,7 @@ from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import send_step, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.rows import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
@@ -478,7 +480,7 @@ class URLabClient(ClientState):
             except TypeError:
                 raise TypeError(f"capture takes camera names, got {cameras!r:.80}.") from None
         views = [self.camera(name) for name in names.values()]
-        samples = await self._publishers.capture(views, timeout) if views else []
+        samples = await self._publishers.capture([view.camera for view in views], timeout) if views else []
         return dict(zip(names, samples, strict=True))
 
     def state_stream(
@@ -563,10 +565,14 @@ class URLabClient(ClientState):
                 hint="Create the client with local_model=True, or use state_stream().",
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
+        wanted = RowFilter(keys, kinds, components, entities=articulation is None)
+        source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
+        if not self._session.features.publishes_rows:
+            # From the socket, which delivers every snapshot; a region holds only the newest.
+            states = self._publishers.state(StreamPolicy.ALL)
+            source = DerivedRowSource(states, lambda: self.articulations, wanted)
         return Stream(
-            self._publishers.rows(
-                keys, kinds, components, entities=articulation is None, robots=lambda: self.articulations
-            ),
+            source,
             policy=policy,
             buffer=buffer,
             buffer_bytes=buffer_bytes,

@@ -59,15 +59,7 @@ class _Movable(Protocol):
 
 
 class Motion:
-    """Lets simulation time pass.
-
-    Args:
-        simulation: The client.
-        driven: Returns whether the client has set-points of its own, which must be sent in live mode.
-        locate: Asks the server for the state if it is not known yet.
-        stall_timeout: Wall-clock seconds within which simulation time must advance; None waits without limit.
-        session: The client's session, which counts restarts of the server.
-    """
+    """Lets simulation time pass."""
 
     def __init__(
         self,

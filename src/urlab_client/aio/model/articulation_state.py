@@ -188,13 +188,7 @@ class MirroredArticulation(MirroredEntity):
         self.bind(info, layout, keep=False)
 
     def bind(self, info: ArticulationInfo, layout: ArticulationLayout, *, keep: bool) -> None:
-        """Adopt the description from a handshake. Keep set-points and control mode if they still fit.
-
-        Args:
-            info: The description.
-            layout: Addresses of its values in the model.
-            keep: Whether to keep the state, too.
-        """
+        """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)

@@ -113,11 +113,6 @@ async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) ->
 
     A chunk whose reply was lost is not sent again, because the server counts bytes. A new manifest then shows what is
     missing. The commit is sent once.
-
-    Args:
-        model: The model.
-        call: Callback that sends a request within the caller's deadline.
-        on_progress: Callback invoked after each chunk.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:

@@ -51,9 +51,7 @@ L = TypeVar("L")
 class Asks(Protocol[L_contra]):
     """Sends one request within the caller's turn and returns the reply."""
 
-    def __call__(self, request: Request[R], limits: L_contra, /) -> Awaitable[R]:
-        """See the class."""
-        ...
+    def __call__(self, request: Request[R], limits: L_contra, /) -> Awaitable[R]: ...
 
 
 class ControlledSession(Protocol):
@@ -100,10 +98,6 @@ class _Claim:
 class Control:
     """The robots that one client owns.
 
-    Args:
-        session: Session that sends the claims.
-        wanted: Whether to claim a robot with the first write to it; False leaves that to `claim`.
-
     Attributes:
         resolve: Returns the key of an articulation for any of its names; None for an unknown name.
         owner: Owner name of this client's claims.
@@ -128,11 +122,6 @@ class Control:
 
     async def send(self, request: ControlRequest[R], ask: Asks[L], limits: L) -> R:
         """Send a request that writes to robots, and claim them first where necessary.
-
-        Args:
-            request: The request.
-            ask: Sends one request within the caller's turn.
-            limits: Time limits, passed to `ask`.
 
         Raises:
             NotControlOwner: Another client owns one of the robots; nothing was written.

@@ -141,11 +141,6 @@ class Session:
     ) -> R:
         """Send a request that does not depend on the client's state; return its reply, or the result of its job.
 
-        Args:
-            request: Any request struct of `urlab_client.protocol.messages`.
-            timeout: Seconds for queueing, sending and the reply, including a job; None waits without limit.
-            on_progress: Callback invoked with the progress of a job.
-
         Raises:
             URLabRPCError: The server refused the request.
             URLabConnectionError: The server cannot be reached, or the connection broke.
@@ -217,11 +212,8 @@ class Session:
     def turn(self, request: type[Request[Any]], *, timeout: Timeout = DEFAULT, each: bool = False) -> Turn:
         """Return a turn for requests that depend on the client's state or change it.
 
-        Args:
-            request: Type of the first request, whose deadline also covers the wait for the turn.
-            timeout: Seconds for queueing and all requests together; None waits without limit. The default timeout
-                applies to each request separately.
-            each: Whether a given timeout also applies to each request separately.
+        The deadline of the first request also covers the wait for the turn. A given timeout covers all requests
+        together, or `each` of them; the default timeout always applies to each.
         """
         op = op_of(request)
         self.check_offered(op)
@@ -305,15 +297,7 @@ class Session:
             raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
     def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
-        """Return the limits of a request.
-
-        Args:
-            op: Its op.
-            timeout: Timeout given by the caller.
-            since: Loop time from which the timeout counts.
-            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
-                default timeout.
-        """
+        """Return the limits of a request."""
         default = self._default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout

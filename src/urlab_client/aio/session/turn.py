@@ -116,10 +116,7 @@ class Turn:
     def call(self, request: Request[R], *, takes: float | None = None) -> Coroutine[Any, Any, R]:
         """Send a request, built since the last wait of this turn, and return its reply.
 
-        Args:
-            request: The request.
-            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
-                default timeout.
+        By default the server may take the seconds that the op declares; `takes` overrides them.
 
         Raises:
             URLabError: See `Session.call`.

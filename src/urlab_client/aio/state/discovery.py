@@ -38,15 +38,7 @@ _PERHAPS_S: Final = 0.2  # of one that publishes one per tick in live mode, and 
 
 
 class Discovery:
-    """Opens sessions and applies handshakes.
-
-    Args:
-        state: State of the client, updated from each handshake.
-        local_model: Whether to load the model of the handshake.
-        check_version: Whether to raise an error if the MuJoCo builds differ.
-        promote: Whether to switch the server to the step mode that the client was created with.
-        trusted: Whether to load models in MuJoCo's binary format.
-    """
+    """Opens sessions and applies handshakes."""
 
     def __init__(
         self, state: SimState, *, local_model: bool, check_version: bool, promote: bool, trusted: bool

@@ -17,15 +17,7 @@ from urlab_client.values.names import compiled_names
 async def take_reset(
     state: SimState, turn: Turn, keyframe: str | None, seed: int | None, qpos: Mapping[str, Mapping[str, float]]
 ) -> ResetOk:
-    """Reset the simulation and apply the new state.
-
-    Args:
-        state: State of the client.
-        turn: Turn that contains the whole operation.
-        keyframe: Short or compiled name of the keyframe to reset to.
-        seed: Seed that the server stores.
-        qpos: First component of joint positions, by articulation key and joint name.
-    """
+    """Reset the simulation and apply the new state."""
     state.require_handshake("reset")
     articulations = state.objects.articulations
     given = mapping("reset: per_articulation_qpos", qpos, "articulation keys to joint positions")

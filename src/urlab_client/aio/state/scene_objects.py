@@ -182,5 +182,5 @@ class SceneObjects:
         view = self.global_cameras.get(name)
         if view is None:
             return URLabCameraView(name, info, self._publishers)
-        view.info = info
+        view.camera.info = info
         return view

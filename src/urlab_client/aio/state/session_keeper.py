@@ -37,13 +37,7 @@ _PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts; the last one r
 
 
 class SessionKeeper:
-    """Keeps the session of one client open, in one task.
-
-    Args:
-        session: Session of the client.
-        state: State of the client.
-        discovery: Discovery that opens sessions.
-    """
+    """Keeps the session of one client open, in one task."""
 
     def __init__(self, session: Session, state: SimState, discovery: Discovery) -> None:
         self._session = session

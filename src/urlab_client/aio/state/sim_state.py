@@ -21,9 +21,9 @@ from urlab_client.aio.observer import ClientObserver
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
-from urlab_client.aio.streams.live_state import LatestPicture, LiveState
+from urlab_client.aio.streams.live_state import LiveState
+from urlab_client.aio.streams.pictures import LatestPicture, StepStreams
 from urlab_client.aio.streams.publishers import Publishers
-from urlab_client.aio.streams.step_streams import StepStreams
 from urlab_client.enums import CameraMode, CameraTiming, StepMode
 from urlab_client.errors import (
     NoActiveManager,
@@ -262,11 +262,6 @@ class SimState:
     def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
         """Apply the state in a reply completely or not at all.
 
-        Args:
-            reply: The reply.
-            op: Op of the reply, for messages.
-            into_mirror: Whether to write it to the local data, too; not in puppet mode, where they are its source.
-
         Raises:
             ProtocolError: The state does not fit the model or the cameras; nothing was applied.
         """
@@ -445,4 +440,4 @@ def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
     if isinstance(mode, CameraMode) and frame.dtype != ("float32" if mode is CameraMode.DEPTH else "bgra8"):
         raise ProtocolError(f"step: a frame of {mode} camera {view.name!r} has dtype {frame.dtype!r}.", op="step")
     size = frame.width, frame.height
-    return decode_camera(frame.data, view.mode, *size, memory=view.memory, where=view.name).pixels
+    return decode_camera(frame.data, view.mode, *size, memory=view.camera.memory, where=view.name).pixels

@@ -21,15 +21,7 @@ Cameras = bool | Mapping[str, "str | CameraTiming"]
 
 
 async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
-    """Advance physics according to the step mode and apply the new state.
-
-    Args:
-        state: State of the client.
-        turn: Turn that contains the whole operation.
-        n_steps: Number of physics steps.
-        cameras: Pictures to return.
-        asked: Observation level of the reply; None for the session's.
-    """
+    """Advance physics according to the step mode and apply the new state."""
     state.require_handshake("step")
     await settle_mode(state, turn)
     mode = state.mode
