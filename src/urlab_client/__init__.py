@@ -12,13 +12,13 @@ if TYPE_CHECKING:
         CallOutcome,
         CallRecord,
         ClientConfig,
+        ClientObserver,
         Diagnosis,
         Finding,
         Resync,
         ServerInfo,
         Verdict,
     )
-    from urlab_client.aio.observer import ClientObserver
     from urlab_client.enums import (
         ActuatorType,
         CameraMode,
@@ -205,7 +205,7 @@ _HOMES = (
     "urlab_client.enums",
     "urlab_client.errors",
     "urlab_client.values.names",
-    "urlab_client.aio.observer",
+    "urlab_client.aio.client_types",
     "urlab_client.aio.client_types",
     "urlab_client.values.descriptions",
     "urlab_client.values.scene_types",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.observer import ClientObserver
 from urlab_client.enums import ControllerKind
 
 if TYPE_CHECKING:

@@ -461,12 +461,12 @@ class MirroredArticulation(MirroredEntity):
             return None if pair is None else (pair[1].xpos[body_id].copy(), pair[1].xquat[body_id].copy())
 
 
-Carried = dict[MirroredEntity, Wrenches]
-"""The wrenches that a step carries, by the record that they were applied to."""
+SentWrenches = dict[MirroredEntity, Wrenches]
+"""The wrenches of one step, by the record that they were applied to."""
 
 
-def give_back(carried: Carried) -> None:
+def restore_wrenches(sent: SentWrenches) -> None:
     """Buffer the wrenches of a step that was not executed again, unless newer ones were applied."""
-    for record, wrenches in carried.items():
+    for record, wrenches in sent.items():
         with record.mirror.lock:
             record.wrenches = {**wrenches, **record.wrenches}

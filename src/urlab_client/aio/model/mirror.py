@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from urlab_client._mujoco import forget_last_document, without_newer_attributes
-from urlab_client.aio.model.numbers import first_not_finite
+from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import HelloOk, Perturbation

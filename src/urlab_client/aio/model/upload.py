@@ -9,14 +9,15 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
+from urlab_client.aio.defaults import Timeout
+from urlab_client.aio.session.session import Session
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
-from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
@@ -33,16 +34,10 @@ from urlab_client.values.types import UploadProgress
 if TYPE_CHECKING:
     import mujoco
 
-R = TypeVar("R", bound=Reply)
-
 OnUpload = Callable[[UploadProgress], object]
 """Callback invoked with the progress of an upload on the client's event loop."""
 
 _ATTEMPTS: Final = 3
-
-
-class _Call(Protocol):
-    def __call__(self, request: Request[R]) -> Awaitable[R]: ...
 
 
 @dataclass(frozen=True)
@@ -108,7 +103,9 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     return flat
 
 
-async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
+async def upload(
+    model: FlatModel, session: Session, timeout: Timeout, on_progress: OnUpload | None
+) -> UploadModelCommitOk:
     """Send the parts of a model that the server lacks, and import the model.
 
     A chunk whose reply was lost is not sent again, because the server counts bytes. A new manifest then shows what is
@@ -116,18 +113,18 @@ async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) ->
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
-            upload_id = await _send_files(model, call, on_progress)
+            upload_id = await _send_files(model, session, timeout, on_progress)
             break
         except (UnknownUpload, ConnectionLost, OutcomeUnknown):
             if attempt == _ATTEMPTS:
                 raise
     else:
         raise AssertionError("the last attempt returns or raises")
-    return await call(UploadModelCommit(upload_id=upload_id))
+    return await session.call(UploadModelCommit(upload_id=upload_id), timeout=timeout)
 
 
-async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> str:
-    opened = await call(model.manifest)
+async def _send_files(model: FlatModel, session: Session, timeout: Timeout, on_progress: OnUpload | None) -> str:
+    opened = await session.call(model.manifest, timeout=timeout)
     missing = [("asset", name, model.files[name]) for name in dict.fromkeys(opened.need_assets)]
     if opened.need_xml:
         missing.insert(0, ("xml", "", model.xml))
@@ -136,11 +133,10 @@ async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | Non
     for kind, name, data in missing:
         for offset in range(0, max(1, len(data)), MAX_CHUNK_BYTES):
             chunk = data[offset : offset + MAX_CHUNK_BYTES]
-            await call(
-                UploadModelChunk(
-                    upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
-                )
+            request = UploadModelChunk(
+                upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
             )
+            await session.call(request, timeout=timeout)
             sent += len(chunk)
             if on_progress is not None:
                 on_progress(UploadProgress(file=name or "model.xml", sent_bytes=sent, total_bytes=total))

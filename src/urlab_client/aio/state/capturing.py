@@ -16,7 +16,6 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import learn_mode, stopped_live
 from urlab_client.aio.state.step_pictures import first_picture_s
 from urlab_client.aio.streams.pictures import PictureListener
 from urlab_client.aio.streams.sources import Camera
@@ -74,14 +73,14 @@ class Capturing:
             views = self._views(cameras)
             taking = _Taking(state, turn, views, self._deadline(views, timeout))
             try:
-                if state.mode_assumed and not state.session.read_only:
+                if state.mode.assumed and not state.session.read_only:
                     await self._learn_mode(turn)
-                if state.mode is StepMode.LIVE or state.mode_assumed:
-                    await taking.in_live_mode(certain=not state.mode_assumed)
+                if state.mode.live or state.mode.assumed:
+                    await taking.in_live_mode(certain=not state.mode.assumed)
                 else:
-                    async with stopped_live(state, turn):
+                    async with state.mode.stopped_live(turn):
                         await taking.in_live_mode(certain=True)
-                    taking.note_time(state.sim_time)
+                    taking.note_time(state.clocks.sim_time)
             except ModeLocked as locked:
                 locked.hint = "In this mode, pictures come with steps: call client.step(include_cameras=…)."
                 raise
@@ -113,9 +112,9 @@ class Capturing:
             return
         await turn.aside(asyncio.sleep(_MOVES_S))
         if (await turn.call(PieStatus())).sim_time != before:
-            state.mode = StepMode.LIVE  # no other client holds the session, so physics runs on its own
+            state.mode.note(StepMode.LIVE)  # no other client holds the session, so physics runs on its own
         else:
-            await learn_mode(state, turn)
+            await state.mode.find_out(turn)
 
 
 class _Taking:
@@ -146,7 +145,7 @@ class _Taking:
             raise PictureTimeout(
                 f"capture: no picture of {', '.join(map(repr, late))} arrived in time.",
                 cameras=late,
-                hint=_ASSUMED if state.mode_assumed else _HINT,
+                hint=_ASSUMED if state.mode.assumed else _HINT,
             ) from None
 
     def note_time(self, sim_time: float) -> None:

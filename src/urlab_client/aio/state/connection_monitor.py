@@ -106,7 +106,7 @@ class ConnectionMonitor:
 
     @property
     def _playing(self) -> bool:
-        return self._state.hello is not None and self._state.hello.manager_present
+        return self._state.playing
 
     def _on_state_line(self, connected: bool) -> None:
         if self._playing and not connected:

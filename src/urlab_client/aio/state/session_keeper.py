@@ -82,7 +82,7 @@ class SessionKeeper:
     async def _act_on(self, event: ClientEvent) -> None:
         match event:
             case ServerLost():
-                self._time = self._state.sim_time
+                self._time = self._state.clocks.sim_time
             case SessionLost():
                 if event.session_id == self._session.session_id:
                     await self._on_lost(event.session_id)
@@ -132,7 +132,7 @@ class SessionKeeper:
                 async with session.turn(Hello) as turn:
                     if session.session_id == lost:
                         log.info("discovering again, because %s", why)
-                        await self._discovery.open(turn, state.level)
+                        await self._discovery.open(turn, state.level.of_session)
             except (URLabConnectionError, URLabTimeoutError) as error:
                 if isinstance(error, ClientClosed):
                     raise

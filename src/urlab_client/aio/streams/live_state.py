@@ -82,7 +82,7 @@ class LiveState(MessageHandler):
                 payload, self._payload = self._payload, None
                 self._snapshot = StateSnapshot.decode(payload)
             if self._snapshot is not None:
-                self._take_over(self._snapshot)
+                self._apply(self._snapshot)
         except ProtocolError as error:
             self._snapshot = None
             self._refuse(str(error))
@@ -95,7 +95,7 @@ class LiveState(MessageHandler):
         self._running = False
         self._forget()
 
-    def _take_over(self, snapshot: StateSnapshot) -> None:
+    def _apply(self, snapshot: StateSnapshot) -> None:
         if not self._free():
             if self._retry is None:
                 self._retry = asyncio.get_running_loop().call_later(_RETRY_S, self._try_again)

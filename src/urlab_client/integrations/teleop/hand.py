@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from urlab_client.aio.arguments import finite, finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
-from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.errors import URLabError
 from urlab_client.integrations.ik import IkSolution, InverseKinematics
 from urlab_client.integrations.ik.solver import Vector, own_sites
