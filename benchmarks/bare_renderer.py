@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from urlab_client.server.render.drawing import simplify_textures
+from urlab_client.simulation.drawing import simplify_textures
 
 
 def _main(backend: str, path: str, camera: str, width: int, height: int) -> None:

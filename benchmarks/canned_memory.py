@@ -12,6 +12,7 @@ import ctypes
 import mmap
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -22,13 +23,14 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from urlab_client.protocol import doorbell, shm
+from urlab_client.protocol import shm
 
 __all__ = ["memory_server"]
 
 _POLL_S = 100e-6
 _BRISK_S = 200e-6
 _PR_SET_TIMERSLACK = 29
+_RUNG_FOR_REPLY = b"r"
 
 
 @contextlib.contextmanager
@@ -64,7 +66,9 @@ def memory_server(
 def _region(path: Path, stride: int) -> shm.Region:
     with path.open("w+b") as file:
         file.truncate(shm.region_size(stride))
-        return shm.create(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), stride, fence=shm.no_fence)
+        file.write(struct.pack("<IIIIQI36x", shm.MAGIC, shm.VERSION, stride, 2, 0, 0))
+        file.flush()
+        return shm.attach(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=lambda: None)
 
 
 def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:
@@ -130,7 +134,7 @@ def _main() -> None:
         threading.Thread(target=_write_pictures, args=(directory, camera), daemon=True).start()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     if bell:
-        listener.bind(str(directory / doorbell.FILE))
+        listener.bind(str(directory / "doorbell.sock"))
         listener.listen()
     print(port, flush=True)
     if not bell:
@@ -149,7 +153,7 @@ def _main() -> None:
                 served_at = -_BRISK_S
                 while True:
                     if memory.serve():
-                        client.send(doorbell.REPLY)
+                        client.send(_RUNG_FOR_REPLY)
                         served_at = time.monotonic()
                     elif time.monotonic() - served_at > _BRISK_S:
                         break

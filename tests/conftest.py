@@ -79,7 +79,7 @@ collect_ignore = [test.removeprefix("tests/") for test in IMPOSSIBLE if "::" not
 def without_opengl() -> str:
     """Return why no pictures can be drawn here; empty where they can. The workers ask the process that starts them."""
     if OPENGL not in os.environ:
-        from urlab_client.server.render.opengl import Backend, search_backend
+        from urlab_client.simulation.opengl import Backend, search_backend
 
         found = search_backend()
         os.environ[OPENGL] = "" if isinstance(found, Backend) else found
@@ -104,7 +104,7 @@ def lacking(item: pytest.Item) -> str:
 @pytest.fixture(scope="session")
 def opengl() -> None:
     """Look for OpenGL, which the first picture would wait for. Tests whose fixtures request this get the mark."""
-    from urlab_client.server.render.opengl import search_backend
+    from urlab_client.simulation.opengl import search_backend
 
     search_backend()
 

@@ -44,11 +44,11 @@ AWAITED = {
     "sync/_loop.py:_cancel_all": "likewise",
     "sync/_loop.py:_main": "waits for them in bounded time, and logs their errors",
     "sync/_loop.py:_end": "likewise",
-    "web/stoppable.py:stoppable": "waits for the task and raises its error",
+    "console/stoppable.py:stoppable": "waits for the task and raises its error",
     "web/recording_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
-    "web/recordings.py:start": "start() waits for its begin, stop() or the end of the console for its end; both raise",
-    "web/console_session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
-    "web/console_session.py:_keep": "waits for both tasks, and raises the error of the first",
+    "console/recordings.py:start": "start() waits for its begin, stop() or the console's end for its end; both raise",
+    "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
+    "console/session.py:_keep": "waits for both tasks, and raises the error of the first",
     "web/application.py:_live": "the task group of one connection, which ends with the error",
     "web/application.py:_pictures": "likewise",
     "web/application.py:_poses": "likewise",
@@ -80,8 +80,7 @@ KILLED = {
         "urlab-server",
         "urlab-server-end",
         "urlab-server-log",
-        "urlab-shm",
-        "urlab-sockets",
+        "urlab-waiter",
         "urlab-watch",
     },
     "tests/sync/test_portal.py": {"urlab-io"},
@@ -89,7 +88,6 @@ KILLED = {
     "tests/integrations/test_failing_threads.py": {
         "urlab-environment",
         "urlab-feed",
-        "urlab-lerobot",
         "urlab-pictures",
         "urlab-record",
         "urlab-view",
@@ -149,7 +147,7 @@ def test_each_name_is_killed_by_a_test(sources: list[tuple[str, ast.Module]]) ->
     for file, tree in sources:
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and called(node) in HELPERS and node.args and (name := text(node.args[0])):
-                names.add((file.startswith("server/"), name))
+                names.add((file.startswith(("server/", "_sandbox/")), name))
     assert {name for _, name in names if not name.startswith("urlab-")} == set()
     killed = {(file.startswith("tests/server/"), name) for file, all_ in KILLED.items() for name in all_}
     assert killed == names

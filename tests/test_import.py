@@ -72,7 +72,40 @@ def test_a_name_is_what_type_checkers_are_told_it_is() -> None:
                 assert getattr(urlab_client, alias.name) is getattr(import_module(str(node.module)), alias.name)
     assert told == set(urlab_client.__all__) - {"__version__"}
     assert told <= set(dir(urlab_client))
+    assert len(urlab_client.__all__) <= 60
     assert urlab_client.aio is import_module("urlab_client.aio")  # as after any import of the package's names
+
+
+@pytest.mark.parametrize("home", ["enums", "errors", "events", "types"])
+def test_names_of_the_public_modules_can_be_imported_from_the_package_too(home: str) -> None:
+    import urlab_client
+
+    module = import_module(f"urlab_client.{home}")
+    for name in module.__all__:
+        if name in {"RPC_ERRORS", "UNCLAIMED", "rpc_error"}:
+            continue  # for the protocol
+        assert getattr(urlab_client, name) is getattr(module, name)
+        assert (name in dir(urlab_client)) == (name in urlab_client.__all__)
+
+
+def test_the_tree_of_exceptions_is_that_of_the_docstring() -> None:
+    from urlab_client import errors
+
+    shown: dict[str, str] = {}
+    above: list[str] = []
+    for line in (errors.__doc__ or "").splitlines():
+        name = line.split()[0].rstrip(",") if line.startswith("    ") else ""
+        depth = (len(line) - len(line.lstrip())) // 4
+        if isinstance(getattr(errors, name, None), type):
+            above[depth - 1 :] = [name]
+            shown[name] = above[-2] if depth > 1 else ""
+    classes = {
+        name: value for name, value in vars(errors).items() if isinstance(value, type) and name in errors.__all__
+    }
+    per_code = {cls.__name__ for cls in errors.RPC_ERRORS.values()}
+    assert set(shown) == (set(classes) - per_code) | {"SessionTakenOver", "NoActiveManager"}
+    for name, parent in shown.items():
+        assert not parent or issubclass(classes[name], classes[parent])
 
 
 def test_all_names_can_be_imported_with_a_star() -> None:

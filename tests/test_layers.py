@@ -18,24 +18,25 @@ VALUES = frozenset({"enums", "errors", "values"})
 ALLOWED: dict[str, frozenset[str]] = {
     "enums": frozenset(),
     "errors": frozenset({"enums", "values"}),
-    "values": frozenset({"_extras", "enums", "errors"}),
+    "values": frozenset({"_installation", "enums", "errors"}),
     "protocol": VALUES,
+    "events": VALUES | {"protocol"},
+    "types": VALUES | {"aio", "protocol"},
     "keys": frozenset({"errors"}),
     "_platform": frozenset(),
-    "_sandbox": frozenset(),
+    "_sandbox": frozenset({"_platform"}),
     "_mujoco": frozenset(),
-    "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),
-    "aio": VALUES | {"_extras", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
-    "sync": VALUES | {"aio", "protocol"},
+    "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
+    "sync": VALUES | {"aio", "events", "protocol", "types"},
     "randomise": VALUES | {"protocol"},
+    "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
     "server": VALUES
-    | {"_extras", "_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise"},
-    "": VALUES | {"_installation", "aio", "protocol", "sync"},
+    | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise", "simulation"},
+    "": VALUES | {"_installation", "aio", "events", "protocol", "sync", "types"},
     "integrations": VALUES
     | {
         "",
-        "_extras",
         "_installation",
         "_mujoco",
         "_platform",
@@ -44,26 +45,31 @@ ALLOWED: dict[str, frozenset[str]] = {
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
     },
-    "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync"},
-    "web": VALUES | {"_extras", "_installation", "aio", "integrations", "protocol"},
-    "mcp": VALUES | {"_extras", "aio", "protocol", "web"},
+    "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync", "types"},
+    "console": VALUES | {"_installation", "aio", "events", "integrations", "protocol", "types"},
+    "web": VALUES | {"_installation", "aio", "console", "events", "integrations", "protocol", "types"},
+    "mcp": VALUES | {"_installation", "aio", "console", "protocol", "types", "web"},
     "cli": VALUES
     | {
         "",
-        "_extras",
         "_installation",
         "_mujoco",
         "_platform",
         "aio",
+        "console",
+        "events",
         "integrations",
         "keys",
         "mcp",
         "protocol",
         "randomise",
         "server",
+        "simulation",
         "sync",
+        "types",
         "web",
     },
     "__main__": frozenset({"cli"}),
@@ -95,7 +101,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "server": (
         "dialects",
-        "controller_text",
         "system",
         "limits",
         "refusal",
@@ -221,12 +226,23 @@ def test_imports_point_one_way() -> None:
     assert violations(PACKAGE) == []
 
 
+def test_integrations_use_the_public_server() -> None:
+    public = {"SimulatedServer", "ServedRequest"}
+    inside = [
+        f"{file.relative_to(PACKAGE).as_posix()}:{line}: {imported}"
+        for file in sorted((PACKAGE / "integrations").rglob("*.py"))
+        for line, imported in facts(file).imports
+        if imported.startswith("urlab_client.server.") and imported.rpartition("urlab_client.server.")[2] not in public
+    ]
+    assert inside == []
+
+
 def test_imports_inside_the_large_layers_point_one_way() -> None:
     assert room_violations(PACKAGE) == []
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "console", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 

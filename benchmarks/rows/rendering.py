@@ -19,7 +19,7 @@ from benchmarks import bare_renderer
 from benchmarks.harness import Figure, Pair, Row
 from benchmarks.robots import dialect, humanoid
 from urlab_client import URLabClient
-from urlab_client.server.render.opengl import Backend, need_backend
+from urlab_client.simulation.opengl import Backend, need_backend
 
 __all__ = ["ROWS"]
 

@@ -1,4 +1,4 @@
-"""The installation of this package: the command that adds an extra, and conflicts with other packages.
+"""The installation of this package: extras that are missing, the command that adds one, and conflicts with others.
 
 Two distributions that both contain a top-level `urlab_client` overwrite each other's files, and neither works.
 Searching all installed distributions is slow, so only `urlab doctor` does it, and the handling of failed imports.
@@ -56,3 +56,18 @@ def _source(extra: str) -> str:
 
 def _normalized(name: str) -> str:
     return name.lower().replace("_", "-").replace(".", "-")
+
+
+class MissingExtra(ImportError):
+    """An optional library is not installed; the message gives the command that installs its extra."""
+
+
+def need(*modules: str, extra: str) -> None:
+    """Check that modules can be imported.
+
+    Raises:
+        MissingExtra: A module is missing.
+    """
+    for name in modules:
+        if importlib.util.find_spec(name) is None:
+            raise MissingExtra(f"{name} is not installed; run: {install_command(extra)}", name=name)

@@ -10,6 +10,19 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, TypeVar
 
+__all__ = [
+    "ActuatorType",
+    "CameraMode",
+    "CameraTiming",
+    "ControlMode",
+    "ControllerKind",
+    "ObservationLevel",
+    "OutOfRange",
+    "PIEState",
+    "StepMode",
+    "Transport",
+]
+
 E = TypeVar("E", bound=StrEnum)
 
 

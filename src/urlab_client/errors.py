@@ -1,5 +1,29 @@
 """All exceptions of this package, and the table from wire codes to exception classes.
 
+    URLabError                       what failed, on what, and what to do next; `op`, `code`, `hint`
+        URLabConnectionError         also a `ConnectionError`
+            ServerUnreachable
+                AuthenticationFailed
+            ConnectionLost
+            OutcomeUnknown
+            ClientClosed
+            ForkedError
+            SessionTakenOver         also a `URLabRPCError`
+                NoSession
+                ServerRestarted
+        URLabTimeoutError            also a `TimeoutError`
+            NotSettled
+            PictureTimeout
+        ProtocolError
+        ReadOnlyClient
+        URLabVersionMismatch
+        StreamOverflow
+        ConcurrentReadError
+        URLabRPCError                the server refused a request; `details`
+            URLabPIEError
+            NoActiveManager, …       one class for each wire code: `RPC_ERRORS`
+    UnknownName                      a `KeyError`: no such articulation, joint, camera, …
+
 `str()` of each states what failed, on what, and what to do next. All of them can be pickled, so they cross process
 pools. Invalid arguments raise plain `ValueError` or `TypeError` before anything is sent.
 """
@@ -11,6 +35,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 from urlab_client.enums import PIEState, StepMode
+from urlab_client.values.names import UnknownName
 
 __all__ = [
     "RPC_ERRORS",
@@ -97,6 +122,7 @@ __all__ = [
     "UnknownBody",
     "UnknownJob",
     "UnknownKeyframe",
+    "UnknownName",
     "UnknownOp",
     "UnknownUpload",
     "Unsupported",
@@ -334,7 +360,7 @@ class URLabRPCError(URLabError):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error as JSON-compatible data; in addition to the common fields, `details`."""
-        from urlab_client.values.serializable import plain  # errors alone need no NumPy
+        from urlab_client.values.plain import plain  # errors alone need no NumPy
 
         return {**super().to_dict(), "details": plain(self.details, "list")}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,10 @@ from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.live_state import LiveState
-from urlab_client.aio.transport import readiness
-from urlab_client.aio.transport.poller import Poller
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport import waiting as transport_waiting
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.errors import ServerRestarted, ServerUnreachable, URLabError
-from urlab_client.protocol.messages.streams import ClientEvent, ServerReconnected, TaskFailed
+from urlab_client.events import ClientEvent, ServerReconnected, TaskFailed
 from urlab_client.server import SimulatedServer
 
 
@@ -174,33 +173,39 @@ async def test_the_thread_that_waits_for_a_started_server(
     await client.close()
 
 
-async def test_the_thread_that_polls_shared_memory(
+def look_or_die(monkeypatch: pytest.MonkeyPatch, lives: Iterator[bool]) -> list[bool]:
+    """Let the watching thread die after as many looks as are given; return where the next thread notes its looks."""
+    monkeypatch.setattr(transport_waiting, "_AGAIN_S", 0.01)
+    look, again = transport_waiting._Watcher._look, list[bool]()
+
+    def look_or_die(self: Any) -> bool:
+        alive = next(lives, None)
+        if alive is None:
+            again.append(True)
+        return die() if alive is False else look(self)
+
+    monkeypatch.setattr(transport_waiting._Watcher, "_look", look_or_die)
+    return again
+
+
+async def test_the_thread_that_watches_shared_memory(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(SharedMemoryRegions, "connect_bell", lambda _: None)
+    monkeypatch.setattr(ServerRegions, "connect_doorbell", lambda _: None)
     async with (
         SimulatedServer("arm", play=True, shm_dir=tmp_path) as server,
         URLabClient(**server.client_options(), transport="shm", step_mode="direct") as client,
     ):
         await client.discover()
         async with client.events() as events:
-            with monkeypatch.context() as patch:
-                patch.setattr(Poller, "_look", die)
-                step = 0
-                async with asyncio.timeout(DEADLINE_S):
-                    while not events.stats.received:  # a step that is answered at once needs no poll
-                        step += 200
-                        assert (await client.step(200)).step == step
-                await is_told(events, caplog, "urlab-shm")
-            look, looked = Poller._look, list[Poller]()
-
-            def note(poller: Poller) -> Any:
-                looked.append(poller)
-                return look(poller)
-
-            monkeypatch.setattr(Poller, "_look", note)
+            again, step = look_or_die(monkeypatch, iter([False])), 0
             async with asyncio.timeout(DEADLINE_S):
-                while not looked:  # by the next thread
+                while not events.stats.received:  # a step that is answered at once needs no thread
+                    step += 200
+                    assert (await client.step(200)).step == step
+            await is_told(events, caplog, "urlab-waiter")
+            async with asyncio.timeout(DEADLINE_S):
+                while not again:
                     step += 200
                     assert (await client.step(200)).step == step
 
@@ -208,22 +213,13 @@ async def test_the_thread_that_polls_shared_memory(
 def test_the_thread_that_watches_sockets(
     scripted: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(readiness, "_AGAIN_S", 0.01)
-    look, lives, again = readiness._Watcher._look, iter([True, True, False]), list[bool]()
-
-    def look_or_die(self: Any) -> bool:
-        alive = next(lives, None)
-        if alive is None:
-            again.append(True)  # the next thread
-        return die() if alive is False else look(self)
-
     async def main() -> None:
         client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False)
         async with client, client.events() as events:
-            monkeypatch.setattr(readiness._Watcher, "_look", look_or_die)
+            again = look_or_die(monkeypatch, iter([True, True, False]))
             for _ in range(3):
                 assert await client.meta()
-            await is_told(events, caplog, "urlab-sockets")
+            await is_told(events, caplog, "urlab-waiter")
             await wait_until(lambda: again)
             assert await client.meta()
 

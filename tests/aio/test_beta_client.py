@@ -15,17 +15,9 @@ from scripted_beta import BETA_OPS, ROBOT, ScriptedBeta, error
 from waiting import DEADLINE_S
 
 import urlab_client
-from urlab_client import (
-    DestroyFailed,
-    OutcomeUnknown,
-    ProtocolError,
-    StepMode,
-    StepTimeout,
-    URLabRPCError,
-    URLabTimeoutError,
-    URLabVersionMismatch,
-)
+from urlab_client import OutcomeUnknown, StepMode, URLabRPCError, URLabTimeoutError, URLabVersionMismatch
 from urlab_client.aio import Stream, URLabClient
+from urlab_client.errors import DestroyFailed, ProtocolError, StepTimeout
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.server import SimulatedServer
 from urlab_client.values.types import JobStatus
@@ -352,8 +344,7 @@ async def test_a_job_that_is_not_waited_for_any_more(client: URLabClient, beta: 
     """Generation 2 statement 49."""
     beta.running = 10**9
     call = asyncio.create_task(client.scene.import_xml("/robots/arm.xml"))
-    while (await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S))["op"] != "op_status":
-        pass
+    await asyncio.to_thread(beta.request, "op_status")
     call.cancel()
     with pytest.raises(asyncio.CancelledError) as caught:
         await call
@@ -379,8 +370,7 @@ async def test_a_state_nobody_knows_counts_as_running(scripted: ScriptedServer) 
 async def test_steps_go_on_while_the_editor_works(client: URLabClient, beta: ScriptedBeta) -> None:
     beta.running = 3
     call = asyncio.create_task(client.scene.import_xml("/robots/arm.xml"))
-    while (await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S))["op"] != "op_status":
-        pass
+    await asyncio.to_thread(beta.request, "op_status")
     await client.step()
     level = asyncio.create_task(client.scene.current_level())
     assert (await call).short_name == "arm"
@@ -407,7 +397,7 @@ async def test_unknown_fields_do_no_harm(client: URLabClient, beta: ScriptedBeta
         answer = beta.answers[op]
         beta.on(op, lambda request, answer=answer: {**answer(request), "favourite": {"colour": 1}})
     assert (await client.step()).time == client.sim_time == pytest.approx(0.002)
-    await client.scene.import_xml("/robots/arm.xml")
+    assert (await client.scene.import_xml("/robots/arm.xml")).short_name == "arm"
 
 
 # Cameras, and the state stream outside live mode, against the simulated server's beta.

@@ -13,8 +13,8 @@ from bare_loop import run_bare
 
 from urlab_client import ServerUnreachable, URLabTimeoutError
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import connection_status
-from urlab_client.protocol.messages.streams import ServerLost, ServerSilent
+from urlab_client.aio.transport import connection
+from urlab_client.events import ServerLost, ServerSilent
 
 Main = Callable[[URLabClient], Coroutine[Any, Any, None]]
 
@@ -97,7 +97,7 @@ async def test_the_server_is_not_taken_for_lost(client: Any, scripted: Any) -> N
         call = asyncio.create_task(client.meta())
         await asyncio.sleep(0)
         scripted.request()
-        compute(connection_status.NOTICED_S + 0.5)
+        compute(connection.NOTICED_S + 0.5)
         assert await call
         assert await client.meta()
         told = list(iter(events.receive_nowait, None))

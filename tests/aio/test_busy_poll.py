@@ -7,8 +7,8 @@ import itertools
 
 import pytest
 
-from urlab_client.aio.transport import busy_poll
-from urlab_client.aio.transport.busy_poll import BusyPoll
+from urlab_client.aio.transport import waiting
+from urlab_client.aio.transport.waiting import BusyPoll
 
 SHORTEST, LONGEST = 0.001, 0.01
 
@@ -16,7 +16,7 @@ SHORTEST, LONGEST = 0.001, 0.01
 @pytest.fixture(autouse=True)
 def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Processors to spare, whatever this machine does."""
-    monkeypatch.setattr(busy_poll, "crowded", lambda: False)
+    monkeypatch.setattr(waiting, "crowded", lambda: False)
 
 
 async def test_a_look_is_taken_even_where_time_is_up() -> None:
@@ -87,7 +87,7 @@ def test_the_loop_stays_awake_where_that_has_proved_quicker(awake_s: float, asle
     for _ in range(20):
         ask()
     chosen = [ask() for _ in range(10_000)]
-    assert 0 < chosen.count(not often) < 20, "now and then it does the other thing, to find out"
+    assert 0 < chosen.count(not often) < 50, "now and then it does the other thing, to find out"
 
 
 def test_it_learns_that_waking_up_has_become_quick() -> None:
@@ -114,8 +114,11 @@ def test_it_learns_that_waking_up_has_become_slow() -> None:
 
 async def test_finding_out_takes_no_longer_than_the_reply_would_take() -> None:
     looks, asleep_s = BusyPoll(30.0, 30.0), 0.001
-    while not looks.pays("step"):
+    for _ in range(5000):
+        if looks.pays("step"):
+            break
         looks.note("step", asleep_s, awake=False)
+    assert looks.pays("step")
     for _ in range(20):  # the first ones stay awake
         looks.note("step", 20 * asleep_s, awake=True)
         looks.note("step", asleep_s, awake=False)
@@ -126,5 +129,5 @@ async def test_finding_out_takes_no_longer_than_the_reply_would_take() -> None:
 
 
 def test_nobody_looks_where_processors_are_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(busy_poll, "crowded", lambda: True)
+    monkeypatch.setattr(waiting, "crowded", lambda: True)
     assert not BusyPoll(SHORTEST, LONGEST).pays("step")

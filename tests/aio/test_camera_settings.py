@@ -12,9 +12,10 @@ from scripted import client_of
 from scripted_beta import ROBOT, ScriptedBeta
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client import CameraDelay, CameraTransports, UnknownOp
 from urlab_client.aio import URLabClient
+from urlab_client.errors import UnknownOp
 from urlab_client.server import SimulatedServer
+from urlab_client.types import CameraDelay, CameraTransports
 
 BOTH, NEITHER = (True, True), (False, False)
 

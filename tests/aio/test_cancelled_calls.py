@@ -12,8 +12,8 @@ from waiting import DEADLINE_S, pass_time, until
 from urlab_client import ClientClosed, URLabTimeoutError
 from urlab_client.aio import URLabClient
 from urlab_client.aio.model.mirror import Mirror
+from urlab_client.events import PlayEnded
 from urlab_client.protocol.messages.sim import StopPie
-from urlab_client.protocol.messages.streams import PlayEnded
 from urlab_client.server import Drop, Faults, SimulatedServer
 
 

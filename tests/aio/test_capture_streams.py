@@ -14,7 +14,7 @@ from waiting import pass_time, until
 
 from urlab_client.aio import URLabClient
 from urlab_client.errors import PictureTimeout, URLabTimeoutError
-from urlab_client.values.pixels import camera_header
+from urlab_client.values.pictures import camera_header
 
 TOPIC = b"arm_a/wrist "
 

@@ -16,9 +16,9 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
-from urlab_client.aio.transport import connection_status
+from urlab_client.aio.transport import connection
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,
@@ -153,8 +153,7 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
     await client.discover()
     scripted.on("current_level", None)
     pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
-    while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
-        pass
+    await asyncio.to_thread(scripted.request, "current_level")
     await asyncio.to_thread(scripted.close)
     reborn = type(scripted)(scripted.port)
     reborn.on("current_level", LEVEL)
@@ -168,8 +167,7 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
 async def test_a_read_whose_server_stays_away_says_that_it_was_lost(client: Any, scripted: Any) -> None:
     await client.discover()
     pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
-    while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
-        pass
+    await asyncio.to_thread(scripted.request, "current_level")
     await asyncio.to_thread(scripted.close)
     await wait_until(lambda: not client.connected)
     pass_time(DEADLINE_S)
@@ -201,7 +199,7 @@ async def test_garbage_on_the_line_is_a_typed_error_and_the_next_call_works(
 async def test_garbage_in_the_handshake_of_a_reconnection_does_not_end_it_for_good(
     server: SimulatedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection_status, "RETRY_S", 0.2)
+    monkeypatch.setattr(connection, "_RETRY_S", 0.2)
     options = server.client_options() | {"step_mode": "direct"}
     async with Relay(options["step_port"]) as relay, URLabClient(**(options | {"step_port": relay.port})) as client:
         await client.discover()
@@ -225,8 +223,7 @@ async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any, monkeypat
     reborn = type(scripted)(port)
     reborn.on("current_level", LEVEL)
     try:
-        while (await asyncio.to_thread(reborn.request))["op"] != "list_keyframes":
-            pass
+        await asyncio.to_thread(reborn.request, "list_keyframes")
         assert await client.scene.current_level(timeout=DEADLINE_S) == "/Game/Levels/lab"
     finally:
         await asyncio.to_thread(reborn.close)

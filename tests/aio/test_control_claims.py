@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 
 import pytest
 from hello import hello_ok
 from scripted import ScriptedServer, client_of, names
 from scripted_beta import ScriptedBeta, error
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client import (
-    ControlClaimed,
-    NotControlOwner,
-    UnknownArticulation,
-)
+from urlab_client import ControlClaimed, NotControlOwner
 from urlab_client.aio import URLabClient
 from urlab_client.aio.session.control import process_owner
+from urlab_client.errors import UnknownArticulation
 from urlab_client.protocol.messages.control import ReleaseControl
 from urlab_client.web.explained_errors import explain_error
 
@@ -215,15 +213,23 @@ async def test_a_claim_made_again_keeps_its_own_time_limit(client: URLabClient, 
     assert [request["ttl_s"] for request in beta.arrived() if request["op"] == "claim_control"] == [7.5]
 
 
-async def test_a_renewal_that_fails_does_not_lose_the_claim(client: URLabClient, beta: ScriptedBeta) -> None:
-    await client.articulations["arm_a"].claim(ttl=0.15)
+async def test_a_renewal_that_fails_does_not_lose_the_claim(
+    client: URLabClient, beta: ScriptedBeta, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "urlab_client.control")
+    await client.articulations["arm_a"].claim(ttl=600.0)
     beta.arrived()
     grant = beta.answers["claim_control"]
     beta.on("claim_control", error("internal_error", "the editor is busy"))
-    assert (await asyncio.to_thread(beta.request))["op"] == "claim_control"
+    await asyncio.sleep(0)  # the renewals begin
+    pass_time(201.0)
+    await asyncio.to_thread(beta.request, "claim_control")
+    await until(lambda: "could not be renewed" in caplog.text)
     assert client.articulations["arm_a"].control_owner == OURS
     beta.on("claim_control", grant)
-    assert (await asyncio.to_thread(beta.request))["ttl_s"] == 0.15
+    pass_time(201.0)
+    again = await asyncio.to_thread(beta.request, "claim_control")
+    assert again["ttl_s"] == 600.0, "long before the claim expires"
 
 
 async def test_an_observer_claims_nothing_by_itself(beta: ScriptedBeta) -> None:

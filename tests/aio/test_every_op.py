@@ -57,8 +57,7 @@ async def test_generated_method(scripted: Any, name: str) -> None:
     async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:
         await client.discover()
         returned = await getattr(getattr(client, op.ns), op.method)(**given)
-    while (seen := scripted.request())["op"] != name:
-        pass
+    seen = scripted.request(name)
     assert {k: v for k, v in seen.items() if k not in {"op", "session_id"}} == expected
     assert returned == result(op, reply)
 

@@ -37,8 +37,7 @@ PAIRS = [(fault, name) for i, name in enumerate(OPS) for j, fault in enumerate(F
 
 
 async def arrived(scripted: Any, op: str) -> None:
-    while (await asyncio.to_thread(scripted.request))["op"] != op:
-        pass
+    await asyncio.to_thread(scripted.request, op)
 
 
 @pytest.mark.parametrize(("fault", "name"), PAIRS)

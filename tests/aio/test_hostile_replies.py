@@ -23,12 +23,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mangling import FACTOR
 
-from urlab_client import ProtocolError, SessionTakenOver, URLabError
+from urlab_client import SessionTakenOver, URLabError
 from urlab_client.aio import URLabClient, URLabPDController
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server.streams.control_messages import ActuatorInfo, ControlPayload, decode_gains
-from urlab_client.values.pixels import decode_camera
+from urlab_client.values.pictures import decode_camera
 
 pytestmark = pytest.mark.mujoco("3.12")  # one of its actuators is a `pid`
 

@@ -6,6 +6,7 @@ import asyncio
 import sys
 import threading
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from waiting import DEADLINE_S, eventually, until
 import urlab_client
 from urlab_client.aio import URLabClient
 from urlab_client.errors import ClientClosed, URLabError, URLabTimeoutError
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     PlayEnded,
     PlayStarted,
     ServerConnected,
@@ -154,6 +155,23 @@ class TestInTheBackground:
             await until(lambda: client.sim_time == 0.6)
             plugin.tick(0.7, wall=90.0)  # somebody set the server's clock
             await until(lambda: client.sim_time == 0.7)
+
+    async def test_a_snapshot_that_waited_for_the_data_lock_is_not_taken_over_outside_live_mode(
+        self, client: URLabClient, plugin: Plugin, publisher: Publisher
+    ) -> None:
+        await client.discover()
+        await publisher.subscribed(STATE, TOPIC)
+        live = client._state._live
+        with ThreadPoolExecutor(1) as reader:  # in a thread of its own, as the lock is reentrant
+            await asyncio.wrap_future(reader.submit(client._data_lock.acquire))
+            try:
+                plugin.tick(0.4, 0.4)
+                await until(lambda: live._retry is not None)
+                await client.runtime.set_mode("direct")
+            finally:
+                await asyncio.wrap_future(reader.submit(client._data_lock.release))
+        await until(lambda: live._retry is None)
+        assert (client.sim_time, live.stats.absorbed) == (0.0, 0)
 
     async def test_a_state_that_does_not_fit_is_refused_whole(
         self, client: URLabClient, plugin: Plugin, publisher: Publisher, caplog: pytest.LogCaptureFixture

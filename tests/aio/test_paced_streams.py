@@ -12,7 +12,7 @@ from urlab_client.aio.streams import stream as streams
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import URLabTimeoutError
-from urlab_client.protocol.messages.streams import ServerLost
+from urlab_client.events import ServerLost
 from urlab_client.values.layouts import BytesLike
 
 

@@ -18,8 +18,8 @@ from waiting import DEADLINE_S, eventually, gives_up, until
 
 from urlab_client import ClientClosed, OutcomeUnknown, URLabTimeoutError
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import readiness
-from urlab_client.protocol.messages.streams import ServerAnswers, ServerLost, ServerSilent
+from urlab_client.aio.transport import waiting as transport_waiting
+from urlab_client.events import ServerAnswers, ServerLost, ServerSilent
 from urlab_client.server import SimulatedServer
 
 # Wine takes a hundred times as long for each as Linux.
@@ -30,7 +30,7 @@ Main = Callable[[URLabClient], Coroutine[Any, Any, None]]
 
 def watchers() -> list[threading.Thread]:
     """Return the threads that watch sockets for a loop."""
-    return [thread for thread in threading.enumerate() if thread.name == "urlab-sockets"]
+    return [thread for thread in threading.enumerate() if thread.name == "urlab-waiter"]
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def test_a_server_that_dies_is_noticed_at_once(run: Callable[[Main], None], scri
 def test_a_loop_that_is_closed_underneath_clients_takes_its_thread_along(
     scripted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(readiness, "_CHECK_MS", 50)
+    monkeypatch.setattr(transport_waiting, "_CHECK_S", 0.05)
 
     async def main() -> URLabClient:
         client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False)
@@ -175,7 +175,7 @@ def test_a_loop_that_is_closed_underneath_clients_takes_its_thread_along(
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 def test_a_client_that_nobody_closed_goes_with_its_loop(scripted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """And not only when the thread sees that the loop is closed: the next client wants the server's memory."""
-    monkeypatch.setattr(readiness, "_CHECK_MS", 5_000)
+    monkeypatch.setattr(transport_waiting, "_CHECK_S", 5.0)
 
     async def main() -> tuple[weakref.ref[URLabClient], weakref.ref[object]]:
         client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False)
@@ -223,7 +223,7 @@ def test_a_socket_that_was_closed_meanwhile_does_not_hide_the_others(
     async def main(client: URLabClient) -> None:
         loop = asyncio.get_running_loop()
         with zmq.Context() as context, context.socket(zmq.PAIR) as pair:
-            dead = readiness.watch_socket(loop, pair, lambda: None)
+            dead = transport_waiting.watch_socket(loop, pair, lambda: None)
             closed.add(pair.fileno())
             assert await client.meta()
             dead.close()
@@ -246,7 +246,7 @@ def test_what_a_reader_raises_does_not_deafen_it() -> None:
                     heard.append(pull.recv())
                 raise RuntimeError("what was heard")
 
-            watched = readiness.watch_socket(loop, pull, hear)
+            watched = transport_waiting.watch_socket(loop, pull, hear)
             push.connect("inproc://here")
             for word in (b"one", b"two"):
                 push.send(word)

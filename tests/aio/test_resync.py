@@ -16,8 +16,9 @@ from scripted_beta import ScriptedBeta
 from waiting import DEADLINE_S, gives_up, until
 
 import urlab_client
-from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout
+from urlab_client import OutcomeUnknown, SessionTakenOver
 from urlab_client.aio import URLabClient
+from urlab_client.errors import StepTimeout
 from urlab_client.protocol.messages.sim import BeginPie, StopPie
 from urlab_client.server import Delay, Faults, SimulatedServer
 

@@ -20,20 +20,10 @@ from hello import hello_ok
 from waiting import DEADLINE_S, until
 
 import urlab_client
-from urlab_client import (
-    ControllerSchemaViolation,
-    NoActiveManager,
-    NotReady,
-    PIEState,
-    ProtocolError,
-    UnknownKeyframe,
-    UnknownName,
-    UnknownOp,
-    URLabPIEError,
-    URLabVersionMismatch,
-)
+from urlab_client import NoActiveManager, PIEState, UnknownName, URLabPIEError, URLabVersionMismatch
 from urlab_client.aio import URLabClient
 from urlab_client.enums import ActuatorType, CameraMode, ControllerKind, StepMode
+from urlab_client.errors import ControllerSchemaViolation, NotReady, ProtocolError, UnknownKeyframe, UnknownOp
 from urlab_client.protocol.messages.session import HelloOk
 
 

@@ -11,7 +11,6 @@ import pytest
 import zmq
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client import Verdict
 from urlab_client.aio import URLabClient
 from urlab_client.errors import (
     RPC_ERRORS,
@@ -25,6 +24,7 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.protocol.messages.session import Step
+from urlab_client.types import Verdict
 
 PAUSED = {"op": "set_paused_ok", "paused": True}
 LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
@@ -92,7 +92,7 @@ async def test_a_reply_that_came_before_the_line_broke_counts(client: Any, scrip
     transport = client._transport
     scripted.release(PAUSED)
     assert transport._socket.poll(round(1e3 * DEADLINE_S))  # the loop stands still
-    transport._note(zmq.Event.DISCONNECTED, 0)
+    transport._note(zmq.Event.DISCONNECTED, 0, None)
     assert not client.connected
     assert await call is True
 

@@ -16,14 +16,7 @@ from waiting import until as wait_until
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import session_keeper
 from urlab_client.errors import ServerRestarted, SessionTakenOver
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    PlayEnded,
-    ServerLost,
-    ServerReconnected,
-    SessionLost,
-    SessionOpened,
-)
+from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost, SessionOpened
 from urlab_client.server import SimulatedServer
 
 E = TypeVar("E", bound=ClientEvent)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import context as shared
+from urlab_client.aio.transport import connection as shared
 from urlab_client.errors import ClientClosed, ServerUnreachable
 
 
@@ -45,16 +45,16 @@ async def test_a_client_that_finds_no_server_gives_it_back_and_one_without_an_ad
 
 
 def test_the_last_one_ends_it_and_the_next_one_gets_another() -> None:
-    before = shared.borrow()
-    assert shared.borrow() is before
-    shared.give_back(before)
+    before = shared.borrow_context()
+    assert shared.borrow_context() is before
+    shared.give_back_context(before)
     assert not before.closed
-    shared.give_back(before)
+    shared.give_back_context(before)
     # Whether it is over depends on clients of other tests that were not closed.
-    after = shared.borrow()
+    after = shared.borrow_context()
     assert not after.closed
     assert before.closed or before is after
-    shared.give_back(after)
+    shared.give_back_context(after)
 
 
 def test_borrowed_from_several_threads_at_once() -> None:
@@ -65,9 +65,9 @@ def test_borrowed_from_several_threads_at_once() -> None:
         try:
             start.wait(10)
             for _ in range(50):
-                context = shared.borrow()
+                context = shared.borrow_context()
                 assert not context.closed
-                shared.give_back(context)
+                shared.give_back_context(context)
         except BaseException as failure:  # noqa: BLE001 - told to the test
             failures.append(failure)
 
@@ -82,15 +82,15 @@ def test_borrowed_from_several_threads_at_once() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks on this system")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_fork_gets_a_context_of_its_own() -> None:
-    ours = shared.borrow()
+    ours = shared.borrow_context()
     child = os.fork()
     if child == 0:
-        own = shared.borrow()
+        own = shared.borrow_context()
         fine = own is not ours and not own.closed
-        shared.give_back(ours)  # nothing to it: it is the parent's
-        shared.give_back(own)
+        shared.give_back_context(ours)  # nothing to it: it is the parent's
+        shared.give_back_context(own)
         os._exit(0 if fine and own.closed else 1)
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 0
     assert not ours.closed
-    shared.give_back(ours)
+    shared.give_back_context(ours)

@@ -15,15 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from plugin_memory import PluginMemory, WrittenRegion
+from plugin_memory import PluginMemory
 from shm_clients import shared, shm_clients
 from waiting import DEADLINE_S, until
+from written_region import WrittenRegion, create
 
+from urlab_client._platform.processors import processor_fence
 from urlab_client.aio import URLabClient
 from urlab_client.aio.transport import shm as shm_transport
 from urlab_client.errors import OutcomeUnknown, URLabConnectionError
 from urlab_client.protocol import shm
-from urlab_client.protocol.fence import processor_fence
 
 SESSION = "11111111-2222-3333-4444-555555555555"
 STEP = {"op": "step_ok", "time": 0.5, "step": 1.0, "per_articulation": {}}
@@ -240,7 +241,7 @@ async def test_a_reply_region_begun_anew_during_a_step_brings_the_reply(connect:
     while region.sequence > 1:  # the number that the next reply has, too
         region._sequence[0] -= 1
     task = await step_in_flight(client, plugin)
-    region = plugin.replies.region = shm.create(plugin.replies._map, shm.RPC_STRIDE, fence=processor_fence())
+    region = plugin.replies.region = create(plugin.replies._map, shm.RPC_STRIDE, fence=processor_fence())
     for _ in range(10):  # something else may keep the process busy for a while
         before, began = time.process_time(), time.monotonic()
         while time.monotonic() - began < 0.3:

@@ -19,9 +19,9 @@ from waiting import DEADLINE_S, attempts, gives_up, pass_time, until
 
 from urlab_client._platform.windows import NamedEvent
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import region_channel
 from urlab_client.aio.transport import shm as shm_transport
-from urlab_client.aio.transport.mapped_region import MappedRegion
+from urlab_client.aio.transport import shm_channel
+from urlab_client.aio.transport.shm_regions import MappedRegion
 from urlab_client.errors import (
     ProtocolError,
     SessionTakenOver,
@@ -194,7 +194,7 @@ async def test_events_are_called_as_the_handshake_says(
             opened.append(name)
             super().__init__(name, create=create)
 
-    monkeypatch.setattr(region_channel, "NamedEvent", Recorded)
+    monkeypatch.setattr(shm_channel, "NamedEvent", Recorded)
     hello = scripted.answers["hello"]({})
     events = {"req_event": "Local\\lab_asked", "rep_event": "Local\\lab_answered"}
     for told in (events, {}):
@@ -230,7 +230,7 @@ async def test_a_refusal_of_somebody_elses_session_does_not_make_the_channel_cle
     await until(plugin.held.qsize)
     scripted.on("step", STEP | {"time": 0.75})
     sent = client.transport_stats.over_shm
-    monkeypatch.setattr(region_channel, "_ASK_AGAIN_S", 0.01)
+    monkeypatch.setattr(shm_channel, "_ASK_AGAIN_S", 0.01)
     refusal = {"op": "error", "code": "session_expired", "message": f"session '{SESSION}' is not active"}
     with monkeypatch.context() as silent:
         silent.setattr(plugin, "_answer", lambda _: None)
@@ -341,9 +341,9 @@ HOSTILE = {
     "short": b"URLB" + bytes(20),
     "not written yet": bytes(4096),
     "another magic": b"ELF\0" + bytes(4096),
-    "huge stride": shm._HEADER.pack(shm.MAGIC, 1, 0xFFFFFFFF, 2, 0, 0) + bytes(4096),
-    "no slots": shm._HEADER.pack(shm.MAGIC, 1, 64, 1, 0, 0) + bytes(4096),
-    "slot out of range": shm._HEADER.pack(shm.MAGIC, 1, 64, 2, 5, 7) + bytes(4096),
+    "huge stride": shm.HEADER.pack(shm.MAGIC, 1, 0xFFFFFFFF, 2, 0, 0) + bytes(4096),
+    "no slots": shm.HEADER.pack(shm.MAGIC, 1, 64, 1, 0, 0) + bytes(4096),
+    "slot out of range": shm.HEADER.pack(shm.MAGIC, 1, 64, 2, 5, 7) + bytes(4096),
 }
 
 

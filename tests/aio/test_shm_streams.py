@@ -13,17 +13,17 @@ import msgspec
 import numpy as np
 import pytest
 from hello import hello_ok
-from plugin_memory import WrittenRegion
 from publisher import Publisher
 from waiting import DEADLINE_S
+from written_region import WrittenRegion, create
 
+from urlab_client._platform.processors import processor_fence
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import Stream
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm
-from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
 
 STATE = b"state/full"
@@ -58,15 +58,15 @@ async def publisher() -> AsyncIterator[Publisher]:
 
 
 @pytest.fixture
-async def memory(tmp_path: Path) -> AsyncIterator[SharedMemoryRegions]:
-    made = SharedMemoryRegions(tmp_path)
+async def memory(tmp_path: Path) -> AsyncIterator[ServerRegions]:
+    made = ServerRegions(tmp_path)
     made.follow(msgspec.convert(hello_ok(), HelloOk, strict=False))
     yield made
     made.close()
 
 
 @pytest.fixture
-async def publishers(publisher: Publisher, memory: SharedMemoryRegions) -> AsyncIterator[Publishers]:
+async def publishers(publisher: Publisher, memory: ServerRegions) -> AsyncIterator[Publishers]:
     made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=DEADLINE_S, memory=memory)
     yield made
     made.close()
@@ -315,7 +315,7 @@ async def test_pictures_go_on_when_a_server_begins_to_count_anew(
     async with frames(publishers) as stream:
         await stream.receive()
         # After a crash the plugin lays out its files in place.
-        again = shm.create(camera_region._map, camera_region.region.stride, fence=processor_fence())
+        again = create(camera_region._map, camera_region.region.stride, fence=processor_fence())
         again.publish(picture(2))
         assert (await stream.receive()).pixels[0, 0, 2] == 2
         again.publish(picture(3))
@@ -339,7 +339,7 @@ async def test_snapshots_go_on_when_a_server_lays_them_out_in_another_way(
 
 
 async def test_streams_survive_a_server_that_calls_its_directory_something_else(
-    publishers: Publishers, publisher: Publisher, memory: SharedMemoryRegions, state_region: WrittenRegion
+    publishers: Publishers, publisher: Publisher, memory: ServerRegions, state_region: WrittenRegion
 ) -> None:
     state_region.publish(snapshot(1.0))
     async with states(publishers) as stream:

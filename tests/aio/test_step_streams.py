@@ -15,7 +15,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.errors import URLabTimeoutError
 from urlab_client.protocol.messages.session import StepOk
 from urlab_client.server import Drop, Faults, SimulatedServer
-from urlab_client.values.pixels import camera_header
+from urlab_client.values.pictures import camera_header
 
 TOPIC = b"arm_a/wrist "
 SYNC = {"arm a/wrist": "sync"}

@@ -160,6 +160,20 @@ def test_a_gap_is_told_with_what_took_over(policy: StreamPolicy) -> None:
     assert entry.gap is None
 
 
+@pytest.mark.parametrize("policy", [StreamPolicy.LATEST, StreamPolicy.LATEST_PER_KEY])
+@pytest.mark.parametrize("before", [None, "moved"])
+def test_a_gap_right_before_what_took_over_is_told(policy: StreamPolicy, before: str | None) -> None:
+    buffer = StreamBuffer(policy, 10, 1000)
+    if before:
+        buffer.note_gap(before)
+    buffer.push(b"a", b"", 0)
+    buffer.note_gap("reconnected")
+    buffer.push(b"a", b"", 0)
+    entry = buffer.pop()
+    assert entry is not None
+    assert (entry.seq, entry.dropped, entry.gap) == (2, 1, "reconnected"), "the latest gap is told"
+
+
 @pytest.mark.parametrize("limits", [(0, 1), (1, 0)])
 def test_a_buffer_without_room_is_refused(limits: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="at least one item and one byte"):

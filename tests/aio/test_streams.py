@@ -34,15 +34,9 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import PlayStarted, ServerConnected, ServerLost, ServerReconnected
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import (
-    PlayStarted,
-    RowSample,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    StateSnapshot,
-)
+from urlab_client.protocol.messages.streams import RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
 from urlab_client.protocol.topics import TopicKind
 

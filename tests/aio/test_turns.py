@@ -21,11 +21,12 @@ from scripted import client_of
 from waiting import DEADLINE_S, pass_time, until
 from wire_log import WireLog
 
-from urlab_client import NoSession, NotReady, SessionTakenOver, StepMode, URLabTimeoutError
+from urlab_client import SessionTakenOver, StepMode, URLabTimeoutError
 from urlab_client.aio import URLabClient
+from urlab_client.errors import NoSession, NotReady
+from urlab_client.events import SessionOpened
 from urlab_client.protocol.messages.runtime import ListKeyframes, SetMode
 from urlab_client.protocol.messages.session import Forward, Hello
-from urlab_client.protocol.messages.streams import SessionOpened
 from urlab_client.server import Cut, Delay, Drop, Faults, Refuse, SimulatedServer
 
 DT = 0.002

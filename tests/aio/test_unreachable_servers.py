@@ -14,13 +14,13 @@ from waiting import DEADLINE_S, eventually, until
 
 from urlab_client import ServerUnreachable, SessionTakenOver
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import connection_status
+from urlab_client.aio.transport import connection
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Attempts to connect are given up fifteen times as soon."""
-    monkeypatch.setattr(connection_status, "_CONNECT_MS", 200)
+    monkeypatch.setattr(connection, "_CONNECT_MS", 200)
 
 
 async def test_what_accepts_and_says_nothing_is_tried_again() -> None:
@@ -30,11 +30,11 @@ async def test_what_accepts_and_says_nothing_is_tried_again() -> None:
         async with URLabClient("tcp://127.0.0.1", step_port=port, local_model=False) as client:
             call = asyncio.create_task(client.meta(timeout=None))
             for _ in range(2):
-                connection, _ = await asyncio.to_thread(mute.accept)
-                with connection:
-                    connection.settimeout(DEADLINE_S)
+                accepted, _ = await asyncio.to_thread(mute.accept)
+                with accepted:
+                    accepted.settimeout(DEADLINE_S)
                     async with asyncio.timeout(DEADLINE_S):
-                        while await asyncio.to_thread(connection.recv, 65536):  # until the client gives it up
+                        while await asyncio.to_thread(accepted.recv, 65536):  # until the client gives it up
                             pass
             call.cancel()
             await asyncio.wait((call,))
@@ -54,17 +54,17 @@ async def test_a_host_that_drops_what_is_sent_is_not_said_to_refuse(monkeypatch:
             filler.setblocking(False)
             filler.connect_ex(deaf.getsockname())
         async with URLabClient("tcp://127.0.0.1", step_port=deaf.getsockname()[1], local_model=False) as client:
-            tried, told = 0, connection_status.Attempts.obstacle
+            tried, told = 0, connection.Attempts.obstacle
 
-            def count(attempts: connection_status.Attempts, event: zmq.Event, value: int, now: float) -> str | None:
+            def count(attempts: connection.Attempts, event: zmq.Event, value: int, now: float) -> str | None:
                 nonlocal tried
                 tried += event is zmq.Event.CONNECT_RETRIED
                 return told(attempts, event, value, now)
 
-            monkeypatch.setattr(connection_status.Attempts, "obstacle", count)
+            monkeypatch.setattr(connection.Attempts, "obstacle", count)
             call = asyncio.create_task(client.meta(timeout=None))
             # Where the loop was held up for longer than an attempt takes, only the next one shows what it is.
-            await until(lambda: tried > 2 and client._transport._obstacle == connection_status.UNANSWERED)
+            await until(lambda: tried > 2 and client._transport._obstacle == connection.UNANSWERED)
             call.cancel()
             await asyncio.wait((call,))
             with pytest.raises(ServerUnreachable, match="the host does not answer"):

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from hello import hello_ok
+from msgspec.structs import replace
 
-from urlab_client import ProtocolError
+from urlab_client._sandbox import process, references
 from urlab_client.aio import URLabClient
 from urlab_client.aio import client as client_module
 from urlab_client.aio.model import compilation
+from urlab_client.errors import ProtocolError
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BODY = '<body><freejoint/><geom size=".1"/></body>'
@@ -78,7 +78,7 @@ def test_however_it_names_a_file_of_this_machine_it_is_refused(tmp_path: Path, x
     secret.write_text(MESH)
     named = xml.format(file=secret, folder=tmp_path, escaped=str(secret).replace("/", "&#47;"))
     with pytest.raises(ValueError, match="a file of this machine"):
-        compilation._refuse_local_files(named, {})
+        references.refuse_local_files(named, {})
 
 
 INCLUDING = '<mujoco><include file="sub/part.xml"/></mujoco>'
@@ -95,7 +95,7 @@ async def test_documents_that_came_with_it_read_none_either(told: Callable[..., 
     for disguise in ("", " " * 256, "\v", "\ufeff\ufeff", "A poem. ", '<!-- file=" -->'):
         for xml in (INCLUDING, ATTACHING):
             with pytest.raises(ValueError, match=r"secret\.obj, a file of this machine"):
-                compilation._refuse_local_files(xml, {"part.xml": (disguise + part).encode()})
+                references.refuse_local_files(xml, {"part.xml": (disguise + part).encode()})
 
 
 PART = (
@@ -107,11 +107,11 @@ ATTACHED = (
     '<worldbody><frame><attach model="a" body="b" prefix="x"/></frame></worldbody></mujoco>'
 )
 UNWATCHED = """
-import sys
+from urlab_client._sandbox import process
 from urlab_client.aio.model import compilation
 
-compilation._refuse_local_files = compilation.confine_files = lambda *_, **__: None
-compilation._main(sys.argv[1])
+compilation.refuse_local_files = process.confine_files = lambda *_: None
+process.serve()
 """
 
 
@@ -123,31 +123,30 @@ compilation._main(sys.argv[1])
         (ATTACHED, {"part.xml": PART}),
     ],
 )
-def test_what_its_names_hide_from_the_client_cannot_be_opened(tmp_path: Path, xml: str, assets: dict[str, str]) -> None:
-    """The compiling process without its own look at the model, and without Landlock."""
+def test_what_its_names_hide_from_the_client_cannot_be_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, xml: str, assets: dict[str, str]
+) -> None:
+    """The process without its own look at the model, and without Landlock."""
     secret = tmp_path / "secret.obj"
     secret.write_text(MESH)
-    job = compilation._CompileJob(
-        xml.replace("{file}", str(secret)),
-        {name: text.replace("{file}", str(secret)).encode() for name, text in assets.items()},
-        compilation._MEMORY_BYTES,
-        compilation._CPU_S,
-    )
-    command = [sys.executable, "-c", UNWATCHED, str(tmp_path)]
-    done = subprocess.run(command, input=msgspec.msgpack.encode(job), capture_output=True, check=True)
-    assert done.stdout.startswith(b"-")
+    monkeypatch.setattr(process._Child, "program", UNWATCHED)
+    with pytest.raises(process.Refused):
+        compilation.compile_confined(
+            xml.replace("{file}", str(secret)),
+            {name: text.replace("{file}", str(secret)).encode() for name, text in assets.items()},
+        )
 
 
 def test_it_may_not_hide_names_in_entities() -> None:
     with pytest.raises(ValueError, match="document type"):
-        compilation._refuse_local_files('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>', {})
+        references.refuse_local_files('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>', {})
 
 
 @pytest.mark.parametrize("xml", [HUGE, ENDLESS], ids=["huge", "endless"])
 async def test_it_takes_no_more_time_than_it_may(
     told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch, xml: str
 ) -> None:
-    monkeypatch.setattr(compilation, "_CPU_S", 1)
+    monkeypatch.setattr(compilation, "LIMITS", replace(compilation.LIMITS, cpu_s=1))
     async with told(xml) as client:
         with pytest.raises(ProtocolError, match=r"more than 1 s of processor time.*trust_server=True"):
             await client.discover()
@@ -157,7 +156,7 @@ async def test_it_takes_no_more_time_than_it_may(
 async def test_it_takes_no_more_memory_than_it_may(
     told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compilation, "_MEMORY_BYTES", 64 * 2**20)
+    monkeypatch.setattr(compilation, "LIMITS", replace(compilation.LIMITS, memory_bytes=64 * 2**20))
     texture = '<texture name="t" type="2d" builtin="flat" width="8000" height="8000"/>'
     async with told(f"<mujoco><asset>{texture}</asset></mujoco>") as client:
         with pytest.raises(ProtocolError, match=r"allocate memory.*trust_server=True"):
@@ -173,7 +172,7 @@ async def test_what_mujoco_says_of_it_is_passed_on(told: Callable[..., URLabClie
 async def test_a_trusted_server_has_no_limits(
     told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compilation, "_MAX_COMBINATIONS", -1)
+    monkeypatch.setattr(references, "_MOST_COMBINATIONS", -1)
     async with told(f"<mujoco><worldbody>{BODY}</worldbody></mujoco>", trust_server=True) as client:
         await client.discover()
         assert client.model is not None

@@ -6,19 +6,18 @@ import contextlib
 import io
 import stat
 import struct
-import subprocess
 import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client._sandbox.landlock import is_available
+from urlab_client._sandbox import process, references
+from urlab_client._sandbox.confinement import is_available
 from urlab_client.aio.model import archive as archive_module
 from urlab_client.aio.model import compilation
 from urlab_client.aio.model.archive import unpacked
@@ -50,7 +49,7 @@ LEADING_OUT = [
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The child's working folder with an empty room for content, in this process."""
     monkeypatch.chdir(tmp_path)
-    content = compilation._ROOM / "content"
+    content = compilation._CONTENT
     content.mkdir(parents=True)
     return content
 
@@ -91,7 +90,7 @@ def test_a_model_names_no_file_but_its_own_whether_or_not_it_exists(room: Path, 
             (room / "sub").mkdir(exist_ok=True)
             (room / "sub" / "part.txt").write_text(WITH_MESH.format(leading.format(folder=folder)))
         with pytest.raises(ValueError, match="a model may name only files that come with it, by relative paths"):
-            compilation._refuse_outside(room / "m.xml", room)
+            references.refuse_outside(room / "m.xml", room)
 
 
 def test_a_model_names_its_own_files_from_where_they_lie(room: Path) -> None:
@@ -102,35 +101,34 @@ def test_a_model_names_its_own_files_from_where_they_lie(room: Path) -> None:
     }.items():
         (room / name).parent.mkdir(exist_ok=True, parents=True)
         (room / name).write_text(text)
-    compilation._refuse_outside(room / "xml" / "m.xml", room)
+    references.refuse_outside(room / "xml" / "m.xml", room)
 
 
 UNWATCHED = """
-import sys
+from urlab_client._sandbox import process
 from urlab_client.aio.model import compilation
 
-compilation._refuse_outside = lambda *_: None
-compilation._main(sys.argv[1])
+compilation.refuse_outside = lambda *_: None
+process.serve()
 """
 
 
 @pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
-def test_what_names_hide_cannot_be_opened(tmp_path: Path) -> None:
-    """The compiling process without its own look at the model."""
+def test_what_names_hide_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process without its own look at the model."""
     (tmp_path / "child").mkdir()
     (tmp_path / "secret.obj").write_text(MESH)
     (tmp_path / "child" / "m.xml").write_text(WITH_MESH.format(tmp_path / "secret.obj"))
-    job = msgspec.msgpack.encode(compilation._FlattenJob("m.xml", 2**30, 10))
-    command = [sys.executable, "-c", UNWATCHED, str(tmp_path / "child")]
-    done = subprocess.run(command, input=job, capture_output=True, check=True)
-    assert done.stdout.startswith(b"-")
+    monkeypatch.setattr(process._Child, "program", UNWATCHED)
+    with pytest.raises(process.Refused):
+        flatten_confined(tmp_path / "child" / "m.xml")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="there is no limit of memory")
 def test_a_huge_texture_takes_no_more_memory_than_it_may(tmp_path: Path) -> None:
     texture = '<texture name="t" type="2d" builtin="flat" width="40000" height="40000"/>'
     (tmp_path / "m.xml").write_text(f"<mujoco><asset>{texture}</asset></mujoco>")
-    with pytest.raises(ValueError, match="compiling it needs more than 1024 MiB"):
+    with pytest.raises(ValueError, match="it needs more memory than 1024 MiB"):
         flatten_confined(tmp_path / "m.xml")
 
 
@@ -141,12 +139,13 @@ def test_work_that_is_broken_off_leaves_no_process(tmp_path: Path, monkeypatch: 
     def stop(_: int) -> None:
         raise Enough
 
-    command = [sys.executable, "-c", "import time; time.sleep(3600)"]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    monkeypatch.setattr(compilation.subprocess, "Popen", lambda *_, **__: child)
+    monkeypatch.setattr(process._Child, "program", "import time; time.sleep(3600)")
+    started: list[process._Child] = []
+    start = process._Child.__init__
+    monkeypatch.setattr(process._Child, "__init__", lambda self: (started.append(self), start(self))[1])
     with pytest.raises(Enough):
         flatten_confined(tmp_path / "m.xml", stop)
-    assert child.returncode is not None
+    assert [child.process.returncode is not None for child in started] == [True]
 
 
 MODEL = {"m.xml": b"<mujoco/>", "meshes/t.obj": MESH.encode()}

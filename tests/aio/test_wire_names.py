@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from urlab_client import UnknownArticulation, UnknownBody, URLabClient
+from urlab_client import URLabClient
+from urlab_client.errors import UnknownArticulation, UnknownBody
 from urlab_client.protocol.base import DialectName
 from urlab_client.server import SimulatedServer
 

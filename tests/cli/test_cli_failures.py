@@ -10,9 +10,9 @@ import pytest
 from starlette.applications import Starlette
 from waiting import DEADLINE_S, until
 
-from urlab_client.cli import _serve_events
+from urlab_client.cli import serve as serve_command
 from urlab_client.cli._pages import bound, serve
-from urlab_client.cli._serve_events import Event, Events, Starter, next_event, watch_input
+from urlab_client.cli.serve import Event, Events, Starter, next_event, watch_input
 
 
 def die(*_: Any) -> Any:
@@ -33,7 +33,7 @@ def test_the_thread_that_starts_a_server() -> None:
 def test_the_thread_that_waits_for_the_end_of_input(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_serve_events, "read_aside", die)
+    monkeypatch.setattr(serve_command, "read_aside", die)
     events: Events = queue.SimpleQueue()
     watch_input(events)
     assert events.get(timeout=DEADLINE_S) is Event.STOP

@@ -14,9 +14,10 @@ from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, signals_kept
 from forked import program
 from waiting import eventually
 
-from urlab_client import ModeLocked, URLabClient, URLabPDController
+from urlab_client import URLabClient, URLabPDController
 from urlab_client.cli import main
 from urlab_client.enums import CameraMode, StepMode
+from urlab_client.errors import ModeLocked
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",
@@ -194,7 +195,7 @@ def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_broken_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    broken = write(tmp_path, "broken.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
+    broken = write(tmp_path, "broken  robot.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
     line = refused(capsys, broken)
     assert str(broken) in line
     assert "potato" in line

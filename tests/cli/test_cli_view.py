@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from pathlib import Path
-from typing import get_type_hints
 
 import pytest
 from commands import urlab
 
-from urlab_client.cli import console, main
-from urlab_client.cli._page_options import PageArguments
+from urlab_client.cli import _parser, console, main
 
 
 @pytest.mark.view
@@ -62,10 +61,11 @@ def test_options_of_another_view_are_refused(capsys: pytest.CaptureFixture[str])
 
 
 def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[PageArguments] = []
+    told: list[Namespace] = []
     monkeypatch.setattr(console, "run", lambda arguments: told.append(arguments) or 0)
     assert main(["view", "sim://arm", "--web", "--port", "0"]) == 0
-    assert {name: getattr(told[0], name) for name in get_type_hints(PageArguments)} == {
+    names = set(vars(_parser("console").parse_args(["console"]))) - {"command", "run", "version"}
+    assert {name: getattr(told[0], name) for name in names} == {
         "address": "sim://arm", "host": "127.0.0.1", "port": 0, "allow_host": [], "open": False, "handshake": None,
         "recordings": Path("recordings"), "mjcf_options": False, "server_key": None, "client_key": None,
         "step_port": 5559, "state_port": None,

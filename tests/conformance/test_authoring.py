@@ -8,18 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from urlab_client import (
-    CreateLevelFailed,
-    ImportFailed,
-    NoActiveManager,
-    PIEState,
-    SpawnFailed,
-    TooManyCells,
-    Unsupported,
-    URLabAsset,
-    URLabPIEError,
-)
+from urlab_client import NoActiveManager, PIEState, URLabAsset, URLabPIEError
 from urlab_client.enums import StepMode
+from urlab_client.errors import CreateLevelFailed, ImportFailed, SpawnFailed, TooManyCells, Unsupported
 
 BOX = """
 <mujoco model="box"><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/>

@@ -11,11 +11,13 @@ import pytest
 from ports import free_port
 from waiting import gives_up, until
 
-from urlab_client import CallOutcome, CallRecord, ServerUnreachable, UnknownKeyframe, URLabTimeoutError
+from urlab_client import ServerUnreachable, URLabTimeoutError
+from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.messages.runtime import SetPaused
 from urlab_client.protocol.messages.session import Reset
 from urlab_client.server import Drop, Faults
+from urlab_client.types import CallOutcome, CallRecord
 
 
 async def test_each_request_is_told_with_its_size_time_and_outcome(connect: Any, serve: Any) -> None:

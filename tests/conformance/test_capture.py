@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from urlab_client import ModeLocked, NoActiveManager
+from urlab_client import NoActiveManager
+from urlab_client.errors import ModeLocked
 
 MODEL = """
 <mujoco model="gate">

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from urlab_client import ModeLocked, NoSession, SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
+from urlab_client import SessionTakenOver, UnknownName, URLabError
 from urlab_client.enums import ControlMode, StepMode
+from urlab_client.errors import ModeLocked, NoSession, UnknownKeyframe
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import ControllerConfig
 
@@ -508,7 +509,7 @@ async def test_control_mode(connect: Any, serve: Any, mode: str) -> None:
 
 
 async def test_gains(connect: Any, serve: Any) -> None:
-    from urlab_client import ControllerSchemaViolation
+    from urlab_client.errors import ControllerSchemaViolation
 
     with serve("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
         client = connect(server, step_mode="direct")

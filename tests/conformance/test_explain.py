@@ -5,8 +5,8 @@ from __future__ import annotations
 import socket
 from typing import Any
 
-from urlab_client import Verdict
 from urlab_client.server import ControllerConfig
+from urlab_client.types import Verdict
 
 
 def problems(diagnosis: Any) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import record
+from urlab_client.integrations.view import rerun_view
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 PILE = """
@@ -89,15 +91,19 @@ def of_client(client: Any) -> tuple[Any, ...]:
 
 
 @asynccontextmanager
-async def recording(client: Any, path: Path) -> AsyncIterator[None]:
-    """Record a client of either flavour."""
-    recorder: Any = record(handle(client), path, cameras=())
-    if isinstance(handle(client), URLabClient):
-        async with recorder:
-            yield
-    else:
-        with recorder:
-            yield
+async def watched(client: Any, folder: Path) -> AsyncIterator[None]:
+    """Record a client of either flavour, and show it where the extra `rerun` is installed."""
+    seen = handle(client)
+    watchers: list[Any] = [record(seen, folder / "run.mcap", cameras=())]
+    if importlib.util.find_spec("rerun") is not None:
+        watchers.append(rerun_view(seen, save=folder / "run.rrd"))
+    async with AsyncExitStack() as stack:
+        for watcher in watchers:
+            if isinstance(seen, URLabClient):
+                await stack.enter_async_context(watcher)
+            else:
+                stack.enter_context(watcher)
+        yield
 
 
 @asynccontextmanager
@@ -115,7 +121,7 @@ async def test_reading_everything_changes_nothing(connect: Any, serve: Any, pile
         client = connect(server, step_mode="direct")
         await client.discover(observations="full")
         await client.step(30)
-        async with recording(client, tmp_path / "run.mcap"):
+        async with watched(client, tmp_path):
             handle(client).data  # noqa: B018  # computes what follows from the state, here
             before = of_client(client), of_server(server)
             seen: dict[int, Any] = {}
@@ -137,7 +143,7 @@ async def test_reading_drives_no_robot_in_live_mode(connect: Any, serve: Any, pi
     with serve(pile, "arm", play=True, unpaused=True) as server:
         client = connect(server, step_mode="live", live_pictures=False)
         await client.discover()
-        async with recording(client, tmp_path / "run.mcap"):
+        async with watched(client, tmp_path):
             sent = client.transport_stats.sent
             read(handle(client), {})
             await client.run_for(0.01)
@@ -151,7 +157,7 @@ async def test_a_robot_of_another_program_may_be_looked_at(
         async with owner_of(server, "arm"):
             client = connect(server, step_mode="direct")
             await client.discover()
-            async with recording(client, tmp_path / "run.mcap"):
+            async with watched(client, tmp_path):
                 read(handle(client), {})
                 client.articulations["pile"].ctrl_array[:] = 0.25
                 await client.step()

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from waiting import DEADLINE_S
 
-from urlab_client import NotSettled, URLabTimeoutError
+from urlab_client import URLabTimeoutError
 from urlab_client.enums import ControllerKind
+from urlab_client.errors import NotSettled
 from urlab_client.server import ControllerConfig
 from urlab_client.values.descriptions import SceneDescription
 

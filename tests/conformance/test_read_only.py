@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from urlab_client import ReadOnlyClient
+from urlab_client.errors import ReadOnlyClient
 
 
 @pytest.fixture

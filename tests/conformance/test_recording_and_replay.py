@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from urlab_client import PathNotWritable, ReplayRequiresStepped, ReplaySessionNotFound
+from urlab_client.errors import PathNotWritable, ReplayRequiresStepped, ReplaySessionNotFound
 
 
 async def test_record_save_and_play(connect: Any, serve: Any, tmp_path: Path) -> None:

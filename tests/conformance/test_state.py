@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from urlab_client import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
 from urlab_client.enums import ActuatorType, CameraMode
+from urlab_client.errors import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
 from urlab_client.server import ControllerConfig
 
 BOT = """
@@ -322,10 +322,12 @@ async def test_state_belongs_together_under_the_lock(connect: Any, serve: Any, b
 
         watcher = threading.Thread(target=watch)
         watcher.start()
-        for _ in range(40):
-            await client.step()
-        stop.set()
-        watcher.join(60)
+        try:
+            for _ in range(40):
+                await client.step()
+        finally:
+            stop.set()
+            watcher.join(60)
         assert torn == []
 
 

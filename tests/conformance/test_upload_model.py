@@ -8,9 +8,11 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from urlab_client import ImportFailed, UnknownOp, UploadProgress, URLabAsset, URLabClient, URLabTimeoutError
+from urlab_client import URLabAsset, URLabClient, URLabTimeoutError
 from urlab_client.aio import URLabClient as AsyncClient
-from urlab_client.server import Cut, Delay, Drop, Faults, SimulatedServer
+from urlab_client.errors import ImportFailed, UnknownOp
+from urlab_client.server import Cut, Delay, Drop, Fault, Faults, Refuse, SimulatedServer
+from urlab_client.types import UploadProgress
 
 MESH = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 ROBOT = """
@@ -109,9 +111,14 @@ def test_a_model_goes_over_zmq_and_its_import_takes_its_time(robot: Path, memory
         assert slow.seen == 1
 
 
-def test_an_upload_goes_on_after_a_cut_connection(robot: Path) -> None:
+@pytest.mark.parametrize(
+    "fault",
+    [Cut(op="upload_model_chunk", times=1), Refuse(op="upload_model_chunk", code="unknown_upload", times=1)],
+    ids=["cut", "forgotten"],
+)
+def test_an_upload_goes_on_after_a_cut_connection_or_where_the_server_forgot_it(robot: Path, fault: Fault) -> None:
     with (
-        SimulatedServer(dialect="beta", faults=Faults(Cut(op="upload_model_chunk", times=1))) as server,
+        SimulatedServer(dialect="beta", faults=Faults(fault)) as server,
         URLabClient(**server.client_options()) as client,
     ):
         client.discover()

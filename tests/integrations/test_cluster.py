@@ -18,7 +18,8 @@ import anyio.to_thread
 import numpy as np
 import pytest
 
-from urlab_client import LeaseBusy, URLabClient
+from urlab_client import URLabClient
+from urlab_client.errors import LeaseBusy
 from urlab_client.server import SimulatedServer
 
 pytestmark = pytest.mark.ray

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from waiting import DEADLINE_S, eventually, until
 
@@ -17,9 +15,8 @@ from urlab_client.errors import ConnectionLost, URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.gym import pictures as drawing
 from urlab_client.integrations.gym import vector
-from urlab_client.integrations.record import RecordingError, lerobot, read_run, record
+from urlab_client.integrations.record import RecordingError, read_run, record
 from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.record.lerobot import LeRobot
 from urlab_client.integrations.view.view import AsyncView, ViewOptions
 from urlab_client.server import SimulatedServer
 
@@ -141,20 +138,6 @@ def test_the_thread_that_draws_for_a_batch(caplog: pytest.LogCaptureFixture, mon
         assert isinstance(caught.value.__cause__, MemoryError)
     assert logged(caplog, "urlab-pictures")
     thread.close()
-
-
-def test_the_thread_that_listens_to_lerobot(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    script = tmp_path / "script.py"
-    script.write_text("import sys\nsys.stdout.buffer.write(b'\\xff\\n')\nsys.stdout.flush()\nsys.stdin.read()\n")
-    monkeypatch.setattr(lerobot, "_SCRIPT", script)
-    with LeRobot(sys.executable, tmp_path) as robot:
-        robot.add({"state": np.zeros((1, 2))}, ends_episode=True)
-        with pytest.raises(RecordingError, match="could not be read: UnicodeDecodeError") as caught:
-            robot.finish()
-    assert isinstance(caught.value.__cause__, UnicodeDecodeError)
-    assert logged(caplog, "urlab-lerobot")
 
 
 def test_the_restart_of_an_environment(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,26 +23,20 @@ from starlette.testclient import TestClient
 import urlab_client.protocol
 from urlab_client.aio.client_types import Diagnosis, Finding, ServerInfo, Verdict
 from urlab_client.errors import UnknownArticulation
+from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.integrations.policy.runner import PolicyRun
 from urlab_client.integrations.record.writer import RecorderStats
 from urlab_client.integrations.view.view import ViewStats
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.messages.session import ArticulationInfo, ArticulationState, Clock, HelloOk
-from urlab_client.protocol.messages.streams import (
-    CameraSample,
-    ClientEvent,
-    RowSample,
-    ServerLost,
-    StateSnapshot,
-)
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot
 from urlab_client.protocol.rows import BaseStateRow, JointRow
 from urlab_client.protocol.shm import Header, Publication
 from urlab_client.protocol.topics import StreamTopic
 from urlab_client.values.descriptions import Pose, SceneDescription
-from urlab_client.values.pixels import CameraImage
-from urlab_client.values.plain_reading import kinds_of
+from urlab_client.values.pictures import CameraImage
+from urlab_client.values.plain import Serializable, kinds_of
 from urlab_client.values.scene_types import ActorHierarchyNode, BlueprintInfo
-from urlab_client.values.serializable import Serializable
 from urlab_client.values.types import CameraPose, SimOptions
 
 # What transports and robots are sent; no call returns any of it.

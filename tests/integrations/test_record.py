@@ -23,9 +23,9 @@ from mcap.writer import IndexType
 from waiting import eventually, until
 
 import urlab_client
-from urlab_client import NotReady
 from urlab_client.aio import URLabClient as AsyncClient
 from urlab_client.aio.state.step_pictures import StepPictures
+from urlab_client.errors import NotReady
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CameraCalibration,

@@ -22,8 +22,7 @@ from pyarrow import parquet
 
 import urlab_client
 from urlab_client.cli import main
-from urlab_client.cli.figures import Quantity, Trace, plot_trace
-from urlab_client.integrations._feed.quantities import component_name, quantities
+from urlab_client.cli.plot import Curves, plot_curves
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import (
@@ -35,8 +34,9 @@ from urlab_client.integrations.record import (
     tables,
 )
 from urlab_client.integrations.record import lerobot as lerobot_dataset
+from urlab_client.integrations.record.contents import even, visible
 from urlab_client.integrations.record.lerobot import LeRobot, _rate
-from urlab_client.integrations.record.pictures import even, visible
+from urlab_client.integrations.record.tables import component_name, quantities
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
@@ -261,7 +261,7 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
 
 
-def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_outlives_a_lerobot_is_not_waited_for(tmp_path: Path) -> None:
     python = tmp_path / "python"
     python.write_text(
         f"#!{sys.executable}\nimport os, time\n"
@@ -269,12 +269,22 @@ def test_what_outlives_a_lerobot_that_died_is_not_waited_for(tmp_path: Path, mon
         "time.sleep(600)\n"
     )
     python.chmod(0o700)
-    monkeypatch.setattr(lerobot_dataset, "_DEADLINE_S", 0.1)
     with LeRobot(str(python), tmp_path) as writer:
         writer._process.wait()
-        with pytest.raises(RecordingError, match="LeRobot did not finish"):
-            writer.finish()
+        writer.finish()
     os.kill(int((tmp_path / "encodes").read_text()), signal.SIGKILL)
+
+
+def test_a_lerobot_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("import sys\nsys.stdin.read()\n")
+    monkeypatch.setattr(lerobot_dataset, "_SCRIPT", script)
+    monkeypatch.setattr(lerobot_dataset, "_DEADLINE_S", 0.1)
+    monkeypatch.setattr(lerobot_dataset, "_FRAME_S", 0.0)
+    with LeRobot(sys.executable, tmp_path) as writer:
+        writer.add({"state": np.zeros((1, 2))}, ends_episode=True)
+        with pytest.raises(RecordingError, match=r"LeRobot did not finish within 0\.1 s"):
+            writer.finish()
 
 
 @pytest.mark.usefixtures("small_pieces")
@@ -430,8 +440,8 @@ def test_values_say_what_they_measure() -> None:
 
 
 def test_sensors_of_one_kind_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    traces: list[Trace] = []
-    monkeypatch.setattr("urlab_client.cli.figures.plot_trace", lambda trace, _path: traces.append(trace))
+    drawn: list[Curves] = []
+    monkeypatch.setattr("urlab_client.cli.plot.plot_curves", lambda _title, _time, curves, _path: drawn.extend(curves))
     with (
         SimulatedServer("quadruped", play=True) as server,
         urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
@@ -440,7 +450,7 @@ def test_sensors_of_one_kind_share_an_axis(tmp_path: Path, monkeypatch: pytest.M
         with record(client, tmp_path / "run.mcap"):
             client.step()
     assert run("plot", tmp_path / "run.mcap", "--field", "sensors", "--joints", "imu_gyro.*", "imu_acc*.x") == 0
-    assert [(quantity.label, quantity.names) for quantity in traces[0].quantities] == [
+    assert [(curves.label, curves.names) for curves in drawn] == [
         ("quadruped\nlinear acceleration (m/s²)", ["imu_accelerometer.x"]),
         ("quadruped\nangular velocity (rad/s)", ["imu_gyro.x", "imu_gyro.y", "imu_gyro.z"]),
     ]
@@ -452,7 +462,7 @@ def test_curves_in_one_place_can_be_told_apart(tmp_path: Path) -> None:
     colours = []
     for columns in ([0, 1], [0, 1, 2]):
         names = ["a", "b", "c"][: len(columns)]
-        plot_trace(Trace("", time, values, [Quantity("q", names, columns)]), tmp_path / "plot.png")
+        plot_curves("", time, [Curves("q", names, values[:, columns])], tmp_path / "plot.png")
         pixels = np.asarray(Image.open(tmp_path / "plot.png"))[:, :1150, :3]  # without the legend
         colours.append([int((np.abs(pixels.astype(int) - colour).max(axis=-1) < 10).sum()) for colour in C0_AND_C2])
     (alone, none), (shared, twin) = colours

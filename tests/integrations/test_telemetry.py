@@ -20,7 +20,7 @@ from starlette.testclient import TestClient
 
 import urlab_client
 import urlab_client.aio
-from urlab_client import UnknownKeyframe
+from urlab_client.errors import UnknownKeyframe
 from urlab_client.integrations.telemetry import OpenTelemetryObserver, PrometheusObserver, PrometheusServerMetrics
 from urlab_client.protocol.messages.session import Reset
 from urlab_client.server import ServedRequest, SimulatedServer

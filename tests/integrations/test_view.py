@@ -286,8 +286,9 @@ class Foxglove:
         """Read until there is a message of each topic, later than this call."""
         for topic in topics:
             self.newest.pop(topic, None)
-        asked = time.monotonic()
+        began = asked = time.monotonic()
         while missing := [topic for topic in topics if topic not in self.newest]:
+            assert time.monotonic() - began < DEADLINE_S, f"no message of {missing}"
             if time.monotonic() - asked > AGAIN_S:
                 asked = time.monotonic()
                 await self._subscribe([self.channels[topic] for topic in missing if topic in self.channels])
@@ -330,9 +331,10 @@ async def test_foxglove_is_told_frames_geometry_joints_and_contacts(server: Simu
             await seen.until("/tf", "/scene")
             await client.step()
             shown = None  # what is subscribed to begins with the state before the step
-            while shown != client.sim_time:
-                await seen.until("/tf", "/joint_states", "/contacts", "/contact_markers", "/state/arm")
-                shown = json.loads(seen.newest["/state/arm"])["sim_time"]
+            async with asyncio.timeout(DEADLINE_S):
+                while shown != client.sim_time:
+                    await seen.until("/tf", "/joint_states", "/contacts", "/contact_markers", "/state/arm")
+                    shown = json.loads(seen.newest["/state/arm"])["sim_time"]
             robot, arm = client.articulations["quadruped"], client.articulations["arm"]
             body = f"quadruped_{next(iter(robot.bodies))}"
             frames = {f["child_frame_id"]: f for f in json.loads(seen.newest["/tf"])["transforms"]}

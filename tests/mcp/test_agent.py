@@ -21,11 +21,11 @@ from PIL import Image
 from waiting import until
 
 from urlab_client.aio import URLabClient
+from urlab_client.console.lease import Viewer
 from urlab_client.integrations.record import read_run
 from urlab_client.mcp import Agent, Limits
 from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.bundled_robots import bundled_models
-from urlab_client.web.driving_lease import Viewer
 
 PERSON = Viewer("a person's key", "Ann")
 

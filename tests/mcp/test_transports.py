@@ -6,6 +6,7 @@ import importlib.util
 import signal
 import subprocess
 import sys
+from argparse import Namespace
 from pathlib import Path
 
 import httpx2
@@ -138,10 +139,10 @@ def test_what_cannot_be_honoured_is_said(arguments: list[str], words: str, capsy
 def test_beside_standard_input_the_console_has_any_port_but_one_that_is_given(
     monkeypatch: pytest.MonkeyPatch, given: int | None
 ) -> None:
-    told: list[command.McpArguments] = []
+    told: list[Namespace] = []
     monkeypatch.setattr(command, "run", lambda arguments: told.append(arguments) or 0)
     assert main(["mcp", "sim://arm", *([] if given is None else ["--port", str(given)])]) == 0
-    assert command._console_port(told[0]) == (given or 0)
+    assert command._port(told[0]) == (given or 0)
 
 
 def test_without_the_sdk_the_extra_is_named(

@@ -7,14 +7,14 @@ from forked import program
 BLOCKED = """
 import asyncio, time
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import connection_status, subscriber
+from urlab_client.aio.transport import connection, subscriber
 from urlab_client.server import SimulatedServer
 
 async def main():
     async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
         await client.discover()
         # Only the stream's connection is to be given up: on a busy machine, the requests' would be, too.
-        connection_status.HEARTBEAT_MS, connection_status.SILENCE_MS, subscriber._QUEUED_MESSAGES = 100, 300, 10
+        connection.HEARTBEAT_MS, connection.SILENCE_MS, subscriber._QUEUED_MESSAGES = 100, 300, 10
         async with client.state_stream(timeout=None) as states:
             for _ in range(3):
                 await states.receive()

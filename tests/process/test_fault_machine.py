@@ -25,7 +25,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from waiting import eventually, in_time
 
 from urlab_client.aio import Stream, URLabClient
-from urlab_client.aio.transport import connection_status
+from urlab_client.aio.transport import connection
 from urlab_client.errors import (
     NoActiveManager,
     NotReady,
@@ -288,8 +288,8 @@ class Machine(RuleBasedStateMachine):
 
 @pytest.mark.timeout(3600 if LONG else 120)
 def test_any_history_of_faults(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_status, "HEARTBEAT_MS", 100)
-    monkeypatch.setattr(connection_status, "SILENCE_MS", 300)
+    monkeypatch.setattr(connection, "HEARTBEAT_MS", 100)
+    monkeypatch.setattr(connection, "SILENCE_MS", 300)
     steps = Steps()
     monkeypatch.setattr(mujoco, "mj_step", steps)
     monkeypatch.setattr(Machine, "steps", steps, raising=False)

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 from hammer import STRIDE
+from written_region import create
 
-from urlab_client.protocol.fence import processor_fence
-from urlab_client.protocol.shm import create, region_size
+from urlab_client._platform.processors import processor_fence
+from urlab_client.protocol.shm import region_size
 
 SECONDS = os.environ.get("URLAB_HAMMER_S", "0.3")
 HAMMER = Path(__file__).parents[1] / "support" / "hammer.py"

@@ -23,6 +23,7 @@ from urlab_client.errors import (
     URLabError,
     WrongTransport,
 )
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_message, encode_reply, encode_request
 from urlab_client.protocol.messages.jobs import OpStarted
@@ -41,11 +42,11 @@ from urlab_client.protocol.messages.session import (
     StepOk,
     TwistState,
 )
-from urlab_client.protocol.messages.streams import ClientEvent, StateSnapshot
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.server.streams.broadcast import StateFull
-from urlab_client.values.serializable import plain as plain_data
+from urlab_client.values.plain import plain as plain_data
 
 OPS_BY_NAME = sorted(OPS)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from urlab_client._extras import MissingExtra
+from urlab_client._installation import MissingExtra
 from urlab_client.protocol.messages.streams import CameraSample
 
 

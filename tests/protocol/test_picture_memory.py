@@ -6,8 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import PictureMemory, Pixels, decode_camera
 
 MODES = ["real", "semantic", "depth"]
 SIDE = 256

@@ -31,7 +31,7 @@ from urlab_client.server.streams.control_messages import (
     decode_gains,
     encode_gains,
 )
-from urlab_client.values.pixels import decode_camera, encode_camera
+from urlab_client.values.pictures import decode_camera, encode_camera
 
 OF_COMPONENT = [TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR, TopicKind.CAMERA]
 OF_ARTICULATION = [TopicKind.TWIST, TopicKind.ACTIONS, TopicKind.CONTROL, TopicKind.SET_GAINS]

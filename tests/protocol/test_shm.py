@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import mmap
 import pickle
-import string
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
@@ -11,17 +10,19 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from written_region import create
 
+from urlab_client._platform.processors import no_fence
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol import shm
-from urlab_client.protocol.shm import Region, no_fence
+from urlab_client.protocol.shm import Region
 
 STRIDE = 24
 
 
 def new_region(n_buffers: int = 2, stride: int = STRIDE) -> tuple[bytearray, Region]:
     buffer = bytearray(b"\xee" * shm.region_size(stride, n_buffers))
-    return buffer, shm.create(buffer, stride, n_buffers, fence=no_fence)
+    return buffer, create(buffer, stride, n_buffers, fence=no_fence)
 
 
 def payload_of(publication: int) -> bytes:
@@ -94,7 +95,7 @@ class TestPublishAndRead:
         buffer, region = new_region()
         for _ in range(5):
             region.publish(b"old")
-        anew = shm.create(buffer, STRIDE, fence=no_fence)
+        anew = create(buffer, STRIDE, fence=no_fence)
         assert region.read_latest(5) is None
         anew.publish(b"new")
         assert region.read_latest(5) == shm.Publication(1, b"new")
@@ -131,7 +132,7 @@ class TestPublishAndRead:
     def test_order_of_the_stores(self) -> None:
         buffer = bytearray(shm.region_size(STRIDE))
         seen: list[tuple[bytes, int, int]] = []
-        region = shm.create(buffer, STRIDE, fence=lambda: seen.append((bytes(buffer[88:95]), buffer[24], buffer[16])))
+        region = create(buffer, STRIDE, fence=lambda: seen.append((bytes(buffer[88:95]), buffer[24], buffer[16])))
         seen.clear()
         region.publish(b"abc")
         slot = b"\3\0\0\0abc"
@@ -201,7 +202,7 @@ class TestTornReads:
         def take(live: memoryview) -> bytes:
             copy = bytes(live)
             if copy == b"old":
-                shm.create(buffer, STRIDE, 4, fence=no_fence).publish(b"new")
+                create(buffer, STRIDE, 4, fence=no_fence).publish(b"new")
             return copy
 
         assert region.read_latest(take=take) == shm.Publication(1, b"new")
@@ -251,7 +252,7 @@ class TestTornReads:
 class TestCreateAndAttach:
     def test_not_ready_until_the_last_store(self) -> None:
         buffer = bytearray(shm.region_size(STRIDE))
-        region = shm.create(buffer, STRIDE, fence=no_fence)
+        region = create(buffer, STRIDE, fence=no_fence)
         region.publish(b"old")
         looks = 0
 
@@ -261,7 +262,7 @@ class TestCreateAndAttach:
             with pytest.raises(shm.RegionNotReady, match="not written yet"):
                 shm.attach(buffer, fence=no_fence)
 
-        shm.create(buffer, STRIDE, fence=look)
+        create(buffer, STRIDE, fence=look)
         assert looks == 2
         assert shm.attach(buffer, fence=no_fence).read_latest() is None
 
@@ -327,28 +328,13 @@ class TestCreateAndAttach:
             with pytest.raises(ProtocolError, match=problem):
                 region.read_latest()
 
-    @pytest.mark.parametrize(
-        ("buffer", "stride", "n_buffers", "problem"),
-        [
-            (bytearray(112), 4, 2, "stride 4"),
-            (bytearray(112), 2**32, 2, "stride 4294967296"),
-            (bytearray(112), 24, 1, "1 slots"),
-            (bytearray(112), 24, 65, "65 slots"),
-            (bytearray(111), 24, 2, r"a buffer of 111 bytes, expected 112 \(64 \+ 24 \* 2\)"),
-            (memoryview(bytes(112)), 24, 2, "read-only"),
-        ],
-    )
-    def test_create_refuses(self, buffer: bytearray, stride: int, n_buffers: int, problem: str) -> None:
-        with pytest.raises(ValueError, match=problem):
-            shm.create(buffer, stride, n_buffers, fence=no_fence)
-
     def test_between_two_mappings_of_a_file(self, tmp_path: Path) -> None:
         path = tmp_path / shm.STATE_FILE
         path.write_bytes(bytes(shm.region_size(STRIDE)))
         with path.open("r+b") as file:
             ours = mmap.mmap(file.fileno(), 0)
             theirs = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        writer = shm.create(memoryview(ours), STRIDE, fence=no_fence)
+        writer = create(memoryview(ours), STRIDE, fence=no_fence)
         reader = shm.attach(memoryview(theirs), fence=no_fence)
         writer.publish(b"across")
         assert reader.read_latest() == shm.Publication(1, b"across")
@@ -383,18 +369,6 @@ class TestFiles:
         for names in ((name, "head"), ("g1", name)):
             with pytest.raises(ProtocolError, match="cannot be part of a file name"):
                 shm.camera_file(*names)
-
-    @given(st.text(min_size=1))
-    def test_safe_names_serve_as_key_topic_and_file_name(self, name: str) -> None:
-        safe = shm.safe_name(name)
-        assert safe
-        assert set(safe) <= set(string.ascii_letters + string.digits + "_-.")
-        assert PurePath(shm.camera_file(safe, safe)).name == f"cam_{safe}_{safe}.shm"
-        assert shm.safe_name(safe) == safe
-
-    def test_plain_names_are_safe_already(self) -> None:
-        for name in ("robot_C_0", "left-knee.2"):
-            assert shm.safe_name(name) == name
 
     def test_directories(self) -> None:
         """Beta statement 98."""

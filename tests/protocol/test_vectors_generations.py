@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import vectors
 
+from urlab_client._platform.processors import no_fence
 from urlab_client.aio.features import Features
 from urlab_client.enums import CameraMode
 from urlab_client.errors import (
@@ -38,7 +39,7 @@ from urlab_client.protocol.messages.session import HelloOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
-from urlab_client.values import pixels
+from urlab_client.values import pictures
 
 REPLIES = {op.reply_name: op for op in OPS.values()} | {"set_mode_ok": OPS["set_mode"]}
 
@@ -219,7 +220,7 @@ def test_a_published_snapshot_and_its_region() -> None:
     assert topic == topics.STATE_FULL
     assert StateSnapshot.decode(payload).per_articulation.keys() == {"arm_a"}
     region = vectors.load("shm_region_state_full", "beta")
-    found = shm.attach(bytearray(region.data), fence=shm.no_fence).read_latest()
+    found = shm.attach(bytearray(region.data), fence=no_fence).read_latest()
     assert found is not None
     assert found.sequence == region.decoded["header"]["sequence"]
     assert StateSnapshot.decode(found.payload).per_articulation.keys() == {"arm_a"}
@@ -232,12 +233,12 @@ def test_picture_headers(name: str) -> None:
     said = vector.decoded
     if vector.expect == "reject":
         with pytest.raises(ProtocolError):
-            pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+            pictures.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
         return
-    frame = pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+    frame = pictures.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
     bare = bytes.fromhex(said["pixels_hex"])
     assert np.array_equal(
-        frame.pixels, pixels.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
+        frame.pixels, pictures.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
     )
     assert (frame.frame_id, frame.sim_time, frame.capture_time) == (
         said["frame_id"],
@@ -251,7 +252,7 @@ def test_a_published_picture(generation: str, name: str) -> None:
     vector = vectors.load(name, generation)
     topic, payload = vector.frames
     assert topic.decode() == vector.decoded["topic"]
-    assert pixels.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
+    assert pictures.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
 
 
 # What the answers say about the server.

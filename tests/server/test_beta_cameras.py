@@ -20,7 +20,7 @@ from wire import Wire
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render import camera_renderer
 from urlab_client.server.render.camera_renderer import GIVEN_UP, CameraRenderer
-from urlab_client.server.render.drawing import Stage
+from urlab_client.simulation.drawing import Stage
 
 
 @pytest.mark.opengl

@@ -134,11 +134,14 @@ def test_the_other_writes_that_need_an_owner(playing: Bench) -> None:
 
 def test_what_needs_no_owner(playing: Bench) -> None:
     """Beta statement 22."""
-    playing.wire.ask("reset")
-    playing.wire.ask("forward")
-    playing.wire.ask("set_user_channels", scene={"door": True})
-    playing.wire.ask("set_mode", mode="puppet")
-    playing.step(qpos=[0.0] * 16, time=0.5)
+    playing.step(n_steps=3)
+    assert playing.wire.ask("reset")["time"] == 0.0
+    assert playing.wire.ask("forward")["step"] == 0.0
+    assert playing.wire.ask("set_user_channels", scene={"door": True})["applied"] == 1.0
+    assert playing.refused("configure_controller", articulation="arm_a", params={})[0] == "no_controller"
+    assert playing.wire.ask("set_mode", mode="puppet")["current_mode"] == "puppet"
+    pushed = playing.step(qpos=[0.25] * 16, time=0.5)
+    assert (pushed["time"], pushed["arts"]["arm_a"]["qpos"]) == (0.5, [0.25] * 8)
 
 
 def test_a_claim_ends_with_play_and_belongs_to_its_name(playing: Bench) -> None:

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from wire import files_of_at_most
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
 from urlab_client._platform.files import replaced, write_whole
-from urlab_client.server.assets import content, sandbox
+from urlab_client.server.assets import content, importer
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
@@ -370,14 +371,11 @@ def test_an_import_onto_a_full_disk_is_refused_and_leaves_nothing(workspace: Wor
             with pytest.raises(Refusal, match="import_failed: cannot store the snapshot"):
                 workspace.content.import_xml(path, force_reimport=True, trusted=True)
         (workspace.saved / "snapshot").mkdir()
-        order = sandbox._SandboxJob(
-            str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits()
-        )
-        outcome = sandbox._work(order)  # of a child, whose files have a limit of their own
+        order = importer._Order(str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits())
+        with pytest.raises(ValueError, match=r"^cannot store the snapshot"):
+            importer.build_order(msgspec.msgpack.encode(order))  # in a process whose files have a limit of their own
         shutil.rmtree(workspace.saved / "snapshot")
 
-    assert outcome.done is None
-    assert outcome.subject.startswith("cannot store the snapshot")
     assert tree(workspace.saved) == before
     assert list(workspace.content.blueprints) == list(ContentRoot(workspace.saved).blueprints) == ["bot"]
     assert workspace.content.import_xml("arm")[1]

@@ -13,15 +13,9 @@ from hypothesis import strategies as st
 from scenes import BOT, make_scene
 
 from urlab_client.enums import ControllerKind
-from urlab_client.server.physics.controllers import (
-    ArticulationControl,
-    ControllerConfig,
-    ControlSource,
-    PassthroughController,
-    PDController,
-    SetPoints,
-    Twist,
-)
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource, SetPoints, Twist
+from urlab_client.simulation.controller_config import ControllerConfig
+from urlab_client.simulation.controllers import PassthroughController, PDController
 
 MIXED = """
 <mujoco>

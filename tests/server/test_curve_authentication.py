@@ -17,8 +17,9 @@ from ports import free_ports
 from waiting import eventually
 from wire import server_threads
 
-from urlab_client import AuthenticationFailed, URLabClient
+from urlab_client import URLabClient
 from urlab_client.cli import main
+from urlab_client.errors import AuthenticationFailed
 from urlab_client.keys import KeyFileError, KeyPair, public_key, read_pair
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.server import CurveServer, SimulatedServer, UnprotectedServer

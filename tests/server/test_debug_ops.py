@@ -12,7 +12,7 @@ from wire import Wire
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.editor.markers import DebugLine, Drawings, Sphere
-from urlab_client.server.handlers.debug import _color
+from urlab_client.server.handlers.viewport import _color
 from urlab_client.server.limits import Limits
 
 COLOR = [1, 0, 0]

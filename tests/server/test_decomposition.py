@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from urlab_client import AddQuickConvertFailed, URLabClient
+from urlab_client import URLabClient
+from urlab_client.errors import AddQuickConvertFailed
 from urlab_client.server import ModelError, SimulatedServer
 from urlab_client.server.assets.decomposition import convex_parts
 

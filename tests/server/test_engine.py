@@ -24,9 +24,10 @@ from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.handlers.runtime import parse_control_source, parse_mode
 from urlab_client.server.physics import engine as engine_module
 from urlab_client.server.physics import pacing
-from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
+from urlab_client.server.physics.controllers import ControlSource
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 
 DT = 0.002
 DEADLINE = 30.0

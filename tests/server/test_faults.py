@@ -14,14 +14,8 @@ from hypothesis import strategies as st
 from waiting import attempts, eventually
 from wire import Wire
 
-from urlab_client import (
-    OutcomeUnknown,
-    ProtocolError,
-    SessionTakenOver,
-    StepTimeout,
-    URLabClient,
-    URLabTimeoutError,
-)
+from urlab_client import OutcomeUnknown, SessionTakenOver, URLabClient, URLabTimeoutError
+from urlab_client.errors import ProtocolError, StepTimeout
 from urlab_client.server import Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse, SimulatedServer
 
 

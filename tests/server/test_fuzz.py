@@ -23,8 +23,8 @@ from scenes import hasty
 from waiting import attempts
 from wire import Wire, pack
 
-from urlab_client import ProtocolError, URLabRPCError
-from urlab_client.errors import RPC_ERRORS
+from urlab_client import URLabRPCError
+from urlab_client.errors import RPC_ERRORS, ProtocolError
 from urlab_client.protocol.base import DialectName, Needs
 from urlab_client.protocol.codec import decode_reply
 from urlab_client.protocol.messages.session import HelloOk, StepOk

@@ -15,8 +15,9 @@ import pytest
 from waiting import DEADLINE_S, eventually
 from wire import Wire
 
-from urlab_client import InternalError, ServerUnreachable, URLabClient, URLabPIEError
+from urlab_client import ServerUnreachable, URLabClient, URLabPIEError
 from urlab_client.enums import PIEState
+from urlab_client.errors import InternalError
 from urlab_client.keys import KeyPair
 from urlab_client.protocol.messages.scene import CreateLevelOk
 from urlab_client.server import CurveServer, Drop, Faults, SimulatedServer
@@ -212,9 +213,9 @@ def test_the_thread_that_waits_for_a_confined_compiler(
 ) -> None:
     wire = serve()
     with monkeypatch.context() as patch:
-        patch.setattr("urlab_client.server.assets.sandbox._REPLY_BYTES", "many")
+        patch.setattr("urlab_client._sandbox.process._SIZE", "many")
         assert wire.refused("import_xml", path=str(models / "bot.xml")) == "internal_error"
-    assert "urlab-sandbox died of TypeError" in caplog.text
+    assert "urlab-sandbox died of AttributeError" in caplog.text
     assert wire.ask("import_xml", path=str(models / "bot.xml"))["blueprint_short_name"] == "bot"
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
-from urlab_client.server.render.latency import CAPACITY, Instant, Latency
+from urlab_client.simulation.cameras import CAPACITY, Instant, Latency
 
 STATE = np.zeros(1)
 

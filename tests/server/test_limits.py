@@ -141,10 +141,16 @@ def test_a_recording_too_large_to_load(serve: Serve, tmp_path: Path) -> None:
     assert (code, "recording_file_bytes" in message) == ("path_not_readable", True)
 
 
-def test_drawings_give_way(small: Wire) -> None:
-    for x in range(10):
-        small.ask("draw_marker", location=[x, 0, 0], color=[1, 0, 0], ttl=-1)
-    kept = small.core.drawings.take_frame(in_play=False)
+@pytest.mark.parametrize("restored", [False, True])
+def test_drawings_give_way(restored: bool, models: Path) -> None:
+    with SimulatedServer(models / "bot.xml", limits=SMALL) as server:
+        if restored:
+            server.restore()
+        with Wire(server) as wire:
+            wire.hello()
+            for x in range(10):
+                wire.ask("draw_marker", location=[x, 0, 0], color=[1, 0, 0], ttl=-1)
+            kept = wire.core.drawings.take_frame(in_play=False)
     assert [marker.center[0] for marker in kept] == [7, 8, 9], "the newest stay"
 
 

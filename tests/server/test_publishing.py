@@ -21,11 +21,11 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
 from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server import SimulatedServer
-from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.streams import broadcast, publishing
 from urlab_client.server.streams.control_messages import ControlPayload, encode_gains
 from urlab_client.server.transport.endpoint import bound_peers
+from urlab_client.simulation.controller_config import ControllerConfig
 
 Tick = list[tuple[bytes, bytes]]
 

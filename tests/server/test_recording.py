@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import Wire
 
-from urlab_client.server.physics.recording import Frame, JointLayout, decode_csv, decode_json, encode_json
+from urlab_client.simulation import joint_recording as recording
+from urlab_client.simulation.joint_recording import Frame, JointLayout, decode_csv, decode_json, encode_json
 
 Serve = Callable[..., Wire]
 
@@ -135,6 +136,31 @@ def test_what_is_saved_is_loaded(widths: dict[str, tuple[int, int]], times: list
     assert frames_equal(decode_json(encode_json(frames)), frames)
 
 
+@pytest.mark.parametrize("limit", [201, 202, 700])
+def test_a_file_is_decoded_in_parts(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = JointLayout.of([("j", 2, 2)])
+    frames = [Frame(float(10 + at), layout, np.full(2, 0.25), np.full(2, -0.125)) for at in range(90)]
+    monkeypatch.setattr(recording, "_VALUE_CHARS", limit)
+    content = encode_json(frames)
+    assert frames_equal(decode_json(content), frames)
+    broken = content.replace(b'"timestamp":99', b'"timestamp"=99')
+    with pytest.raises(ValueError, match=rf"char {broken.index(b'=')}\)"):
+        decode_json(broken)
+    monkeypatch.setattr(recording, "_VALUE_CHARS", 100)
+    with pytest.raises(ValueError, match="the value at character 11 is damaged, or has 100 characters or more"):
+        decode_json(content)
+
+
+def test_frames_take_no_more_memory_than_a_file_of_their_size_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "_SMALL_BYTES", 1000)
+    assert len(decode_json(b'{"Frames":[{},{}]}')) == 2
+    content = b'{"Frames":[' + b"{}," * 40 + b"{}]}"
+    with pytest.raises(ValueError, match=f"its frames take more than {16 * len(content)} bytes of memory"):
+        decode_json(content)
+    one = [Frame(0.5, JointLayout.of([("j", 1, 1)]), np.zeros(1), np.zeros(1))]
+    assert len(decode_json(encode_json(one * 100))) == 100
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_a_file_of_the_plugin(encoding: str) -> None:
     text = '{"frames":[{"TIMESTAMP":1,"JointStates":{"é":{"QPos":[2],"qvel":[3]}},"extra":0},{}]}'
@@ -235,7 +261,8 @@ import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 from urlab_client._platform.files import write_whole
-from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
+from urlab_client.simulation.joint_recording import Frame, JointLayout, encode_json
+from urlab_client.simulation import joint_recording as recording
 
 layout = JointLayout.of([("j", 1, 1)])
 file, chance = Path(sys.argv[1]), random.Random(0)

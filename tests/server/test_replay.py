@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from scenes import BOT, make_scene
 from wire import Wire
 
-from urlab_client.server.physics.recording import Frame, JointLayout
 from urlab_client.server.physics.replay import Player
+from urlab_client.simulation.joint_recording import Frame, JointLayout
 
 
 @pytest.fixture

@@ -18,11 +18,13 @@ import msgspec
 import pytest
 from wire import Wire
 
-from urlab_client import ImportFailed, URLabTimeoutError
-from urlab_client._sandbox.landlock import is_available
+from urlab_client import URLabTimeoutError
+from urlab_client._sandbox import process
+from urlab_client._sandbox.confinement import is_available
 from urlab_client.aio import URLabClient
+from urlab_client.errors import ImportFailed
 from urlab_client.server import Limits, ModelError, SimulatedServer, open_server
-from urlab_client.server.assets import sandbox
+from urlab_client.server.assets import importer
 from urlab_client.server.refusal import Refusal
 
 Serve = Callable[..., Wire]
@@ -105,20 +107,20 @@ HANGING = "import time; time.sleep(600)"
 LEFT_WITH_THE_PIPE = """
 import os, sys, time
 alive = os.open("{alive}", os.O_WRONLY)
-sys.stdin.readline()
+sys.stdin.buffer.read(9)
 if os.fork() == 0:
     time.sleep(600)
 """
 LEFT_AT_WORK = """
 import os, signal
 alive = os.open("{alive}", os.O_WRONLY)
-from urlab_client.server.assets import sandbox
-def work(order):
+from urlab_client._sandbox import process
+def work(job):
     os.kill(os.getppid(), signal.SIGKILL)
     while True:
         sum(range(10**9))  # which heeds no signal
-sandbox._work, sandbox.confine_files = work, lambda *_: None  # or the kernel forbids the signal
-sandbox.serve()
+process._work = work
+process.serve()
 """
 LEFT_ITS_GROUP = LEFT_WITH_THE_PIPE.replace("    time.", "    os.setsid(); os.write(alive, b'%d' % os.getpid()); time.")
 
@@ -126,27 +128,27 @@ LEFT_ITS_GROUP = LEFT_WITH_THE_PIPE.replace("    time.", "    os.setsid(); os.wr
 @pytest.fixture
 def compile_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]]:
     """Have a model compiled by a program of the test's, and return why that failed."""
-    monkeypatch.setattr(sandbox, "_compilers", sandbox._Compilers())
-    monkeypatch.setattr(sandbox, "_END_S", 0.1)
+    monkeypatch.setattr(process, "_children", process._Children())
+    monkeypatch.setattr(process, "_END_S", 0.1)
 
     def compile_with(program: str, wall_s: float) -> str:
-        monkeypatch.setattr(sandbox._Compiler, "program", program)
-        monkeypatch.setattr(sandbox, "_GRACE_S", wall_s - 1)
+        monkeypatch.setattr(process._Child, "program", program)
+        monkeypatch.setattr(process, "_GRACE_S", wall_s - 1)
         with pytest.raises(Refusal) as refused:
-            sandbox.build_confined(tmp_path / "x.xml", tmp_path / "snapshot", (tmp_path,), Limits(model_wall_s=1))
+            importer.build_confined(tmp_path / "x.xml", tmp_path / "snapshot", (tmp_path,), Limits(model_wall_s=1))
         return refused.value.message
 
     yield compile_with
-    sandbox._compilers.close()
+    process._children.close()
 
 
 def test_a_process_that_never_answers_is_waited_for_once(
     compile_with: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[sandbox._Compiler] = []
-    start = sandbox._Compiler.__init__
-    monkeypatch.setattr(sandbox._Compiler, "__init__", lambda self: (started.append(self), start(self))[1])
-    assert compile_with(HANGING, 0.1).endswith("x.xml: compilation took longer than the limit model_wall_s, 1 s")
+    started: list[process._Child] = []
+    start = process._Child.__init__
+    monkeypatch.setattr(process._Child, "__init__", lambda self: (started.append(self), start(self))[1])
+    assert compile_with(HANGING, 0.1).endswith("x.xml: compilation took more than the limit model_wall_s, 1 s")
     assert len(started) == 1
 
 
@@ -177,10 +179,12 @@ def test_models_do_not_wait_for_each_other(tmp_path: Path, compile_with: Callabl
     begun = os.open(tmp_path / "begun", os.O_RDWR)
     program = f"""
 import fcntl, os, sys
-sys.stdin.readline()
+from urlab_client._sandbox import process
+sys.stdin.buffer.read(9)
 os.write(os.open({str(tmp_path / "begun")!r}, os.O_WRONLY), b".")
 fcntl.flock(os.open({str(tmp_path)!r}, os.O_RDONLY), fcntl.LOCK_SH)
-print('{{"refused": "done"}}', flush=True)
+sys.stdout.buffer.write(process._framed(process._Answer(failed="done")))
+sys.stdout.flush()
 sys.stdin.read()
 """
     import fcntl  # not on Windows
@@ -371,7 +375,7 @@ def test_what_is_not_understood_is_refused(text: str, reason: str, wire: Wire, f
 def test_a_process_that_compiles_starts_without_a_word(
     wire: Wire, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    sandbox._compilers.close()
+    process._children.close()
     model = folder / "root" / "first.xml"
     model.write_text(f"<mujoco>{BODY}</mujoco>")
     assert wire.ask("import_xml", path=str(model))["imported_now"] is True
@@ -389,23 +393,28 @@ def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
 
 
 @pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
-def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tmp_path: Path) -> None:
+def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     program = (
-        "from urlab_client.server.assets import sandbox\n"
-        "sandbox.check_references = lambda *arguments: None\n"
-        "sandbox.serve()\n"
+        "from urlab_client._sandbox import process\n"
+        "from urlab_client.server.assets import importer\n"
+        "importer.check_references = lambda *arguments: None\n"
+        "process.serve()\n"
     )
-    orders = b""
+    monkeypatch.setattr(process, "_children", process._Children())
+    monkeypatch.setattr(process._Child, "program", program)
     for name, file in (("inside", "meshes/figure.obj"), ("outside", str(folder / "secret.obj"))):
         model = folder / "root" / f"{name}.xml"
         model.write_text(FIGURE.format(file=file))
         (tmp_path / name).mkdir()
-        order = sandbox._SandboxJob(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
-        orders += msgspec.json.encode(order) + b"\n"
-    child = subprocess.run([sys.executable, "-c", program], input=orders, stdout=subprocess.PIPE, check=True)
-    inside, outside = map(msgspec.json.decode, child.stdout.splitlines())
-    assert inside["done"] is not None
-    assert "MuJoCo rejects" in outside["subject"]
+        order = (model, tmp_path / name / "snapshot", (folder / "root",), LIMITS)
+        if name == "inside":
+            assert importer.build_confined(*order).n_bytes
+        else:
+            with pytest.raises(Refusal, match="MuJoCo rejects"):
+                importer.build_confined(*order)
+    process._children.close()
     assert not [*(tmp_path / "outside").rglob("*.obj")]
 
 
@@ -417,7 +426,7 @@ def test_a_confined_process_opens_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "read" / "link").symlink_to(tmp_path / "other" / "file")
     program = (
         "import os, pathlib, socket, sys\n"
-        "from urlab_client._sandbox.landlock import confine_files\n"
+        "from urlab_client._sandbox.confinement import confine_files\n"
         "here = pathlib.Path(sys.argv[1])\n"
         "kept = open(here / 'other' / 'file')\n"
         "server = socket.create_server(('127.0.0.1', 0))\n"
@@ -553,8 +562,8 @@ def test_a_child_that_was_killed_is_replaced(wire: Wire, folder: Path) -> None:
     model = folder / "root" / "again.xml"
     model.write_text('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
     wire.ask("import_xml", path=str(model))
-    assert sandbox._compilers._idle is not None
-    child = sandbox._compilers._idle.process
+    assert process._children.idle is not None
+    child = process._children.idle.process
     child.kill()
     child.wait(30)
     assert wire.ask("import_xml", path=str(model), force_reimport=True)["imported_now"] is True
@@ -583,8 +592,8 @@ async def test_physics_and_streams_go_on_while_a_model_compiles(folder: Path) ->
     ):
         await client.discover()
         await client.scene.import_xml(str(quick))
-        assert sandbox._compilers._idle is not None
-        child = sandbox._compilers._idle.process
+        assert process._children.idle is not None
+        child = process._children.idle.process
         child.send_signal(signal.SIGSTOP)  # it takes as long as the rest does
         try:
             compiling = asyncio.create_task(client.scene.import_xml(str(bomb), timeout=None))

@@ -25,7 +25,8 @@ from waiting import eventually
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.system.health import Health
-from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile
+from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.transport.region_files import RegionFile
 from urlab_client.server.transport.shared_memory import MAX_LISTENERS, SharedMemoryServer
 
 Rpc = Callable[..., dict[str, Any]]
@@ -367,11 +368,11 @@ def test_servers_that_start_at_once_leave_each_other_alone(base: Path) -> None:
     killed, left = serve(base)
     end(killed, subprocess.Popen.kill)
     with ThreadPoolExecutor(8) as threads:
-        directories = list(threads.map(lambda _: InstanceDirectory(base), range(64)))
+        directories = list(threads.map(lambda _: TemporaryFolder(base), range(64)))
     assert not left.exists()
     assert all(directory.path.is_dir() for directory in directories)
     for directory in directories:
-        directory.remove()
+        directory.close()
     assert list(base.iterdir()) == []
 
 

@@ -12,8 +12,9 @@ from wire import Wire
 
 from urlab_client.server import RenderingUnavailable, SimulatedServer
 from urlab_client.server.editor.markers import Drawings
-from urlab_client.server.render import drawing, opengl
+from urlab_client.server.render import viewport_picture
 from urlab_client.server.render.viewport_picture import SELECTED
+from urlab_client.simulation import opengl
 
 # A grey cube that collides, on a stick that does not, and a ball that falls away.
 MODEL = """
@@ -343,7 +344,7 @@ def test_drawing_that_fails_is_an_error(stage: Stage, monkeypatch: pytest.Monkey
     def fail(*arguments: object) -> None:
         raise RuntimeError("the driver is gone")
 
-    monkeypatch.setattr(drawing.Stage, "paint", fail)
+    monkeypatch.setattr(viewport_picture.ViewportStage, "paint", fail)
     for _ in range(2):
         with pytest.raises(RenderingUnavailable, match="log"):
             stage.server.snapshot(SIZE)

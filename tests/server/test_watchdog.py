@@ -14,8 +14,8 @@ import pytest
 from waiting import eventually
 from wire import Wire
 
-from urlab_client import NotReady, StepTimeout
 from urlab_client.aio import URLabClient
+from urlab_client.errors import NotReady, StepTimeout
 from urlab_client.server import Faults, SimulatedServer
 from urlab_client.server.core import ServerCore
 from urlab_client.server.rpc import watchdog

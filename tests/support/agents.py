@@ -12,10 +12,10 @@ from mcp import Client
 from mcp.types import CallToolResult
 
 from urlab_client.aio import URLabClient
+from urlab_client.console.session import ConsoleSession
 from urlab_client.mcp import Agent, Limits
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app
-from urlab_client.web.console_session import ConsoleSession
 
 ALL = Limits(drive=True, edit=True)
 

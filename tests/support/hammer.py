@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from urlab_client.protocol.fence import processor_fence
+from urlab_client._platform.processors import processor_fence
 from urlab_client.protocol.shm import Region, attach
 
 WORDS = (8, 40, 100)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import queue
 import threading
 from collections.abc import Callable
@@ -10,34 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from written_region import WrittenRegion
 
 from urlab_client.protocol import shm
-from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.registry import OPS
 
 Answer = Callable[[dict[str, Any]], "dict[str, Any] | bytes | None"]
-
-
-class WrittenRegion:
-    """A region's file and its writer, made in place as the plugin does."""
-
-    def __init__(self, path: Path, stride: int) -> None:
-        self.path = path
-        with path.open("w+b") as file:
-            file.truncate(shm.region_size(stride))
-            self._map = mmap.mmap(file.fileno(), shm.region_size(stride))
-        self.region = shm.create(self._map, stride, fence=processor_fence())
-
-    def publish(self, payload: bytes) -> None:
-        """Publish; what is too large is dropped."""
-        if len(payload) <= self.region.max_payload:
-            self.region.publish(payload)
-
-    def close(self) -> None:
-        """Remove the file."""
-        self.region.release()
-        self._map.close()
-        self.path.unlink(missing_ok=True)
 
 
 class PluginMemory:

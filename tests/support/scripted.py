@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -73,9 +74,13 @@ class ScriptedServer:
         envelope = self.held.get(timeout=DEADLINE_S)
         self._control.send_multipart([*envelope, msgspec.msgpack.encode(reply)])
 
-    def request(self, timeout: float = DEADLINE_S) -> dict[str, Any]:
-        """Return the next request that arrived."""
-        return self.seen.get(timeout=timeout)
+    def request(self, op: str | None = None) -> dict[str, Any]:
+        """Return the next request that arrived, or the next of an op, whatever else arrives until then."""
+        deadline = time.monotonic() + DEADLINE_S
+        while True:
+            found = self.seen.get(timeout=max(0.0, deadline - time.monotonic()))
+            if op is None or found["op"] == op:
+                return found
 
     def close(self) -> None:
         """Vanish, as a killed process does."""

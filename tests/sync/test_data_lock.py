@@ -17,10 +17,12 @@ def test_values_read_under_the_data_lock_belong_together() -> None:
         over = threading.Event()
 
         def step() -> None:
-            for _ in range(100):
-                reply = client.step()
-                stepped[reply.time] = reply.per_articulation[ball.prefix].qpos.tolist()
-            over.set()
+            try:
+                for _ in range(100):
+                    reply = client.step()
+                    stepped[reply.time] = reply.per_articulation[ball.prefix].qpos.tolist()
+            finally:
+                over.set()
 
         stepping = threading.Thread(target=step)
         stepping.start()

@@ -14,13 +14,8 @@ from urlab_client import (
     ActorInfo,
     ActuatorType,
     CameraMode,
-    CameraPose,
-    ClientConfig,
-    ContactsResult,
     ControllerKind,
     ControlMode,
-    Diagnosis,
-    KeyframeInfo,
     PIEStartResult,
     SimOptions,
     StepMode,
@@ -47,9 +42,11 @@ from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.streams.stream import Stream
+from urlab_client.events import ClientEvent, PlayEnded
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
+from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
+from urlab_client.types import CameraPose, ClientConfig, ContactsResult, Diagnosis, KeyframeInfo
 from urlab_client.values.names import NameMap
 
 Floats = NDArray[np.float64]

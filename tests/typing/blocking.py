@@ -16,14 +16,9 @@ from urlab_client import (
     ActuatorType,
     Body,
     CameraMode,
-    CameraPose,
-    ClientConfig,
-    ContactsResult,
     ControllerKind,
     ControlMode,
-    Diagnosis,
     Joint,
-    KeyframeInfo,
     PIEStartResult,
     Sensor,
     SimOptions,
@@ -38,9 +33,10 @@ from urlab_client import (
     URLabPDController,
     URLabSpawnHandle,
 )
+from urlab_client.events import ClientEvent, PlayEnded
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
+from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
 from urlab_client.sync.namespaces import (
     DebugNamespace,
     OutlinerNamespace,
@@ -52,6 +48,7 @@ from urlab_client.sync.namespaces import (
     ViewportNamespace,
 )
 from urlab_client.sync.streams import Stream
+from urlab_client.types import CameraPose, ClientConfig, ContactsResult, Diagnosis, KeyframeInfo
 from urlab_client.values.names import NameMap
 
 Floats = NDArray[np.float64]

@@ -20,9 +20,10 @@ from waiting import until
 
 from urlab_client.aio import URLabClient
 from urlab_client.cli._pages import bound, graceful_exit, serve
+from urlab_client.console import model_import
 from urlab_client.integrations.record import Run, export
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app, model_upload
+from urlab_client.web import Access, app
 
 LONG = "long.mcap"
 
@@ -100,7 +101,7 @@ def compiling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
             progress(0)
             file.with_name("part").touch()
 
-    monkeypatch.setattr(model_upload, "flatten_confined", flatten)
+    monkeypatch.setattr(model_import, "flatten_confined", flatten)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path.parent / f"{tmp_path.name}-temporary"))
     Path(tempfile.gettempdir()).mkdir()
     return Path(tempfile.gettempdir())

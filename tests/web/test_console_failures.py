@@ -16,16 +16,16 @@ from starlette.routing import Mount
 from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient, background
+from urlab_client.console.controls import Controls
+from urlab_client.console.hand_driving import HandDriving
+from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.pictures import Feed
+from urlab_client.console.replay import Replay
+from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.controls import Controls
-from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.hand_driving import HandDriving
-from urlab_client.web.pictures import Feed
-from urlab_client.web.replay import Replay
 
 ME = Viewer("key", "me")
 LOOPS = [

@@ -15,15 +15,17 @@ from typing import Any
 
 import pytest
 from forked import COMMAND, program
+from msgspec.structs import replace
 from starlette.testclient import TestClient
 from test_web_api import mounted
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.model import compilation
 from urlab_client.aio.model.upload import flatten
+from urlab_client.console import model_import
+from urlab_client.console.session import ConsoleSession
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, model_upload
-from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web import Access
 
 BALL = "<mujoco><worldbody><body name='b'><joint name='j'/><geom size='.1'/></body></worldbody></mujoco>"
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -56,13 +58,13 @@ def http(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[TestClient]
 @pytest.fixture
 def compiled_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of what happens to compiled models: no child process, which takes half a second."""
-    monkeypatch.setattr(model_upload, "flatten_confined", lambda file, _progress: flatten(file))
+    monkeypatch.setattr(model_import, "flatten_confined", lambda file, _progress: flatten(file))
 
 
 @pytest.fixture
 def nothing_handed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if servers could not read what this machine hands over."""
-    monkeypatch.setattr(model_upload, "import_directory", lambda: tmp_path / "nobody reads it")
+    monkeypatch.setattr(model_import, "import_directory", lambda: tmp_path / "nobody reads it")
 
 
 def zipped(**files: str) -> bytes:
@@ -168,10 +170,10 @@ def test_a_viewers_model_reads_nothing_of_the_consoles_machine(http: TestClient,
 @pytest.mark.parametrize("http", ["beta"], indirect=True)
 def test_a_viewers_model_takes_no_more_time_than_it_may(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     replicated = "<replicate count='100'>" * 4 + "<geom size='.1'/>" + "</replicate>" * 4
-    monkeypatch.setattr(compilation, "_UPLOAD_CPU_S", 1)
+    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, cpu_s=1))
     bomb = f"<mujoco><worldbody>{replicated}</worldbody></mujoco>"
     assert "1 s of processor time" in refusal(http.put("/api/models/m.xml", content=bomb))
-    monkeypatch.setattr(compilation, "_UPLOAD_WALL_S", 0)
+    monkeypatch.setattr(compilation, "UPLOAD_LIMITS", replace(compilation.UPLOAD_LIMITS, wall_s=0))
     assert "took more than 0 s" in refusal(http.put("/api/models/m.xml", content=bomb))
     assert blueprints(http) == ["arm"]
 

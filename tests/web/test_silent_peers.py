@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from argparse import Namespace
 from collections.abc import AsyncGenerator
 from typing import Any
 
@@ -159,7 +160,7 @@ async def test_one_connection_too_many_ends_the_oldest_without_a_request() -> No
 async def test_the_metrics_of_a_server_wait_for_nobody_either(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(telemetry, "PrometheusServerMetrics", lambda _: None)  # its registry is the process's
     monkeypatch.setattr(serve_command, "_SILENT_S", 0.2)
-    arguments = serve_command.ServeArguments(metrics_port=0)
+    arguments = Namespace(metrics_port=0)
     with serve_command._metrics(SimulatedServer(), arguments) as port:
         for sent in (b"", HEAD):
             reader, writer = await asyncio.open_connection("127.0.0.1", port)

@@ -22,11 +22,12 @@ from starlette.websockets import WebSocketDisconnect
 from waiting import attempts
 
 from urlab_client.aio import URLabClient
+from urlab_client.console import mujoco_viewer
+from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
 from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app, mujoco_viewer
-from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web import Access, app
 
 
 @pytest.fixture(scope="module")
@@ -273,9 +274,7 @@ def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestC
         _, last = next(states), next(states)  # takes two, and says nothing of having shown them
         ahead = heard(quick, "state", lambda state: state["seq"] > last + 30)["seq"]
         busy.send_json({"type": "ack"})
-        while (message := busy.receive_json())["type"] != "state":
-            pass
-        assert message["seq"] >= ahead
+        assert heard(busy, "state")["seq"] >= ahead
 
 
 @pytest.mark.parametrize("path", ["/api/live", "/api/cameras/arm/wrist/live"])

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from starlette.datastructures import Headers
 
-from urlab_client.web import Access, access, recordings
+from urlab_client.console import recordings
+from urlab_client.web import Access, access
 
 
 def test_the_keys_that_were_used_last_are_good(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias, TypeVarTuple
 
 from urlab_client._platform.threads import daemon
 from urlab_client.errors import URLabError
-from urlab_client.protocol.messages.streams import ClientEvent, TaskFailed
+from urlab_client.events import ClientEvent, TaskFailed
 
 log: logging.Logger = logging.getLogger("urlab_client.background")
 

@@ -15,7 +15,7 @@ from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -124,7 +124,8 @@ class URLabCameraView:
         """Stream the camera's pictures as the server publishes them.
 
         Servers of the alpha publish pictures in live mode only, the plugin without time or number. Newer servers
-        publish them in every mode, once per state: no pictures arrive while the simulation stands still.
+        publish them in every mode, once per state. While the simulation stands still, a camera that this call switches
+        on sends the present state if it has not sent it before; nothing else arrives.
 
         Args:
             policy: `latest`, or `all` within the limits of the buffer.

@@ -38,16 +38,17 @@ from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.rows import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.curve import client_keys, is_local
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.errors import URLabError
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
@@ -167,7 +168,7 @@ class URLabClient(ClientState):
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
-        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = ServerRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         session = Session(

@@ -14,7 +14,7 @@ from urlab_client.aio.features import Features
 from urlab_client.enums import CameraTiming, StepMode, Transport
 from urlab_client.protocol.messages.session import InstanceInfo, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 
 class Verdict(StrEnum):

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from urlab_client.protocol.messages.control import ClaimControlOk
 from urlab_client.protocol.messages.session import HelloOk, StateReply
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 
 class Features(Serializable, Struct, frozen=True, kw_only=True, dict=True):

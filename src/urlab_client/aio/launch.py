@@ -29,12 +29,12 @@ from msgspec import Struct
 from urlab_client._platform.children import APART
 from urlab_client.aio.background import Tell, background_task, background_thread
 from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
-from urlab_client.aio.transport.curve import ClientKeys
+from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import Hello, HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent
 
 log: logging.Logger = logging.getLogger("urlab_client.launch")
 
@@ -70,10 +70,11 @@ def serve_arguments(address: str) -> list[str]:
     """
     models, options = _parsed(address)
     for key, _ in options:
-        if key in _OPENING:
+        name = key.partition("=")[0]  # `server-key%3DFILE` is one key, and sets the option, too
+        if name in _OPENING:
             raise ValueError(
-                f"{address!r}: '{key}' is for a server that others use, and this one is for its client alone; start it "
-                "with `urlab serve`"
+                f"{address!r}: '{name}' is for a server that others use, and this one is for its client alone; start "
+                "it with `urlab serve`"
             )
     arguments = [f"--{key}={value}" if value else f"--{key}" for key, value in options if key != _START_TIMEOUT]
     return [*models, *arguments]

@@ -1,7 +1,8 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has its own module and imports heavy dependencies (MuJoCo, the server, the demo's libraries) when it
-runs. An expected failure prints one line on standard error and exits with code 2.
+Each command has a module with its `DESCRIPTION`, its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`. Only the
+module of the command that is run is imported, because every `sim://` server is an `urlab serve`, and none for
+`urlab --help`. An expected failure prints one line on standard error and exits with code 2.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 import urlab_client
-from urlab_client._extras import MissingExtra
+from urlab_client._installation import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError
@@ -26,25 +27,25 @@ __all__ = ["main"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
-_COMMANDS = (
-    "serve",
-    "console",
-    "mcp",
-    "ping",
-    "doctor",
-    "demo",
-    "robots",
-    "keys",
-    "snapshot",
-    "record",
-    "info",
-    "convert",
-    "plot",
-    "run-policy",
-    "evaluate",
-    "teleop",
-    "view",
-)
+COMMANDS = {
+    "serve": "run a simulated server",
+    "console": "show a simulation in the browser, and interact with it",
+    "mcp": "let an agent look at a simulation, and drive it if you allow that",
+    "ping": "show which server answers at an address, and how fast",
+    "doctor": "find out why a robot does not move",
+    "demo": "drive a robot end to end; keep a plot, a picture and the configuration",
+    "robots": "list the bundled robots",
+    "keys": "make and show CURVE keys",
+    "snapshot": "write a picture of a model, a level or a camera",
+    "record": "record a running simulation to an MCAP file",
+    "info": "show what is in a recording",
+    "convert": "turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
+    "plot": "draw curves of a recording",
+    "run-policy": "let a network from an ONNX file drive a robot",
+    "evaluate": "measure how good a policy is, with confidence intervals",
+    "teleop": "move a robot's hand with the keyboard, and record episodes",
+    "view": "show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
+}
 
 _FAILED = 2
 _INTERRUPTED = 128 + signal.SIGINT
@@ -75,10 +76,9 @@ def _run(argv: Sequence[str]) -> int:
     if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
         reconfigure(errors="backslashreplace")  # not every terminal can encode every file name
     if not argv:
-        print(_parser().format_help(), end="")
+        print(_parser("").format_help(), end="")
         return 0
-    # Every `sim://` server is an `urlab serve`, which starts sooner without the modules of the other commands.
-    parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
+    parser = _parser(next((word for word in argv if not word.startswith("-")), ""))
     arguments = parser.parse_args(argv)
     run: Callable[[object], int] = arguments.run
     name = f"{parser.prog} {arguments.command}"
@@ -117,8 +117,8 @@ def _is_broken_pipe(error: Exception) -> bool:
     return isinstance(error, BrokenPipeError)
 
 
-def _parser(*commands: str) -> Parser:
-    """Return the parser of the given commands, by default of all."""
+def _parser(command: str | None = None) -> Parser:
+    """Return the parser, with the options of the given command, by default of all."""
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
@@ -132,8 +132,14 @@ def _parser(*commands: str) -> Parser:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for name in commands or _COMMANDS:
-        import_module(f"{__name__}.{name.replace('-', '_')}").add_parser(subparsers)
+    for name, brief in COMMANDS.items():
+        if command not in (None, name):
+            subparsers.add_parser(name, help=brief)
+            continue
+        module = import_module(f"{__name__}.{name.replace('-', '_')}")
+        own = subparsers.add_parser(name, help=brief, description=module.DESCRIPTION, examples=module.EXAMPLES)
+        module.add_arguments(own)
+        own.set_defaults(run=module.run)
     return parser
 
 

@@ -1,29 +1,29 @@
-"""Argument types and the parser that the commands share."""
+"""The parser and the options that commands share."""
 
 from __future__ import annotations
 
 import argparse
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Protocol, TypeVar, cast
+from typing import Any, Literal, NoReturn, TypeAlias, TypeVar, cast
 
-from urlab_client.cli._common import CommandError
+from urlab_client.cli._common import CommandError, joined
 from urlab_client.enums import StepMode
 from urlab_client.values.names import did_you_mean
-
-ADDRESSES = (
-    "HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command"
-)
 
 Example = tuple[str, str]
 """A command line, and what it does."""
 
+Options: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+"""What an option can be added to: a parser or one of its groups."""
+
 C = TypeVar("C")
 E = TypeVar("E", bound=StrEnum)
 
-_STEP_PORT = 5559
 _LARGEST_IMAGE = 16384
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 class Parser(argparse.ArgumentParser):
@@ -68,7 +68,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """See `argparse.ArgumentParser.error`."""
-        self.exit(2, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: {joined(message)} (see {self.prog} --help)\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -76,37 +76,10 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, _not_one_of(str(value), known))
 
 
-class Commands(Protocol):
-    """What a command adds its parser to."""
-
-    def add_parser(
-        self,
-        name: str,
-        *,
-        help: str,  # noqa: A002 - argparse's word
-        description: str,
-        examples: Sequence[Example],
-    ) -> Parser: ...
-
-
-class ServerArguments(argparse.Namespace):
-    """How to reach a server, besides its address; see `add_ports`, `add_keys`, `add_mjcf_options`, `add_handshake`."""
-
-    handshake: Path | None
-    mjcf_options: bool
-    step_port: int
-    state_port: int | None
-    server_key: str | None
-    client_key: str | None
-
-
-def make_client(flavour: Callable[..., C], address: str, arguments: ServerArguments, **options: Any) -> C:
+def make_client(flavour: Callable[..., C], address: str, arguments: Namespace, **options: Any) -> C:
     """Return a client of one of the two classes for the server that the arguments name.
 
     A MuJoCo version that differs from the server's is not an error: the client warns and compiles the model locally.
-
-    Raises:
-        CommandError: The address or an option is malformed.
     """
     if arguments.mjcf_options:
         if not address.startswith("sim://"):
@@ -132,7 +105,7 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
         raise CommandError(str(error)) from None
 
 
-def add_address(parser: argparse.ArgumentParser, default: str | None = "tcp://localhost", otherwise: str = "") -> None:
+def add_address(parser: Parser, default: str | None = "tcp://localhost", otherwise: str = "") -> None:
     """Add the server's address, and `--mjcf-options` for a server that the command starts.
 
     Args:
@@ -146,12 +119,69 @@ def add_address(parser: argparse.ArgumentParser, default: str | None = "tcp://lo
         type=address,
         default=default,
         metavar="ADDRESS",
-        help=f"{ADDRESSES} (default: {otherwise or '%(default)s'})",
+        help="HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this "
+        f"command (default: {otherwise or '%(default)s'})",
     )
     add_mjcf_options(parser, "with sim://MODEL")
 
 
-def add_dialect(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:  # pyright: ignore[reportPrivateUsage]
+def add_mjcf_options(parser: Parser, when: str) -> None:
+    """Add `--mjcf-options`, which applies when a model is loaded."""
+    parser.add_argument(
+        "--mjcf-options",
+        action="store_true",
+        help=f"{when}: use the <option> of each model (timestep, integrator, ...) instead of the plugin's defaults",
+    )
+
+
+def add_client(parser: Parser, *, state: bool = True, handshake: bool = False) -> None:
+    """Add how to reach a server besides its address: ports and CURVE keys.
+
+    Args:
+        parser: The command's parser.
+        state: Whether the command uses the state stream.
+        handshake: Whether the command can watch alongside the driving client.
+    """
+    group = parser.add_argument_group("connection")
+    parser.set_defaults(handshake=None, state_port=None)
+    group.add_argument(
+        "--step-port",
+        type=port,
+        default=5559,
+        metavar="PORT",
+        help="RPC port of the server, if the address has none (default: %(default)s)",
+    )
+    if state:
+        group.add_argument(
+            "--state-port",
+            type=port,
+            metavar="PORT",
+            help="port of the server's state stream (default: the one that the server announces, otherwise 5555)",
+        )
+    group.add_argument(
+        "--server-key", metavar="FILE", help="public key of a server that uses keys (default: $URLAB_SERVER_KEY)"
+    )
+    group.add_argument(
+        "--client-key",
+        metavar="FILE",
+        help="this client's secret key, if the server requires one (default: $URLAB_CLIENT_KEY)",
+    )
+    if handshake:
+        group.add_argument(
+            "--handshake",
+            type=Path,
+            metavar="FILE",
+            help="watch alongside the driving client, without taking over its session: FILE holds what its "
+            "client.handshake() returns, or GET /api/handshake of its console",
+        )
+
+
+def handshake(arguments: Namespace) -> bytes | None:
+    """Return what a command's client passes to `discover()`."""
+    return None if arguments.handshake is None else arguments.handshake.read_bytes()
+
+
+def add_dialect(parser: Options) -> None:
     """Add `--dialect` to a command that starts a simulated server."""
     parser.add_argument(
         "--dialect",
@@ -162,47 +192,7 @@ def add_dialect(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> No
     )
 
 
-def add_mjcf_options(parser: argparse.ArgumentParser, when: str) -> None:
-    """Add `--mjcf-options` to a command that can load models.
-
-    Args:
-        parser: The command's parser.
-        when: When the option applies.
-    """
-    parser.add_argument(
-        "--mjcf-options",
-        action="store_true",
-        help=f"{when}: use the <option> of each model (timestep, integrator, ...) instead of the plugin's defaults",
-    )
-
-
-def add_ports(parser: argparse.ArgumentParser, *, state: bool = True) -> None:
-    """Add the ports of a server.
-
-    Args:
-        parser: The command's parser.
-        state: Whether the command uses the state stream.
-    """
-    parser.set_defaults(handshake=None)  # only some commands have the option
-    parser.add_argument(
-        "--step-port",
-        type=port,
-        default=_STEP_PORT,
-        metavar="PORT",
-        help="RPC port of the server, if the address has none (default: %(default)s)",
-    )
-    if state:
-        parser.add_argument(
-            "--state-port",
-            type=port,
-            metavar="PORT",
-            help="port of the server's state stream (default: the one that the server announces, otherwise 5555)",
-        )
-    else:
-        parser.set_defaults(state_port=None)
-
-
-def add_step_mode(parser: argparse.ArgumentParser) -> None:
+def add_step_mode(parser: Parser) -> None:
     """Add the choice between watching physics run and stepping it."""
     parser.add_argument(
         "--step-mode",
@@ -213,12 +203,13 @@ def add_step_mode(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_cameras(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add `--camera`, which may be repeated; `cameras` interprets its values.
+def add_cameras(parser: Parser, what: str, hz: float | None = 30.0) -> None:
+    """Add `--camera`, which may be repeated and whose values `cameras` interprets, and `--camera-hz`.
 
     Args:
         parser: The command's parser.
         what: What the camera is used for.
+        hz: Default rate, or None for a command without the option.
     """
     parser.add_argument(
         "--camera",
@@ -227,6 +218,10 @@ def add_cameras(parser: argparse.ArgumentParser, what: str) -> None:
         metavar="NAME",
         help=f"{what}, as ARTICULATION/CAMERA, or 'all'; may be repeated",
     )
+    if hz is not None:
+        parser.add_argument(
+            "--camera-hz", type=hertz, default=hz, metavar="HZ", help="pictures per second (default: %(default)s)"
+        )
 
 
 def cameras(given: list[str]) -> list[str] | Literal["all"]:
@@ -234,36 +229,64 @@ def cameras(given: list[str]) -> list[str] | Literal["all"]:
     return "all" if "all" in given else given
 
 
-def add_keys(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a client that talks to a server with CURVE keys."""
-    parser.add_argument(
-        "--server-key", metavar="FILE", help="public key of a server that uses keys (default: $URLAB_SERVER_KEY)"
-    )
-    parser.add_argument(
-        "--client-key",
-        metavar="FILE",
-        help="this client's secret key, if the server requires one (default: $URLAB_CLIENT_KEY)",
-    )
+def add_recording(parser: Parser) -> None:
+    """Add the recording that a command reads."""
+    parser.add_argument("recording", type=Path, metavar="FILE", help="a .mcap file, or a server's .json recording")
 
 
-def add_handshake(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:  # pyright: ignore[reportPrivateUsage]
-    """Add `--handshake` to a command that can watch alongside the driving client; see `handshake`."""
+def add_policy(parser: Parser, robot: str) -> None:
+    """Add the policy that a command runs, its declaration and `--robot`."""
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
     parser.add_argument(
-        "--handshake",
+        "--declaration",
         type=Path,
         metavar="FILE",
-        help="watch alongside the driving client, without taking over its session: FILE holds what its "
-        "client.handshake() returns, or GET /api/handshake of its console",
+        help="the .toml file (default: the one beside POLICY with the same name)",
     )
+    parser.add_argument("--robot", metavar="ROBOT", help=robot)
 
 
-def handshake(arguments: ServerArguments) -> bytes | None:
-    """Return what a command's client passes to `discover()`.
+def add_page(parser: Parser, default_port: int) -> None:
+    """Add the options of a page that the command serves."""
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=Path("recordings"),
+        metavar="FOLDER",
+        help="folder for recordings, created with the first one (default: %(default)s)",
+    )
+    network = parser.add_argument_group("network")
+    network.add_argument("--port", type=port, help=f"port to serve at; 0: any free one (default: {default_port})")
+    network.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="interface to bind (default: %(default)s); others need --allow-host. Nothing is encrypted: use a TLS "
+        "proxy or an SSH tunnel",
+    )
+    network.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="host name by which browsers and programs reach the page, besides localhost; repeatable",
+    )
+    network.add_argument("--open", action="store_true", help="open the page in the browser")
 
-    Raises:
-        OSError: The file cannot be read.
-    """
-    return None if arguments.handshake is None else arguments.handshake.read_bytes()
+
+def check_page(arguments: Namespace) -> None:
+    """Refuse an interface that no host name reaches."""
+    if arguments.host not in _LOOPBACK and not arguments.allow_host:
+        raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name by which browsers reach it")
+
+
+def host_names(arguments: Namespace) -> list[str]:
+    """Return the host names by which the page is reached."""
+    return [*_LOOPBACK, *(name.lower() for name in arguments.allow_host)]
+
+
+def page_url(arguments: Namespace, number: int) -> str:
+    """Return the URL of the page that is served at a port."""
+    return f"http://{arguments.allow_host[0] if arguments.allow_host else '127.0.0.1'}:{number}"
 
 
 def address(text: str) -> str:

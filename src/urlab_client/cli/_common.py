@@ -1,4 +1,4 @@
-"""What the commands share: failures, endings, files and output."""
+"""What the commands share: failures, signals, files and output."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Container, Generator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 class CommandError(Exception):
     """An expected failure; its text is one line that says what failed, where, and what would be right."""
+
+
+def joined(text: str) -> str:
+    """Return a text on one line. Spaces within its lines stay, because they may be part of a file's name."""
+    return " ".join(line for part in text.splitlines() if (line := part.strip()))
 
 
 def one_line(error: BaseException) -> str:
@@ -26,7 +32,7 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         # Leave out the error number, which does not help users.
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(text.split()) or type(error).__name__
+    return joined(text) or type(error).__name__
 
 
 def in_background() -> bool:
@@ -50,15 +56,34 @@ def sigterm_interrupts() -> Generator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def check_ending(path: Path, *endings: str) -> None:
-    """Check the ending of an output file.
+@contextlib.contextmanager
+def refusing(*kinds: type[Exception], option: str = "") -> Generator[None]:
+    """Report errors of some kinds, which the block raises for what the user gave, in one line.
 
-    Raises:
-        CommandError: The name has another ending.
+    Args:
+        kinds: The kinds.
+        option: The option that is to blame.
     """
+    try:
+        yield
+    except kinds as error:
+        text = error.args[0] if isinstance(error, KeyError) else error
+        raise CommandError(f"{option}: {text}" if option else str(text)) from error
+
+
+def check_ending(path: Path, *endings: str) -> None:
+    """Refuse an output file whose name has another ending."""
     if path.suffix.lower() not in endings:
         better = path.with_suffix(endings[0]).name if path.name else f"FILE{endings[0]}"
         raise CommandError(f"{path}: write a file that ends in {' or '.join(endings)}, for example {better}")
+
+
+def check_recording(path: Path, *, overwrite: bool) -> None:
+    """Refuse a recording that cannot be written, before the simulation starts."""
+    check_ending(path, ".mcap")
+    if path.exists() and not overwrite:
+        raise CommandError(f"{path} exists; --overwrite replaces it")
+    import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # a missing extra
 
 
 _COLUMNS = 120  # where the output is not a terminal
@@ -79,6 +104,19 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
         yield lambda done: progress.update(task, completed=done)
 
 
+def table(left: Sequence[str], right: Sequence[str], title: str | None = None) -> Table:
+    """Return a table with the given headings, of columns aligned to the left and then to the right."""
+    from rich import box
+    from rich.table import Table
+
+    made = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    for heading in left:
+        made.add_column(heading, overflow="fold")
+    for heading in right:
+        made.add_column(heading, justify="right", no_wrap=True)
+    return made
+
+
 def output() -> Console:
     """Return a console that writes tables to standard output, with brackets and colons in names as they are."""
     from rich.console import Console
@@ -87,6 +125,18 @@ def output() -> Console:
     if not console.is_terminal:
         console.width = _COLUMNS
     return console
+
+
+def aligned(rows: Sequence[Sequence[str]], right: Container[int] = ()) -> str:
+    """Return lines of text with aligned columns, some of them to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if place in right else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
 
 
 def json_line(value: object) -> str:

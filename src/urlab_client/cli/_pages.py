@@ -1,20 +1,30 @@
-"""Serving pages: a socket that listens before its link is printed, and uvicorn until a signal."""
+"""Serving pages: a socket that listens before its link is printed, and uvicorn until a signal.
+
+uvicorn bounds neither the number of connections nor how long a peer may stay silent, and logs requests that its end
+interrupts as failures; the two classes below mend that.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import signal
 import socket
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import uvicorn
-from starlette.types import ASGIApp
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from urlab_client.aio.background import background_task
 from urlab_client.cli._common import in_background, sigterm_interrupts
-from urlab_client.cli._connections import bounded_connections
-from urlab_client.cli._requests import RunningRequests
+from urlab_client.web.route_group import JOB
+
+log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _FINISHING_S = 0.2  # for requests to finish before they are cancelled
 _GRACE_S = 10.0  # for cancelled requests to clean up
@@ -128,3 +138,146 @@ async def serve(
     finally:
         if ending is not None:
             ending.cancel()
+
+
+def bounded_connections(head_s: float, body_s: float, most: int) -> type[H11Protocol]:
+    """Return the protocol of the connections of one server, which ends those whose peer stays silent.
+
+    Args:
+        head_s: Time for the whole head of a request, seconds.
+        body_s: Time between two parts of a request's body, seconds.
+        most: Number of connections. One more ends the oldest of those that have not sent a head yet.
+    """
+    without_head: dict[Connection, None] = {}
+
+    class Connection(H11Protocol):
+        """A connection with a clock that runs while the peer owes the rest of a head or of a body."""
+
+        _clock: asyncio.TimerHandle | None = None
+
+        def connection_made(  # pyright: ignore[reportIncompatibleMethodOverride]  # as in uvicorn
+            self, transport: asyncio.Transport
+        ) -> None:
+            super().connection_made(transport)
+            self._watch()
+            if len(self.connections) > most:
+                next(iter(without_head), self).end()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._watch()
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            self._stop()  # until the peer sends something, uvicorn's own clock for idle connections runs
+            if not self._awaits_head:  # the next request had come already
+                self._watch()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._stop()
+            super().connection_lost(exc)
+
+        @property
+        def _awaits_head(self) -> bool:
+            cycle: Any = self.cycle  # None before the first request
+            return cycle is None or cycle.response_complete
+
+        def _watch(self) -> None:
+            ours = self in self.connections and not self.transport.is_closing()  # else it is a WebSocket, or ends
+            if ours and self._awaits_head and self in without_head:
+                return  # a head has the same time, however many bytes come
+            self._stop()
+            if ours and self._awaits_head:
+                without_head[self] = None
+                self._clock = self.loop.call_later(head_s, self.end)
+            elif ours and self.cycle.more_body:
+                self._clock = self.loop.call_later(body_s, self._end_unless_paused)
+
+        def _stop(self) -> None:
+            without_head.pop(self, None)
+            if self._clock is not None:
+                self._clock.cancel()
+                self._clock = None
+
+        def _end_unless_paused(self) -> None:
+            if self.flow.read_paused:  # the application is slow, not the peer
+                self._watch()
+            else:
+                self.end()
+
+        def end(self) -> None:
+            """Close the connection."""
+            self._stop()
+            self.transport.close()
+
+    return Connection
+
+
+@dataclass(eq=False)
+class _Request:
+    task: asyncio.Task[Any]
+    scope: Scope
+    begun: bool = False
+    """Whether its response has begun."""
+    answered: bool = False
+    """Whether its response has been sent completely."""
+
+
+class RunningRequests:
+    """ASGI middleware that cancels the requests which still run when the server ends, without a traceback."""
+
+    def __init__(self, application: ASGIApp) -> None:
+        self._application = application
+        self._running: set[_Request] = set()
+        self._connections: Iterable[Any] | None = None
+
+    def cancel(self, connections: Iterable[Any]) -> None:
+        """Cancel the running requests, log a warning for each, and abort the connections of unfinished responses."""
+        self._connections = list(connections)
+        for request in self._running:
+            request.task.cancel()
+            job = request.scope.get(JOB)
+            if job is None and request.scope["type"] == "http" and request.scope["method"] != "GET":
+                job = f"{request.scope['method']} {request.scope['path']}"
+            if job is not None and not request.answered:
+                log.warning("%s was broken off", job)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request or serve a WebSocket."""
+        task = asyncio.current_task()
+        if scope["type"] == "lifespan" or task is None:
+            await self._application(scope, receive, send)
+            return
+        request = _Request(task, scope)
+
+        async def sending(message: Message) -> None:
+            request.begun = True
+            await send(message)
+            request.answered = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        self._running.add(request)
+        try:
+            await self._application(scope, receive, sending)
+        except asyncio.CancelledError:
+            if self._connections is None:
+                raise
+            # Nothing else is left to do in this task, and uvicorn would log an escaping error as a failure.
+            task.uncancel()
+            await self._end(request, receive, send)
+        finally:
+            self._running.discard(request)
+
+    async def _end(self, request: _Request, receive: Receive, send: Send) -> None:
+        http = request.scope["type"] == "http"
+        if request.answered:
+            return
+        if http and not request.begun:
+            error = {"code": "ended", "message": "The console ended before the request was complete.", "hint": ""}
+            await JSONResponse({"error": error}, 503)(request.scope, receive, send)
+            return
+        for connection in self._connections or ():
+            if connection.client == request.scope["client"]:
+                connection.transport.abort()
+        # uvicorn logs a response that has begun as incomplete, unless its connection has closed by then.
+        while http and (await receive())["type"] != "http.disconnect":
+            pass

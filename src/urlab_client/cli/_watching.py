@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from urlab_client.cli._common import CommandError, in_background
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
-from urlab_client.protocol.messages.streams import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
+from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient

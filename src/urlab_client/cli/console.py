@@ -4,50 +4,47 @@ from __future__ import annotations
 
 import asyncio
 import webbrowser
+from argparse import Namespace
 
 from urlab_client._installation import install_command
+from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
-    Commands,
+    Parser,
     add_address,
-    add_keys,
-    add_ports,
+    add_client,
+    add_page,
+    check_page,
+    host_names,
     make_client,
+    page_url,
 )
 from urlab_client.cli._common import CommandError, import_mujoco
-from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 
-PAGE_PORT = 8355
+_PORT = 8355
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "console",
-        help="show a simulation in the browser, and interact with it",
-        description="Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
-        "print a link that admits one browser. The page can create more links. Exits with code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM.",
-        examples=(
-            ("urlab console", "the server on this machine, at a link for your browser"),
-            ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
-            ("urlab console --port 0", "any free port for the page"),
-            ("urlab console --handshake robot.hello", "watch alongside the driving client"),
-        ),
-    )
+DESCRIPTION = (
+    "Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
+    "print a link that admits one browser. The page can create more links. Exits with code 0 on SIGINT "
+    "(Ctrl-C) and SIGTERM."
+)
+EXAMPLES = (
+    ("urlab console", "the server on this machine, at a link for your browser"),
+    ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
+    ("urlab console --port 0", "any free port for the page"),
+    ("urlab console --handshake robot.hello", "watch alongside the driving client"),
+)
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser)
-    add_ports(parser)
-    add_keys(parser)
-    add_page(parser, PAGE_PORT)
-    parser.set_defaults(run=run)
+    add_client(parser, handshake=True)
+    add_page(parser, _PORT)
 
 
-def run(arguments: PageArguments) -> int:
-    """Serve the page until stopped.
-
-    Raises:
-        CommandError: An option cannot be honoured, or the `web` extra is not installed.
-        OSError: The port is in use.
-    """
+def run(arguments: Namespace) -> int:
+    """Serve the page until stopped."""
     try:
         import prometheus_client  # noqa: F401  # pyright: ignore[reportUnusedImport]
         import uvicorn  # noqa: F401  # pyright: ignore[reportUnusedImport]
@@ -64,10 +61,9 @@ def run(arguments: PageArguments) -> int:
     return 0
 
 
-async def _serve(arguments: PageArguments) -> None:
+async def _serve(arguments: Namespace) -> None:
     from prometheus_client import REGISTRY
 
-    from urlab_client.aio import URLabClient
     from urlab_client.cli._pages import bound, serve
     from urlab_client.integrations.telemetry import PrometheusObserver
     from urlab_client.web import Access, app
@@ -76,7 +72,7 @@ async def _serve(arguments: PageArguments) -> None:
     # Each camera is streamed while a browser shows it.
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
-        with bound(arguments.host, arguments.port) as listener:
+        with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
             link = f"{page_url(arguments, listener.getsockname()[1])}/?token={access.invite()}"
 
             def started() -> None:

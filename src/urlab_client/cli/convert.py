@@ -2,58 +2,36 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands, count, seconds
-from urlab_client.cli._common import CommandError, progress_bar, sigterm_interrupts
+from urlab_client.cli._arguments import Parser, add_recording, count, seconds
+from urlab_client.cli._common import CommandError, progress_bar, refusing, sigterm_interrupts
 
 if TYPE_CHECKING:
-    from urlab_client.integrations.record import Episodes, Run
+    from urlab_client.integrations.record import Run
 
 _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
 
 
-class ConvertArguments(argparse.Namespace):
-    """The parsed command line."""
-
-    recording: Path
-    output: Path
-    format: str | None
-    camera: list[str]
-    fps: int | None
-    task: str
-    robot_type: str | None
-    images: bool
-    max_picture_age: float | None
-    python: str | None
-    episodes: Episodes
-    overwrite: bool
+DESCRIPTION = (
+    "Convert a recording. CSV, Parquet and LeRobot files hold states with the actions taken at them, "
+    "NumPy files all states, and MP4 files the pictures of one camera. Needs the extra 'urlab-client[mcap]', for "
+    "Parquet also 'dataset', and for MP4 also 'video'."
+)
+EXAMPLES = (
+    ("urlab convert run.mcap run.csv", "states as a table"),
+    ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
+    ("urlab convert run.mcap run.npz --camera arm/wrist", "states and pictures as NumPy arrays"),
+)
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "convert",
-        help="turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
-        description="Convert a recording. CSV, Parquet and LeRobot files hold states with the actions taken at them, "
-        "NumPy files all states, and MP4 files the pictures of one camera. Needs the extra 'urlab-client[mcap]', for "
-        "Parquet also 'dataset', and for MP4 also 'video'.",
-        examples=(
-            ("urlab convert run.mcap run.csv", "states as a table"),
-            ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
-            ("urlab convert run.mcap run.npz --camera arm/wrist", "states and pictures as NumPy arrays"),
-        ),
-    )
-    parser.add_argument(
-        "recording",
-        type=Path,
-        metavar="FILE",
-        help="a .mcap file, or a server's .json recording",
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
+    add_recording(parser)
     parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending selects the format")
     parser.add_argument("--format", choices=_FORMATS, help="the format, if the ending does not select it")
     parser.add_argument(
@@ -88,32 +66,24 @@ def add_parser(commands: Commands) -> None:
         "--python", metavar="PATH", help="a Python interpreter that has LeRobot; this one does not need it"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUTPUT if it exists")
-    parser.set_defaults(run=run)
 
 
-def run(arguments: ConvertArguments) -> int:
-    """Convert.
-
-    Raises:
-        CommandError: The recording, the output or an option cannot be used.
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Convert."""
     kind = arguments.format or arguments.output.suffix[1:].lower()
     if kind not in _FORMATS:
         raise CommandError(f"{arguments.output}: name the format with --format {'|'.join(_FORMATS)}, or by the ending")
     if arguments.output.exists() and (kind == "lerobot" or not arguments.overwrite):
         advice = "name a folder that does not" if kind == "lerobot" else "--overwrite replaces it"
         raise CommandError(f"{arguments.output} exists; {advice}")
-    try:
-        from urlab_client.integrations.record import read_run
+    from urlab_client.integrations.record import read_run
 
+    with refusing(KeyError):
         recording = read_run(arguments.recording)
         write, what = _writer(kind, recording, arguments)
         shown = progress_bar(f"{arguments.recording.name} → {kind}", recording.path.stat().st_size)
         with sigterm_interrupts(), shown as progress:
             written = write(arguments.output, progress=progress)
-    except KeyError as error:
-        raise CommandError(str(error.args[0])) from None
     print(f"{arguments.output}  {written} {what}")
     if recording.damage:
         print(
@@ -122,7 +92,7 @@ def run(arguments: ConvertArguments) -> int:
     return 0
 
 
-def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Callable[..., int], str]:
+def _writer(kind: str, recording: Run, arguments: Namespace) -> tuple[Callable[..., int], str]:
     from urlab_client.integrations.record import export
 
     cameras = arguments.camera

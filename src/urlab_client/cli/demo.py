@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import hashlib
@@ -10,6 +9,7 @@ import logging
 import math
 import platform
 import time
+from argparse import Namespace
 from collections.abc import Generator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import Commands, add_dialect, count
-from urlab_client.cli._common import CommandError, import_mujoco, one_line, output
+from urlab_client.cli._arguments import Parser, add_dialect, count
+from urlab_client.cli._common import CommandError, import_mujoco, one_line, output, table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,29 +42,19 @@ _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 
 
-class DemoArguments(argparse.Namespace):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Start a simulated server, drive one robot through the blocking client and two robots through the "
+    "async client, and write joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'."
+)
+EXAMPLES = (
+    ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
+    ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
+    ("urlab demo arm --no-render", "without a picture of the last state"),
+)
 
-    model: str
-    dialect: DialectName
-    output: Path
-    steps: int
-    no_render: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "demo",
-        help="drive a robot end to end; keep a plot, a picture and the configuration",
-        description="Start a simulated server, drive one robot through the blocking client and two robots through the "
-        "async client, and write joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'.",
-        examples=(
-            ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
-            ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
-            ("urlab demo arm --no-render", "without a picture of the last state"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     parser.add_argument(
         "model",
         nargs="?",
@@ -84,16 +74,10 @@ def add_parser(commands: Commands) -> None:
         help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
     )
     parser.add_argument("--no-render", action="store_true", help="do not draw the picture of the last state")
-    parser.set_defaults(run=run)
 
 
-def run(arguments: DemoArguments) -> int:
-    """Run the demonstration.
-
-    Raises:
-        CommandError: The model or the output folder cannot be used.
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Run the demonstration."""
     need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -147,9 +131,6 @@ async def _drive_two(options: dict[str, Any], progress: Progress, steps: int) ->
             await client.step()
             run.note()
         return run.outcome("async")
-
-
-# The robot and its server.
 
 
 def _model(given: str) -> tuple[str, str]:
@@ -213,9 +194,6 @@ def _draw(server: SimulatedServer, moment: float, folder: Path) -> str:
     with replaced(file) as temporary:
         Image.fromarray(picture).convert("RGB").save(temporary, format="png")
     return f"last state of the blocking run, after {moment:.3f} s"
-
-
-# Driving.
 
 
 class Trot:
@@ -327,13 +305,14 @@ class _Run:
         self._robots: list[Robot] = [one for one in client.articulations_by_id.values() if one.joints]  # no floor
         turns = _TURNS if len(self._robots) > 1 else (0.0,)
         self._controllers = [_controller(robot, turn) for robot, turn in zip(self._robots, turns, strict=True)]
-        self._lines: list[tuple[str, str, int]] = []  # axis label, name and index of each position
+        self._lines: dict[str, list[tuple[str, int]]] = {}  # by axis label: name and index of each position
         for joint in self._robots[0].joints.values():
             place = joint.qpos_local_offset
             if joint.jnt_type == _FREE:
-                self._lines += [("base position (m)", axis, place + index) for index, axis in enumerate("xyz")]
+                base = self._lines.setdefault("base position (m)", [])
+                base += [(axis, place + index) for index, axis in enumerate("xyz")]
             elif joint.jnt_type in _LABELS:
-                self._lines.append((_LABELS[joint.jnt_type], joint.name, place))
+                self._lines.setdefault(_LABELS[joint.jnt_type], []).append((joint.name, place))
         self._times: list[float] = []
         self._positions: list[Floats] = []
         self._began = time.perf_counter()
@@ -346,7 +325,7 @@ class _Run:
     def note(self) -> None:
         """Note the positions after a step."""
         self._times.append(self._client.sim_time)
-        self._positions.append(self._robots[0].qpos_array[[place for _, _, place in self._lines]])
+        self._positions.append(self._robots[0].qpos_array.copy())
         self._progress.advance(self._task)
 
     def outcome(self, flavour: str) -> Outcome:
@@ -361,29 +340,22 @@ class _Run:
 
     def plot(self, title: str, file: Path) -> None:
         """Draw the positions over simulation time."""
-        from urlab_client.cli.figures import Quantity, Trace, plot_trace
+        from urlab_client.cli.plot import Curves, plot_curves
 
-        quantities: list[Quantity] = []
-        for label in dict.fromkeys(label for label, _, _ in self._lines):
-            lines = [(index, name) for index, (own, name, _) in enumerate(self._lines) if own == label]
-            quantities.append(Quantity(label, [name for _, name in lines], [index for index, _ in lines]))
-        plot_trace(Trace(title, np.array(self._times), np.array(self._positions), quantities), file)
-
-
-# Results.
+        positions = np.array(self._positions)
+        curves = [
+            Curves(label, [name for name, _ in lines], positions[:, [place for _, place in lines]])
+            for label, lines in self._lines.items()
+        ]
+        plot_curves(title, np.array(self._times), curves, file)
 
 
 def _print_table(console: Console, name: str, outcomes: Sequence[Outcome]) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=f"{name}, direct mode", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    table.add_column("client")
-    for heading in ("robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"):
-        table.add_column(heading, justify="right")
-    table.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
+    columns = "robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"
+    runs = table(["client"], columns, f"{name}, direct mode")
+    runs.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
     for outcome in outcomes:
-        table.add_row(
+        runs.add_row(
             outcome.client,
             str(outcome.robots),
             str(outcome.steps),
@@ -396,7 +368,7 @@ def _print_table(console: Console, name: str, outcomes: Sequence[Outcome]) -> No
                 for values in (pose[:3], pose[3:])
             ),
         )
-    console.print(table)
+    console.print(runs)
 
 
 def _physics(client: URLabClient) -> dict[str, Any]:

@@ -5,21 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from argparse import Namespace
 
 from urlab_client._installation import conflict
+from urlab_client.aio import URLabClient
 from urlab_client.aio.client_types import Diagnosis
-from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
-    add_address,
-    add_handshake,
-    add_keys,
-    add_ports,
-    handshake,
-    make_client,
-    one_of,
-    seconds,
-)
+from urlab_client.cli._arguments import Parser, add_address, add_client, handshake, make_client, one_of, seconds
 from urlab_client.cli._common import import_mujoco, json_line
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
@@ -29,31 +20,21 @@ _UNHEALTHY = 1
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 
-class DoctorArguments(ServerArguments):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Check a server from its sockets to the set-points, and show what keeps robots from moving. This "
+    "opens a session, which takes the server over from the client that drives it, unless you pass --handshake; in "
+    "your own program, client.explain() does the same. Exit code 0 if nothing is wrong, 1 if something is."
+)
+EXAMPLES = (
+    ("urlab doctor", "the server on this machine"),
+    ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
+    ("urlab doctor --step-mode direct --json", "for a program that steps; print JSON"),
+)
 
-    address: str
-    step_mode: StepMode
-    timeout: float
-    json: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "doctor",
-        help="find out why a robot does not move",
-        description="Check a server from its sockets to the set-points, and show what keeps robots from moving. This "
-        "opens a session, which takes the server over from the client that drives it, unless you pass --handshake; in "
-        "your own program, client.explain() does the same. Exit code 0 if nothing is wrong, 1 if something is.",
-        examples=(
-            ("urlab doctor", "the server on this machine"),
-            ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
-            ("urlab doctor --step-mode direct --json", "for a program that steps; print JSON"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser)
-    add_ports(parser)
     parser.add_argument(
         "--step-mode",
         type=one_of(*StepMode),
@@ -63,12 +44,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    add_keys(parser)
-    add_handshake(parser)
-    parser.set_defaults(run=run)
+    add_client(parser, handshake=True)
 
 
-def run(arguments: DoctorArguments) -> int:
+def run(arguments: Namespace) -> int:
     """Print the diagnosis and return 0 when nothing keeps robots from moving, else 1."""
     if found := conflict():
         logger.warning("%s", found)
@@ -78,8 +57,7 @@ def run(arguments: DoctorArguments) -> int:
     return 0 if diagnosis.healthy else _UNHEALTHY
 
 
-async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
-    from urlab_client.aio import URLabClient
+async def _diagnose(arguments: Namespace) -> Diagnosis:
 
     client = make_client(
         URLabClient,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import Namespace
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands
-from urlab_client.cli._common import counted, json_line, output, progress_bar
+from urlab_client.cli._arguments import Parser, add_recording
+from urlab_client.cli._common import counted, json_line, output, progress_bar, table
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary
@@ -16,46 +15,28 @@ if TYPE_CHECKING:
 _UNFINISHED = 1
 
 
-class InfoArguments(argparse.Namespace):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 if the file is unfinished "
+    "or damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'."
+)
+EXAMPLES = (
+    ("urlab info run.mcap", "duration, topics, rates and gaps"),
+    ("urlab info run.mcap --json", "the same for programs"),
+    ("urlab info run.mcap --verify", "also look for damage"),
+)
 
-    recording: Path
-    json: bool
-    verify: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "info",
-        help="show what is in a recording",
-        description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 if the file is unfinished "
-        "or damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'.",
-        examples=(
-            ("urlab info run.mcap", "duration, topics, rates and gaps"),
-            ("urlab info run.mcap --json", "the same for programs"),
-            ("urlab info run.mcap --verify", "also look for damage"),
-        ),
-    )
-    parser.add_argument(
-        "recording",
-        type=Path,
-        metavar="FILE",
-        help="a .mcap file, or a server's .json recording",
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
+    add_recording(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
         "--verify", action="store_true", help="read the whole file and compare checksums, not only its index"
     )
-    parser.set_defaults(run=run)
 
 
-def run(arguments: InfoArguments) -> int:
-    """Print the summary; return 0 for a complete recording, else 1.
-
-    Raises:
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Print the summary; return 0 for a complete recording, else 1."""
     from urlab_client.integrations.record import read_run
 
     recording = read_run(arguments.recording)
@@ -69,9 +50,6 @@ def run(arguments: InfoArguments) -> int:
 
 
 def _print(summary: Summary) -> None:
-    from rich import box
-    from rich.table import Table
-
     about = summary.about
     print(f"{summary.path}  {summary.path.stat().st_size / 2**20:.1f} MiB")
     print(
@@ -91,13 +69,9 @@ def _print(summary: Summary) -> None:
         unmarked = summary.episodes - len(summary.outcomes)
         print("outcomes: " + ", ".join(f"{n} {what}" for what, n in (*counts.items(), ("unmarked", unmarked)) if n))
     _print_varied(summary)
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("topic", overflow="fold")
-    table.add_column("schema", overflow="fold")
-    for heading in ("messages", "rate (Hz)", "gaps", "longest (s)"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    topics = table(("topic", "schema"), ("messages", "rate (Hz)", "gaps", "longest (s)"))
     for topic in summary.topics.values():
-        table.add_row(
+        topics.add_row(
             topic.name,
             topic.schema,
             str(topic.messages),
@@ -105,7 +79,7 @@ def _print(summary: Summary) -> None:
             str(topic.gaps),
             f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else "",
         )
-    output().print(table)
+    output().print(topics)
 
 
 def _print_varied(summary: Summary) -> None:

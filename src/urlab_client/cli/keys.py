@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import Namespace
 from pathlib import Path
 
-from urlab_client.cli._arguments import Commands
+from urlab_client.cli._arguments import Parser
 from urlab_client.keys import SECRET_SUFFIX, KeyPair, public_key
 
+DESCRIPTION = (
+    "Make and show CURVE keys. A server that is open to a network needs a key pair, by which clients "
+    "recognise it, and the public key of each client that it admits."
+)
+EXAMPLES = (
+    ("urlab keys new server ada", "make keys for a server and for a client called ada"),
+    ("urlab keys show server.key", "print a public key"),
+)
 
-class KeysArguments(argparse.Namespace):
-    """The parsed command line."""
 
-    action: str
-    names: list[str]
-    dir: Path
-    files: list[Path]
-
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "keys",
-        help="make and show CURVE keys",
-        description="Make and show CURVE keys. A server that is open to a network needs a key pair, by which clients "
-        "recognise it, and the public key of each client that it admits.",
-        examples=(
-            ("urlab keys new server ada", "make keys for a server and for a client called ada"),
-            ("urlab keys show server.key", "print a public key"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     actions = parser.add_subparsers(title="actions", dest="action", metavar="ACTION", required=True)
     new = actions.add_parser(
         "new",
@@ -47,16 +37,10 @@ def add_parser(commands: Commands) -> None:
         examples=[("urlab keys show server.key", "its public key and kind")],
     )
     show.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a .key or .key_secret file")
-    parser.set_defaults(run=run)
 
 
-def run(arguments: KeysArguments) -> int:
-    """Make or show keys.
-
-    Raises:
-        KeyFileError: A file exists already, or is not a key file.
-        OSError: A file cannot be written.
-    """
+def run(arguments: Namespace) -> int:
+    """Make or show keys."""
     if arguments.action == "new":
         for name in arguments.names:
             public, secret = KeyPair.new().write(arguments.dir, name)

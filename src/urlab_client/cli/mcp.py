@@ -7,12 +7,25 @@ import os
 import secrets
 import sys
 import webbrowser
+from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, count, make_client, one_of, seconds
+from urlab_client.aio import URLabClient
+from urlab_client.cli._arguments import (
+    Parser,
+    add_address,
+    add_client,
+    add_page,
+    check_page,
+    count,
+    host_names,
+    make_client,
+    one_of,
+    page_url,
+    seconds,
+)
 from urlab_client.cli._common import CommandError, import_mujoco
-from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
@@ -25,44 +38,28 @@ AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
 
-class McpArguments(PageArguments):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
+    "--http, at an address on this machine. Without --allow-drive and --allow-edit, an agent can only look, and "
+    "does not take a running server over from another client. The console shows what the agent does; a person who "
+    "acts there takes the controls from the agent. Messages for you, such as the console's link, go to standard "
+    "error. Exits with code 0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM."
+)
+EXAMPLES = (
+    ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
+    ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),
+    (
+        "urlab mcp tcp://localhost --allow-drive",
+        "drive a running server; another client's session ends",
+    ),
+    ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
+)
 
-    allow_drive: bool
-    allow_edit: bool
-    take_over: bool
-    step_mode: StepMode | None
-    max_seconds: float
-    max_wall: float
-    models: Path | None
-    http: bool
-    agents: int
-    console: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "mcp",
-        help="let an agent look at a simulation, and drive it if you allow that",
-        description="Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
-        "--http, at an address on this machine. Without --allow-drive and --allow-edit, an agent can only look, and "
-        "does not take a running server over from another client. The console shows what the agent does; a person who "
-        "acts there takes the controls from the agent. Messages for you, such as the console's link, go to standard "
-        "error. Exits with code 0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM.",
-        examples=(
-            ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
-            ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),
-            (
-                "urlab mcp tcp://localhost --allow-drive",
-                "drive a running server; another client's session ends",
-            ),
-            ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser, default="sim://arm")
-    add_ports(parser)
-    add_keys(parser)
+    add_client(parser, handshake=True)
     allowed = parser.add_argument_group("what the agent may do")
     allowed.add_argument("--allow-drive", action="store_true", help="move robots, reset, pause, record")
     allowed.add_argument("--allow-edit", action="store_true", help="import, place, move and remove robots and bodies")
@@ -110,17 +107,10 @@ def add_parser(commands: Commands) -> None:
         "(default: %(default)s)",
     )
     parser.add_argument("--no-console", dest="console", action="store_false", help="do not serve the console")
-    parser.set_defaults(run=run)
 
 
-def run(arguments: McpArguments) -> int:
-    """Serve until the input ends or a signal arrives.
-
-    Raises:
-        MissingExtra: The `mcp` extra is not installed.
-        CommandError: An option cannot be honoured.
-        OSError: The port is in use.
-    """
+def run(arguments: Namespace) -> int:
+    """Serve until the input ends or a signal arrives."""
     import urlab_client.mcp  # noqa: F401  # pyright: ignore[reportUnusedImport]  # reports a missing extra
 
     check_page(arguments)
@@ -135,7 +125,7 @@ def run(arguments: McpArguments) -> int:
     return 0
 
 
-def _check_permissions(arguments: McpArguments) -> None:
+def _check_permissions(arguments: Namespace) -> None:
     """Refuse contradictory options, and refuse to end another client's session only to look."""
     if arguments.agents > 1 and not arguments.http:
         raise CommandError("--agents requires --http: standard input and output serve one agent")
@@ -151,8 +141,7 @@ def _check_permissions(arguments: McpArguments) -> None:
         )
 
 
-async def _serve(arguments: McpArguments) -> None:
-    from urlab_client.aio import URLabClient
+async def _serve(arguments: Namespace) -> None:
     from urlab_client.mcp import Agent, Limits
     from urlab_client.web import Access, app
 
@@ -182,14 +171,14 @@ async def _serve(arguments: McpArguments) -> None:
                 await _serve_stdio(arguments, agent, console, access)
 
 
-async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_stdio(arguments: Namespace, agent: Agent, console: Starlette, access: Access) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import serve_stdio
 
     if not arguments.console:
         await serve_stdio(agent)
         return
-    with bound(arguments.host, _console_port(arguments)) as listener:
+    with bound(arguments.host, _port(arguments)) as listener:
         served = asyncio.create_task(serve_stdio(agent))
         ended = asyncio.Event()
         served.add_done_callback(lambda _: ended.set())
@@ -203,19 +192,20 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
         await served  # raises its failure
 
 
-def _console_port(arguments: McpArguments) -> int:
-    # A second agent on this machine serves a console, too. A port that was given is another object than the default.
-    return 0 if arguments.port is AGENT_PORT else arguments.port
+def _port(arguments: Namespace) -> int:
+    if arguments.port is not None:
+        return arguments.port
+    return AGENT_PORT if arguments.http else 0  # a second agent on this machine serves a console, too
 
 
-async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_http(arguments: Namespace, agent: Agent, console: Starlette, access: Access) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import http_application
     from urlab_client.web import Access
 
     given = os.environ.get(_TOKEN, "").split()
     tokens = given or [secrets.token_urlsafe(32) for _ in range(arguments.agents)]
-    with bound(arguments.host, arguments.port) as listener:
+    with bound(arguments.host, _port(arguments)) as listener:
         url = page_url(arguments, listener.getsockname()[1])
 
         def started() -> None:
@@ -229,7 +219,7 @@ async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette,
         await serve(http_application(agent, console if arguments.console else None, own), listener, started)
 
 
-def _print_link(arguments: McpArguments, url: str, access: Access) -> None:
+def _print_link(arguments: Namespace, url: str, access: Access) -> None:
     link = f"{url}/?token={access.invite()}"
     print(f"Console: {link} (good for one browser); Ctrl-C ends it.", file=sys.stderr, flush=True)
     if arguments.open:

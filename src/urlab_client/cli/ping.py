@@ -6,24 +6,17 @@ import asyncio
 import socket
 import statistics
 import time
+from argparse import Namespace
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import Any
 
 from msgspec import Struct
 
+from urlab_client.aio import URLabArticulation, URLabClient
 from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
-from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
-    add_address,
-    add_keys,
-    add_ports,
-    count,
-    make_client,
-    seconds,
-)
-from urlab_client.cli._common import counted, import_mujoco, json_line
+from urlab_client.cli._arguments import Parser, add_address, add_client, count, make_client, seconds
+from urlab_client.cli._common import aligned, counted, import_mujoco, json_line
 from urlab_client.errors import (
     ModeLocked,
     URLabConnectionError,
@@ -34,21 +27,7 @@ from urlab_client.errors import (
 from urlab_client.protocol.instances import RegisteredInstance, decode, registry_directory
 from urlab_client.protocol.messages.runtime import SetMode
 
-if TYPE_CHECKING:
-    from urlab_client.aio import URLabArticulation, URLabClient
-
-REGISTRY_CLIENTS = 16
-
-
-class PingArguments(ServerArguments):
-    """The parsed command line."""
-
-    address: str
-    timeout: float
-    count: int
-    no_session: bool
-    all: bool
-    json: bool
+_CONCURRENT = 16
 
 
 class RoundTrips(Struct):
@@ -80,10 +59,10 @@ class PlayReport(Struct):
     """
 
     state: str
-    sim_time: float | None
-    physics: str | None
-    step_mode: str | None
-    step_mode_pinned: bool
+    sim_time: float | None = None
+    physics: str | None = None
+    step_mode: str | None = None
+    step_mode_pinned: bool = False
 
 
 class Identity(Struct):
@@ -107,22 +86,32 @@ class Report(Struct):
     server: Identity | None = None
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "ping",
-        help="show which server answers at an address, and how fast",
-        description="Show which server answers at an address: versions, play state and step mode, articulations, and "
-        "the round-trip times of `meta`. This opens a session, which takes the server over from the client that "
-        "drives it. --no-session reads only the op list and the round-trip times, and does not disturb other clients.",
-        examples=(
-            ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
-            ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
-            ("urlab ping --all", "every server that this machine's registry lists"),
-        ),
-    )
+class RegisteredServer(Struct):
+    """A server of the registry; `answers` is None for a server on another machine, which is not contacted."""
+
+    instance_id: str
+    address: str
+    pid: int
+    seen_s_ago: float
+    busy: bool
+    answers: bool | None
+
+
+DESCRIPTION = (
+    "Show which server answers at an address: versions, play state and step mode, articulations, and "
+    "the round-trip times of `meta`. This opens a session, which takes the server over from the client that "
+    "drives it. --no-session reads only the op list and the round-trip times, and does not disturb other clients."
+)
+EXAMPLES = (
+    ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
+    ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
+    ("urlab ping --all", "every server that this machine's registry lists"),
+)
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser)
-    add_ports(parser, state=False)
     parser.add_argument(
         "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="how long to wait for each reply (default: 2)"
     )
@@ -137,19 +126,13 @@ def add_parser(commands: Commands) -> None:
         "answers; does not disturb other clients",
     )
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    add_keys(parser)
-    parser.set_defaults(run=run)
+    add_client(parser, state=False)
 
 
-def run(arguments: PingArguments) -> int:
-    """Print a report on the server.
-
-    Raises:
-        CommandError: The address is malformed.
-        URLabError: No server answers, or its reply is invalid.
-    """
+def run(arguments: Namespace) -> int:
+    """Print a report on the server, or on those of the registry."""
     if arguments.all:
-        servers = asyncio.run(_registered(arguments))
+        servers = asyncio.run(_registered(arguments.timeout))
         print(json_line(servers) if arguments.json else _list(servers))
         return 0
     if not arguments.no_session:
@@ -159,33 +142,16 @@ def run(arguments: PingArguments) -> int:
     return 0
 
 
-class RegisteredServer(Struct):
-    """A server of the registry; `answers` is None for a server on another machine, which is not contacted."""
-
-    instance_id: str
-    address: str
-    pid: int
-    seen_s_ago: float
-    busy: bool
-    answers: bool | None
-
-
-async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
-    concurrent = asyncio.Semaphore(REGISTRY_CLIENTS)  # one by one, the timeouts of dead servers would add up
+async def _registered(timeout: float) -> list[RegisteredServer]:
+    concurrent = asyncio.Semaphore(_CONCURRENT)  # one by one, the timeouts of dead servers would add up
 
     async def server(instance: RegisteredInstance, written: float) -> RegisteredServer:
         local = instance.host in ("", socket.gethostname())
-        address = f"tcp://{'127.0.0.1' if local else instance.host}"
+        address = f"tcp://{'127.0.0.1' if local else instance.host}:{instance.step_port}"
         async with concurrent:
-            answers = await _answers(address, instance.step_port, arguments.timeout) if local else None
-        return RegisteredServer(
-            instance_id=instance.instance_id,
-            address=f"{address}:{instance.step_port}",
-            pid=instance.pid,
-            seen_s_ago=round(max(0.0, time.time() - written), 1),
-            busy=instance.busy,
-            answers=answers,
-        )
+            answers = await _answers(address, timeout) if local else None
+        seen = round(max(0.0, time.time() - written), 1)
+        return RegisteredServer(instance.instance_id, address, instance.pid, seen, instance.busy, answers)
 
     entries: list[tuple[RegisteredInstance, float]] = []
     for path in sorted(registry_directory().glob("*.json")):
@@ -194,11 +160,8 @@ async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
     return await asyncio.gather(*(server(instance, written) for instance, written in entries))
 
 
-async def _answers(address: str, step_port: int, timeout: float) -> bool:
-    from urlab_client.aio import URLabClient
-
-    timeout_ms = max(1, round(timeout * 1000))
-    async with URLabClient(address, step_port=step_port, rcv_timeout_ms=timeout_ms, local_model=False) as client:
+async def _answers(address: str, timeout: float) -> bool:
+    async with URLabClient(address, rcv_timeout_ms=_milliseconds(timeout), local_model=False) as client:
         try:
             await client.meta(timeout=timeout)
         except (URLabConnectionError, URLabTimeoutError):
@@ -210,24 +173,23 @@ def _list(servers: list[RegisteredServer]) -> str:
     if not servers:
         return f"The registry {registry_directory()} lists no servers."
     answer_texts = {True: "answers", False: "does not answer", None: "on another machine"}
-    rows = [
-        (
-            server.instance_id,
-            server.address,
-            f"pid {server.pid}",
-            answer_texts[server.answers] + (", in use" if server.busy else ""),
-            f"registered {server.seen_s_ago:.0f} s ago",
-        )
-        for server in servers
-    ]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    return aligned(
+        [
+            (
+                server.instance_id,
+                server.address,
+                f"pid {server.pid}",
+                answer_texts[server.answers] + (", in use" if server.busy else ""),
+                f"registered {server.seen_s_ago:.0f} s ago",
+            )
+            for server in servers
+        ]
     )
 
 
-async def _ping(arguments: PingArguments) -> Report:
-    async with _client(arguments, local_model=True) as client:
+async def _ping(arguments: Namespace) -> Report:
+    options: dict[str, Any] = {"rcv_timeout_ms": _milliseconds(arguments.timeout)}
+    async with make_client(URLabClient, arguments.address, arguments, **options) as client:
         ops = await client.meta(timeout=arguments.timeout)
         report = Report(arguments.address, len(ops), await _round_trips(client, arguments))
         if arguments.no_session:
@@ -236,27 +198,23 @@ async def _ping(arguments: PingArguments) -> Report:
             await client.discover()
             report.server = await _identity(client)
         except URLabVersionMismatch:
-            async with _client(arguments, local_model=False) as other:
+            async with make_client(URLabClient, arguments.address, arguments, local_model=False, **options) as other:
                 await other.discover()
                 report.server = await _identity(other)
         return report
 
 
-def _client(arguments: PingArguments, *, local_model: bool) -> URLabClient:
-    from urlab_client.aio import URLabClient
-
-    timeout_ms = max(1, round(arguments.timeout * 1000))
-    return make_client(URLabClient, arguments.address, arguments, rcv_timeout_ms=timeout_ms, local_model=local_model)
+def _milliseconds(timeout: float) -> int:
+    return max(1, round(timeout * 1000))
 
 
-async def _round_trips(client: URLabClient, arguments: PingArguments) -> RoundTrips:
+async def _round_trips(client: URLabClient, arguments: Namespace) -> RoundTrips:
     times: list[float] = []
     for _ in range(arguments.count):
         start = time.perf_counter()
         await client.meta(timeout=arguments.timeout)
         times.append(1e3 * (time.perf_counter() - start))
-    low, middle, high = (round(f(times), 3) for f in (min, statistics.median, max))
-    return RoundTrips(count=len(times), min=low, median=middle, max=high)
+    return RoundTrips(len(times), *(round(f(times), 3) for f in (min, statistics.median, max)))
 
 
 async def _identity(client: URLabClient) -> Identity:
@@ -291,20 +249,19 @@ async def _play(client: URLabClient) -> PlayReport:
     try:
         before = await client.sim.status()
     except URLabRPCError:  # a packaged build has no such op
-        state = "ready" if client.manager_present else "off"
-        return PlayReport(state=state, sim_time=None, physics=None, step_mode=None, step_mode_pinned=False)
-    play = PlayReport(
-        state=before.state, sim_time=before.sim_time, physics=None, step_mode=None, step_mode_pinned=False
-    )
+        return PlayReport("ready" if client.manager_present else "off")
     if before.sim_time is None or not client.manager_present:
-        return play
+        return PlayReport(before.state, before.sim_time)
     after = await watched(client.sim.status, before)
     advancing = after.sim_time is not None and after.sim_time > before.sim_time
-    play.sim_time, play.physics = after.sim_time, "advancing" if advancing else "standing still"
     pinned = await _pinned_mode(client)
-    play.step_mode_pinned = pinned is not None
-    play.step_mode = pinned or ("live" if advancing else None)
-    return play
+    return PlayReport(
+        before.state,
+        after.sim_time,
+        physics="advancing" if advancing else "standing still",
+        step_mode=pinned or ("live" if advancing else None),
+        step_mode_pinned=pinned is not None,
+    )
 
 
 async def _pinned_mode(client: URLabClient) -> str | None:
@@ -323,14 +280,13 @@ def _text(report: Report) -> str:
     server = report.server
     if server is not None:
         here = "same version here" if server.same_mujoco_build else f"{server.local_mujoco_version} here"
-        rows = [
-            ("URLab", server.urlab_version),
-            ("MuJoCo", f"{server.mujoco_version} ({here})"),
-            *rows,
-            *_play_rows(server.play),
-            *_titled("articulations", [_articulation_text(art) for art in server.articulations]),
-            *_titled("entities", server.entities),
-        ]
+        rows = [("URLab", server.urlab_version), ("MuJoCo", f"{server.mujoco_version} ({here})"), *rows]
+        rows += _play_rows(server.play)
+        for title, texts in (
+            ("articulations", [_articulation_text(art) for art in server.articulations]),
+            ("entities", server.entities),
+        ):
+            rows += [("" if index else title, text) for index, text in enumerate(texts)]
     trips = report.round_trip_ms
     times = f"min {trips.min:.2f} ms, median {trips.median:.2f} ms, max {trips.max:.2f} ms ({trips.count} times meta)"
     lines = [report.address, *(f"  {title:13}  {text}" for title, text in (*rows, ("round trip", times)))]
@@ -352,21 +308,9 @@ def _play_rows(play: PlayReport) -> list[tuple[str, str]]:
     ]
 
 
-def _titled(title: str, texts: list[str]) -> list[tuple[str, str]]:
-    return [(title if index == 0 else "", text) for index, text in enumerate(texts)]
-
-
 def _articulation_text(articulation: ArticulationReport) -> str:
-    counts = [
-        counted(number, noun)
-        for number, noun in (
-            (articulation.joints, "joint"),
-            (articulation.actuators, "actuator"),
-            (articulation.sensors, "sensor"),
-            (articulation.cameras, "camera"),
-        )
-        if number is not None
-    ]
+    numbers = ((noun, getattr(articulation, f"{noun}s")) for noun in ("joint", "actuator", "sensor", "camera"))
+    counts = [counted(number, noun) for noun, number in numbers if number is not None]
     control = f"{articulation.controller} controller" if articulation.controller else "no controller"
     actor = f" (actor {articulation.actor_id})" if articulation.actor_id else ""
     return f"{articulation.key}{actor}: {', '.join([*counts, control])}"

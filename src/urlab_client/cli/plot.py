@@ -1,53 +1,48 @@
-"""`urlab plot`: draw curves of a recording as a picture."""
+"""`urlab plot`: draw curves of a recording as a picture; `plot_trace` also draws those of `urlab demo`."""
 
 from __future__ import annotations
 
-import argparse
+import math
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from urlab_client._extras import need
-from urlab_client.cli._arguments import Commands
+from urlab_client._installation import need
+from urlab_client._platform.files import replaced
+from urlab_client.cli._arguments import Parser, add_recording
 from urlab_client.cli._common import CommandError, check_ending, progress_bar
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Table
 
+_PER_PANEL = 6  # more lines in one panel cannot be told apart
+_DPI = 150
+_COVERS = 0.003  # of the axis: less than the width of a line
+_PERIOD = 18.0  # of a dashed line, in line widths
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
 
-class PlotArguments(argparse.Namespace):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Draw joint positions, or other values, of a recording over simulation time. Needs the extras "
+    "'urlab-client[mcap]' and 'urlab-client[demo]'."
+)
+EXAMPLES = (
+    ("urlab plot run.mcap", "all joint positions; the picture is run.png"),
+    ("urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png", "velocities of some joints"),
+    ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
+)
 
-    recording: Path
-    output: Path | None
-    joints: list[str]
-    field: str
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "plot",
-        help="draw curves of a recording",
-        description="Draw joint positions, or other values, of a recording over simulation time. Needs the extras "
-        "'urlab-client[mcap]' and 'urlab-client[demo]'.",
-        examples=(
-            ("urlab plot run.mcap", "all joint positions; the picture is run.png"),
-            ("urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png", "velocities of some joints"),
-            ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
-        ),
-    )
-    parser.add_argument(
-        "recording",
-        type=Path,
-        metavar="FILE",
-        help="a .mcap file, or a server's .json recording",
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
+    add_recording(parser)
     parser.add_argument(
         "--joints",
         nargs="+",
@@ -59,18 +54,11 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="PICTURE", help="a .png, .pdf or .svg file (default: FILE with .png)"
     )
-    parser.set_defaults(run=run)
 
 
-def run(arguments: PlotArguments) -> int:
-    """Draw.
-
-    Raises:
-        CommandError: No joint, actuator or sensor has such a name.
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Draw."""
     need("matplotlib", extra="demo")
-    from urlab_client.cli.figures import Quantity, Trace, plot_trace
     from urlab_client.integrations.record import read_run
 
     target = arguments.output or arguments.recording.with_suffix(".png")
@@ -78,25 +66,21 @@ def run(arguments: PlotArguments) -> int:
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
         table = recording.table(progress, fields=[arguments.field])
-    quantities: list[Quantity] = []
-    curves: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
+    curves: list[Curves] = []
     for key, names in _chosen(table, arguments).items():
         owner, column = key.rpartition("/")[0], table.columns[key]
         places: dict[str, list[int]] = {}  # one axis per unit
         for place in map(column.names.index, names):
             places.setdefault(column.quantities[place], []).append(place)
         for quantity, chosen in places.items():
-            first = len(curves)
-            curves += [column.values[:, place] for place in chosen]
             labels = [column.labels[place] for place in chosen]
-            quantities.append(Quantity(f"{owner}\n{quantity}", labels, range(first, len(curves))))
-    title = arguments.recording.name
-    plot_trace(Trace(title, table.time, np.stack(curves, axis=1), quantities), target)
-    print(f"{target}  {len(curves)} curves, {len(table)} states")
+            curves.append(Curves(f"{owner}\n{quantity}", labels, column.values[:, chosen]))
+    plot_curves(arguments.recording.name, table.time, curves, target)
+    print(f"{target}  {sum(len(one.names) for one in curves)} curves, {len(table)} states")
     return 0
 
 
-def _chosen(table: Table, arguments: PlotArguments) -> dict[str, list[str]]:
+def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
     from urlab_client.integrations._feed.scene import joint_columns
 
     chosen: dict[str, list[str]] = {}
@@ -128,3 +112,70 @@ def _chosen(table: Table, arguments: PlotArguments) -> dict[str, list[str]]:
             f"There are: {', '.join(there) or 'none'}"
         )
     return chosen
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Curves that share an axis, whose label has the unit; `values` has the shape (samples, curves)."""
+
+    label: str
+    names: Sequence[str]
+    values: NDArray[np.float64]
+
+
+def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves], path: Path) -> None:
+    """Draw curves over simulation time, seconds."""
+    # The figure's own canvas, not pyplot: no display, no global state.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    panels = [panel for some in curves for panel in _panels(some)]
+    figure: Any = Figure(figsize=(10, 0.9 + 2.3 * len(panels)), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        twins = _twins(panel.values)
+        for index, (name, (first, place, count)) in enumerate(zip(panel.names, twins, strict=True)):
+            label = name if first == index else f"{name} (like {panel.names[first]})"
+            axis.plot(time, panel.values[:, index], label=label, color=f"C{index}", **_style(place, count))
+        axis.set_ylabel(panel.label)
+        axis.grid(visible=True, alpha=0.3)
+        axis.margins(x=0.01)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+    figure.align_ylabels(axes)
+    axes[-1].set_xlabel("simulation time (s)")
+    with replaced(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+
+
+def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
+    """Return, per column, the first column that it covers, its place among those that do, and their number."""
+    near = _COVERS * np.ptp(np.nan_to_num(values)) if values.size else 0.0
+    firsts = [
+        next(
+            other
+            for other in range(index + 1)
+            if np.allclose(values[:, other], values[:, index], rtol=0, atol=near, equal_nan=True)
+        )
+        for index in range(values.shape[1])
+    ]
+    return [(first, firsts[:index].count(first), firsts.count(first)) for index, first in enumerate(firsts)]
+
+
+def _style(place: int, count: int) -> dict[str, Any]:
+    """Return the line style of one of several coinciding curves: later ones leave gaps that show the others."""
+    if place == 0:
+        return {"linewidth": 1.4}
+    dash = _PERIOD / count
+    return {"linewidth": 1.4, "linestyle": (place * dash, (dash, _PERIOD - dash))}
+
+
+def _panels(curves: Curves) -> list[Curves]:
+    """Split curves into panels of about equal size."""
+    total = len(curves.names)
+    size = math.ceil(total / math.ceil(total / _PER_PANEL)) if total else 1
+    return [
+        Curves(curves.label, curves.names[start : start + size], curves.values[:, start : start + size])
+        for start in range(0, total, size)
+    ]

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
+    Parser,
     add_address,
     add_cameras,
-    add_keys,
-    add_ports,
+    add_client,
     add_step_mode,
     cameras,
-    hertz,
     make_client,
     seconds,
 )
-from urlab_client.cli._common import CommandError, check_ending, import_mujoco, progress_bar
+from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.enums import StepMode
 
@@ -29,97 +28,62 @@ if TYPE_CHECKING:
 _INCOMPLETE = 1
 
 
-class RecordArguments(ServerArguments):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, "
+    "physics runs by itself and this command watches; in direct mode, this command resets and steps it, with all "
+    "set-points zero or those of the keyframe. Opens a session, which takes the server over from the client that "
+    "drives it; your own program can call record(client, FILE) instead. Ctrl-C ends the recording early. Exit code "
+    "1 if states were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'."
+)
+EXAMPLES = (
+    ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
+    (
+        "urlab record sim://arm run.mcap --step-mode direct --camera all",
+        "a simulated robot, stepped by this command, with every camera",
+    ),
+    (
+        "urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15",
+        "another machine and one of its cameras",
+    ),
+)
 
-    address: str
-    output: Path
-    step_mode: StepMode
-    duration: float
-    keyframe: str | None
-    camera: list[str]
-    camera_hz: float
-    contacts: bool
-    overwrite: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "record",
-        help="record a running simulation to an MCAP file",
-        description="Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, "
-        "physics runs by itself and this command watches; in direct mode, this command resets and steps it, with all "
-        "set-points zero or those of the keyframe. Opens a session, which takes the server over from the client that "
-        "drives it; your own program can call record(client, FILE) instead. Ctrl-C ends the recording early. Exit code "
-        "1 if states were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'.",
-        examples=(
-            ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
-            (
-                "urlab record sim://arm run.mcap --step-mode direct --camera all",
-                "a simulated robot, stepped by this command, with every camera",
-            ),
-            (
-                "urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15",
-                "another machine and one of its cameras",
-            ),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser)
     parser.add_argument("output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
-    add_ports(parser)
     add_step_mode(parser)
     parser.add_argument(
         "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
     parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
     add_cameras(parser, "a camera to record")
-    parser.add_argument(
-        "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
-    )
     parser.add_argument("--contacts", action="store_true", help="also record contacts")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
-    add_keys(parser)
-    parser.set_defaults(run=run)
+    add_client(parser)
 
 
-def run(arguments: RecordArguments) -> int:
-    """Record; return 1 if states were dropped or a camera sent no picture, else 0.
-
-    Raises:
-        CommandError: The file or an option cannot be used.
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Record; return 1 if states were dropped or a camera sent no picture, else 0."""
     import_mujoco()
-    check_ending(arguments.output, ".mcap")
-    if arguments.output.exists() and not arguments.overwrite:
-        raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # fail early
-
+    check_recording(arguments.output, overwrite=arguments.overwrite)
     if arguments.camera and arguments.address.startswith("sim://"):
-        from urlab_client.server.render.opengl import need_backend
+        from urlab_client.simulation.opengl import need_backend
 
         need_backend()  # the server that this command starts renders on this machine
-    try:
+    with refusing(KeyError):
         recorder = asyncio.run(_record(arguments))
-    except KeyError as error:
-        raise CommandError(str(error.args[0])) from None
     stats = recorder.stats
-    print(
-        f"{arguments.output}  {stats.states} states, {stats.frames} pictures, {stats.file_bytes / 2**20:.1f} MiB"
-        + (
-            f"; dropped {stats.dropped_states} and {stats.dropped_frames}"
-            if stats.dropped_states or stats.dropped_frames
-            else ""
-        )
-    )
+    text = f"{arguments.output}  {stats.states} states, {stats.frames} pictures, {stats.file_bytes / 2**20:.1f} MiB"
+    if stats.dropped_states or stats.dropped_frames:
+        text += f"; dropped {stats.dropped_states} and {stats.dropped_frames}"
+    print(text)
     return _INCOMPLETE if stats.dropped_states or recorder.without_pictures else 0
 
 
-async def _record(arguments: RecordArguments) -> AsyncRecorder:
-    from urlab_client.aio import URLabClient
+async def _record(arguments: Namespace) -> AsyncRecorder:
     from urlab_client.integrations.record import record
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)

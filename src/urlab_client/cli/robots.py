@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import Namespace
 from pathlib import Path
 
 from msgspec import Struct
 
-from urlab_client.cli._arguments import Commands
-from urlab_client.cli._common import import_mujoco, json_line
-
-
-class RobotsArguments(argparse.Namespace):
-    """The parsed command line."""
-
-    json: bool
+from urlab_client.cli._arguments import Parser
+from urlab_client.cli._common import aligned, import_mujoco, json_line
 
 
 class Robot(Struct):
@@ -29,24 +23,23 @@ class Robot(Struct):
     path: str
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "robots",
-        help="list the bundled robots",
-        description="List the bundled models and what each one contains. Every command that takes a model, and every "
-        "sim:// address, accepts their names in place of an MJCF file.",
-        examples=(
-            ("urlab robots", "a table"),
-            ("urlab serve arm --play", "serve one of them"),
-            ("urlab robots --json", "the same for programs, with the path of each file"),
-        ),
-    )
+DESCRIPTION = (
+    "List the bundled models and what each one contains. Every command that takes a model, and every "
+    "sim:// address, accepts their names in place of an MJCF file."
+)
+EXAMPLES = (
+    ("urlab robots", "a table"),
+    ("urlab serve arm --play", "serve one of them"),
+    ("urlab robots --json", "the same for programs, with the path of each file"),
+)
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
 
 
-def run(arguments: RobotsArguments) -> int:
+def run(arguments: Namespace) -> int:
     """Print the table."""
     import_mujoco()
     from urlab_client.server.assets.bundled_robots import bundled_models
@@ -76,20 +69,8 @@ def _read(name: str, path: Path) -> Robot:
 
 
 def _table(robots: list[Robot]) -> str:
-    rows = [("name", "joints", "actuators", "sensors", "cameras", "keyframes")]
-    rows += [
-        (
-            robot.name,
-            *map(str, (robot.joints, robot.actuators, robot.sensors, robot.cameras)),
-            ", ".join(robot.keyframes),
-        )
-        for robot in robots
+    counts = ("joints", "actuators", "sensors", "cameras")
+    rows = [
+        (robot.name, *(str(getattr(robot, name)) for name in counts), ", ".join(robot.keyframes)) for robot in robots
     ]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if 0 < column < len(row) - 1 else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
+    return aligned([("name", *counts, "keyframes"), *rows], right=range(1, len(counts) + 1))

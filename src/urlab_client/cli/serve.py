@@ -5,96 +5,59 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import logging
 import os
 import queue
+import signal
+import sys
+import threading
+from argparse import Namespace
 from collections.abc import Generator
+from enum import Enum
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from urlab_client._installation import install_command
-from urlab_client.cli._arguments import Commands, add_dialect, count, image_size, index, port
-from urlab_client.cli._common import CommandError, import_mujoco
-from urlab_client.cli._serve_events import Event, Events, Starter, next_event, stop_on_signals, watch_input
+from urlab_client._platform.threads import daemon
+from urlab_client._platform.windows import read_aside
+from urlab_client.cli._arguments import Parser, add_dialect, count, image_size, index, port
+from urlab_client.cli._common import CommandError, import_mujoco, in_background
 from urlab_client.enums import CameraMode, StepMode
-from urlab_client.server.controller_text import ControllerText
+from urlab_client.simulation.controller_config import ControllerConfig
 
 if TYPE_CHECKING:
     from urlab_client.server.simulated import SimulatedServer
     from urlab_client.server.transport.curve_authentication import CurveServer
 
+logger: logging.Logger = logging.getLogger("urlab_client.cli")
+
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
+# Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.
+_WAIT_S = 0.1 if sys.platform == "win32" else None
 _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
-class ControllerOption(NamedTuple):
-    """`--controller ACTOR=KIND[,gain=…]`."""
-
-    actor: str
-    controller: ControllerText
-
-
-class CameraOption(NamedTuple):
-    """`--camera-mode ACTOR/CAMERA=MODE`."""
-
-    camera: str
-    mode: CameraMode
-
-
-class ServeArguments(argparse.Namespace):
-    """The parsed command line."""
-
-    models: list[str]
-    host: str
-    server_key: Path | None
-    allow_client: list[Path]
-    allow_any_client: bool
-    insecure_no_auth: bool
-    step_port: int
-    state_port: int
-    ctrl_port: int
-    info_port: int
-    camera_port: int
-    shm_dir: Path | None
-    saved_dir: Path | None
-    model_root: list[Path] | None
-    play: bool
-    unpaused: bool
-    step_mode: str
-    controller: list[ControllerOption]
-    camera_mode: list[CameraOption]
-    camera_size: tuple[int, int] | None
-    render_quality: Literal["auto", "fast", "high"]
-    mjcf_options: bool
-    randomise: str | None
-    scene_mib: int | None
-    actor_names: Literal["model", "plugin"]
-    dialect: Literal["alpha", "beta"]
-    instance_id: str
-    instance_index: int | None
-    metrics_port: int | None
-    json: bool
-    until_eof: bool
+DESCRIPTION = (
+    "Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
+    "(Ctrl-C) and SIGTERM, and with code 2 if it fails."
+)
+EXAMPLES = (
+    ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
+    (
+        "urlab serve robot.xml --play --unpaused --mjcf-options",
+        "your own model, simulated in real time with its own <option>",
+    ),
+    ("urlab serve arm ball --step-port 0 --json", "two models on any free port, printed as one line of JSON"),
+)
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "serve",
-        help="run a simulated server",
-        description="Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM, and with code 2 if it fails.",
-        examples=(
-            ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
-            (
-                "urlab serve robot.xml --play --unpaused --mjcf-options",
-                "your own model, simulated in real time with its own <option>",
-            ),
-            ("urlab serve arm ball --step-port 0 --json", "two models on any free port, printed as one line of JSON"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     parser.add_argument(
         "models",
         nargs="+",
@@ -245,18 +208,11 @@ def add_parser(commands: Commands) -> None:
         help="also exit when standard input closes, so that the server cannot outlive the program that started it; "
         "the server then ignores SIGINT, unless standard input is a terminal",
     )
-    parser.set_defaults(run=run)
 
 
-def run(arguments: ServeArguments) -> int:
-    """Serve until stopped.
-
-    Raises:
-        CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
-        OSError: A port is in use, or a folder cannot be used.
-    """
+def run(arguments: Namespace) -> int:
+    """Serve until stopped."""
     _settle_ports(arguments)
-    _check_ports(arguments)
     if arguments.metrics_port is not None and find_spec("prometheus_client") is None:
         raise CommandError(f"prometheus_client is not installed; run: {install_command('prometheus')}")
     events: Events = queue.SimpleQueue()
@@ -294,9 +250,8 @@ def run(arguments: ServeArguments) -> int:
     return 0
 
 
-def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
+def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
     from urlab_client.server.limits import Limits
-    from urlab_client.server.physics.controllers import ControllerConfig
     from urlab_client.server.simulated import SimulatedServer
 
     try:
@@ -315,8 +270,8 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_port=arguments.camera_port,
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
-            controllers={item.actor: ControllerConfig.of(item.controller) for item in arguments.controller},
-            camera_modes={item.camera: item.mode for item in arguments.camera_mode},
+            controllers=dict(arguments.controller),
+            camera_modes=dict(arguments.camera_mode),
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
@@ -334,7 +289,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
         raise CommandError(f"--randomise: {error}") from None
 
 
-def _curve(arguments: ServeArguments) -> CurveServer | None:
+def _curve(arguments: Namespace) -> CurveServer | None:
     from urlab_client.server.transport.curve_authentication import CurveServer
 
     if arguments.server_key is None:
@@ -349,7 +304,7 @@ def _curve(arguments: ServeArguments) -> CurveServer | None:
 
 
 @contextlib.contextmanager
-def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[int | None]:
+def _metrics(server: SimulatedServer, arguments: Namespace) -> Generator[int | None]:
     """Serve metrics while the block runs; yields their port, or None without `--metrics-port`."""
     if arguments.metrics_port is None:
         yield None
@@ -374,7 +329,7 @@ def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[in
         thread.join()
 
 
-def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: int | None) -> None:
+def _announce(server: SimulatedServer, arguments: Namespace, metrics_port: int | None) -> None:
     ports = {name: int(getattr(server, f"{name}_port")) for name in _PORTS}
     if arguments.json:
         ready: dict[str, Any] = {"event": "ready", "address": server.address}
@@ -398,28 +353,23 @@ def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: 
     )
 
 
-def _settle_ports(arguments: ServeArguments) -> None:
+def _settle_ports(arguments: Namespace) -> None:
     """Fill in the ports that were not given: the plugin's defaults, or 0 to derive them from the instance index."""
     from urlab_client.server.dialects import DIALECTS
 
     defaults = {**_PORTS, "camera": DIALECTS[arguments.dialect].first_camera_port}
-    if arguments.instance_index is not None:
-        defaults = dict.fromkeys(_PORTS, 0)
-    for name, default in defaults.items():
-        if getattr(arguments, f"{name}_port") is None:
-            setattr(arguments, f"{name}_port", default)
-
-
-def _check_ports(arguments: ServeArguments) -> None:
     users: dict[int, str] = {}
-    for name in _PORTS:
-        number = cast("int", getattr(arguments, f"{name}_port"))
+    for name, default in defaults.items():
+        number = getattr(arguments, f"{name}_port")
+        if number is None:
+            number = default if arguments.instance_index is None else 0
+            setattr(arguments, f"{name}_port", number)
         if number and number in users:
             raise CommandError(f"--{users[number]}-port and --{name}-port are both {number}; each needs its own")
         users[number] = name
 
 
-def _check_paths(arguments: ServeArguments) -> None:
+def _check_paths(arguments: Namespace) -> None:
     from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 
     bundled = bundled_models()
@@ -431,25 +381,93 @@ def _check_paths(arguments: ServeArguments) -> None:
             raise CommandError(f"--model-root {folder}: no such folder")
 
 
-def _controller(text: str) -> ControllerOption:
+def _controller(text: str) -> tuple[str, ControllerConfig]:
     actor, equals, value = text.partition("=")
     if not actor or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
     try:
-        return ControllerOption(actor, ControllerText.parse(value))
+        return actor, ControllerConfig.parse(value)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
-def _camera_mode(text: str) -> CameraOption:
+def _camera_mode(text: str) -> tuple[str, CameraMode]:
     camera, equals, mode = text.rpartition("=")
     actor, slash, name = camera.partition("/")
     if not (equals and actor and slash and name):
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR/CAMERA=MODE, for example arm/wrist=depth")
     if mode not in [*CameraMode]:
-        raise argparse.ArgumentTypeError(f"{text!r}: {mode!r} is not a camera mode; the modes are {_names(CameraMode)}")
-    return CameraOption(camera, CameraMode(mode))
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: {mode!r} is not a camera mode; the modes are {', '.join(CameraMode)}"
+        )
+    return camera, CameraMode(mode)
 
 
-def _names(kinds: type[CameraMode]) -> str:
-    return ", ".join(kinds)
+class Event(Enum):
+    """What the main thread waits for."""
+
+    STARTED = "started"
+    STOP = "stop"
+    FAILED = "failed"
+
+
+Events: TypeAlias = "queue.SimpleQueue[Event]"  # unlike a threading.Event, it may be used in signal handlers
+
+
+class Starter:
+    """Starts the server off the main thread, which can thus handle a signal while a model compiles.
+
+    The thread queues `Event.STARTED` at its end; `error` is what went wrong.
+    """
+
+    def __init__(self, server: SimulatedServer, events: Events) -> None:
+        self.error: BaseException | None = None
+        fail = partial(self._fail, events)
+        self.thread: threading.Thread = daemon("urlab-start", self._start, server, events, failed=fail)
+        self.thread.start()
+
+    def _start(self, server: SimulatedServer, events: Events) -> None:
+        server.start()
+        events.put(Event.STARTED)
+
+    def _fail(self, events: Events, error: BaseException) -> None:
+        self.error = error  # raised again by the main thread
+        events.put(Event.STARTED)
+
+
+def next_event(events: Events) -> Event:
+    """Wait for the next event; a signal interrupts the wait."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return events.get(timeout=_WAIT_S)
+
+
+def stop_on_signals(events: Events, *, ignore_interrupt: bool) -> None:
+    """Queue `Event.STOP` on SIGTERM, a closed terminal and, unless it is meant for another process, Ctrl-C."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        events.put(Event.STOP)
+
+    # Ctrl-C reaches all processes of a terminal, but is meant for the one that started this server.
+    signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt or in_background() else stop)
+    signal.signal(signal.SIGTERM, stop)
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup ignores it
+        signal.signal(hangup, stop)
+
+
+def watch_input(events: Events) -> None:
+    """Queue `Event.STOP` at the end of standard input, which a thread waits for."""
+
+    def watch() -> None:
+        # Not through sys.stdin, whose lock this thread would still hold when the interpreter ends.
+        with contextlib.suppress(OSError):  # there is no standard input
+            while read_aside(0, 4096):
+                pass
+        events.put(Event.STOP)
+
+    def fail(error: BaseException) -> None:
+        logger.error("standard input can no longer be read", exc_info=error)
+        events.put(Event.STOP)
+
+    daemon("urlab-stdin", watch, failed=fail).start()

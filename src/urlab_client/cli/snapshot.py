@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client._platform.files import replaced
 from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
-    add_handshake,
-    add_keys,
+    Parser,
+    add_client,
     add_mjcf_options,
-    add_ports,
     handshake,
     image_size,
     make_client,
@@ -37,39 +35,26 @@ _CHUNK = 100  # physics steps per request, for which the server allows 5 s
 _BEYOND_M = 1e5  # farther than any ray can hit
 
 
-class SnapshotArguments(ServerArguments):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Write a picture of models or of a saved level, which this command simulates itself, or of what a "
+    "camera of a running server sees, in any mode and without a step. The latter opens a session, which takes the "
+    "server over from the client that drives it, unless you pass --handshake. Needs the extra "
+    "'urlab-client[demo]'."
+)
+EXAMPLES = (
+    ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
+    (
+        "urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg",
+        "your own model, one second after its keyframe, as JPEG",
+    ),
+    ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
+    ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
+    ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "alongside its client"),
+)
 
-    sources: list[str]
-    output: Path
-    camera: str | None
-    mode: str | None
-    size: tuple[int, int]
-    seconds: float | None
-    keyframe: str | None
-    timeout: float | None
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "snapshot",
-        help="write a picture of a model, a level or a camera",
-        description="Write a picture of models or of a saved level, which this command simulates itself, or of what a "
-        "camera of a running server sees, in any mode and without a step. The latter opens a session, which takes the "
-        "server over from the client that drives it, unless you pass --handshake. Needs the extra "
-        "'urlab-client[demo]'.",
-        examples=(
-            ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
-            (
-                "urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg",
-                "your own model, one second after its keyframe, as JPEG",
-            ),
-            ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
-            ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
-            ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "alongside its client"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     parser.add_argument(
         "sources",
         nargs="+",
@@ -106,27 +91,17 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long first")
     add_mjcf_options(parser, "for models")
-    add_ports(parser)
     parser.add_argument(
         "--timeout",
         type=seconds,
         metavar="S",
         help="how long to wait for a running server (default: 5, and 30 for its first picture)",
     )
-    add_keys(parser)
-    add_handshake(parser)
-    parser.set_defaults(run=run)
+    add_client(parser, handshake=True)
 
 
-def run(arguments: SnapshotArguments) -> int:
-    """Write the picture.
-
-    Raises:
-        CommandError: An option cannot be honoured.
-        MissingExtra: A library is missing.
-        URLabError: A model is invalid, rendering is not available, or the server does not answer.
-        OSError: The file cannot be written.
-    """
+def run(arguments: Namespace) -> int:
+    """Write the picture."""
     need("PIL", extra="demo")
     if not arguments.output.parent.is_dir():
         raise CommandError(f"{arguments.output}: no such folder")
@@ -142,7 +117,7 @@ def run(arguments: SnapshotArguments) -> int:
     return 0
 
 
-def _check_mode(arguments: SnapshotArguments) -> None:
+def _check_mode(arguments: Namespace) -> None:
     if arguments.mode is None:
         return
     for_camera = arguments.mode in [*CameraMode]
@@ -152,10 +127,10 @@ def _check_mode(arguments: SnapshotArguments) -> None:
         raise CommandError(f"--mode {arguments.mode}: {where} the modes are {', '.join(fitting)}")
 
 
-def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
+def _of_models(arguments: Namespace) -> NDArray[np.uint8]:
     from urlab_client import URLabClient
     from urlab_client.server import SimulatedServer
-    from urlab_client.server.render.opengl import need_backend
+    from urlab_client.simulation.opengl import need_backend
 
     if arguments.handshake is not None:
         raise CommandError("--handshake is for the address of a running server")
@@ -191,7 +166,7 @@ def _simulate(client: URLabClient, duration: float) -> None:
         remaining -= _CHUNK
 
 
-def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
+def _of_running_server(arguments: Namespace) -> NDArray[np.uint8]:
     from urlab_client import URLabClient
 
     if len(arguments.sources) > 1:

@@ -3,81 +3,65 @@
 from __future__ import annotations
 
 import asyncio
+import codecs
 import contextlib
+import importlib
+import os
+import select
 import sys
-from collections.abc import AsyncGenerator, Callable
+from argparse import Namespace
+from collections.abc import AsyncGenerator, Callable, Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
+    Parser,
     add_address,
     add_cameras,
-    add_keys,
-    add_ports,
+    add_client,
     cameras,
     count,
     hertz,
     make_client,
     seconds,
 )
-from urlab_client.cli._common import CommandError, check_ending, import_mujoco
-from urlab_client.cli._terminal_keys import terminal_keys
+from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
 from urlab_client.cli._watching import interruptible
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabClient
     from urlab_client.integrations.gym import Task
     from urlab_client.integrations.record import AsyncRecorder
     from urlab_client.integrations.teleop import TeleopCommand, TeleopTally, TeleopView
 
 _SHOWN_S = 0.1
+_MOST = 1024
 
 
-class TeleopArguments(ServerArguments):
-    """The parsed command line."""
+DESCRIPTION = (
+    "Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint "
+    "limits. The simulation is stepped in real time; an episode begins with the first key. With --record, each "
+    "episode is saved with the outcome that you mark with a key, and `urlab convert` makes a LeRobot dataset of "
+    "the episodes that were not discarded. Opens a session, which takes the server over from the client that "
+    "drives it. `urlab console` supports gamepads. Needs the extra 'urlab-client[teleop]', and with --task also "
+    "'urlab-client[gym]'."
+)
+EXAMPLES = (
+    ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
+    ("urlab teleop sim://arm", "try it, without a recording"),
+    (
+        "urlab teleop tcp://localhost --robot arm --site grip --record run.mcap --camera arm/wrist",
+        "the robot of a running server, with pictures",
+    ),
+)
 
-    address: str | None
-    output: Path | None
-    task: str | None
-    robot: str | None
-    site: str | None
-    gripper: str | None
-    speed: float
-    turn_speed: float
-    episodes: int | None
-    seconds: float | None
-    seed: int
-    camera: list[str]
-    camera_hz: float
-    overwrite: bool
 
-
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "teleop",
-        help="move a robot's hand with the keyboard, and record episodes",
-        description="Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint "
-        "limits. The simulation is stepped in real time; an episode begins with the first key. With --record, each "
-        "episode is saved with the outcome that you mark with a key, and `urlab convert` makes a LeRobot dataset of "
-        "the episodes that were not discarded. Opens a session, which takes the server over from the client that "
-        "drives it. `urlab console` supports gamepads. Needs the extra 'urlab-client[teleop]', and with --task also "
-        "'urlab-client[gym]'.",
-        examples=(
-            ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
-            ("urlab teleop sim://arm", "try it, without a recording"),
-            (
-                "urlab teleop tcp://localhost --robot arm --site grip --record run.mcap --camera arm/wrist",
-                "the robot of a running server, with pictures",
-            ),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser, default=None, otherwise="a simulated server for --task, else tcp://localhost")
     parser.add_argument("--record", dest="output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
     parser.add_argument("--task", metavar="ID", help="a task of this package, such as urlab/Reach-v0")
@@ -102,29 +86,15 @@ def add_parser(commands: Commands) -> None:
         "--seed", type=int, default=0, metavar="N", help="seed of initial states and goals (default: 0)"
     )
     add_cameras(parser, "with --record: a camera to record")
-    parser.add_argument(
-        "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
-    )
     parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
-    add_ports(parser)
-    add_keys(parser)
-    parser.set_defaults(run=run)
+    add_client(parser)
 
 
-def run(arguments: TeleopArguments) -> int:
-    """Teleoperate; return 0.
-
-    Raises:
-        CommandError: The terminal, the file or an option cannot be used.
-        MissingExtra: A library is missing.
-        URLabError: The server refused a request, or the robot cannot be moved this way.
-    """
+def run(arguments: Namespace) -> int:
+    """Teleoperate; return 0."""
     import_mujoco()
     if arguments.output is not None:
-        check_ending(arguments.output, ".mcap")
-        if arguments.output.exists() and not arguments.overwrite:
-            raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
-        import urlab_client.integrations.record  # pyright: ignore[reportUnusedImport]  # fail early
+        check_recording(arguments.output, overwrite=arguments.overwrite)
     elif arguments.camera or arguments.overwrite:
         raise CommandError("--camera and --overwrite require --record")
     if arguments.seed < 0:
@@ -132,20 +102,15 @@ def run(arguments: TeleopArguments) -> int:
     import urlab_client.integrations.teleop  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
     task = None if arguments.task is None else _task(arguments.task)
-    try:
-        with terminal_keys() as keys:
-            tally = asyncio.run(_teleoperate(arguments, task, keys))
-    except KeyError as error:
-        raise CommandError(str(error.args[0])) from None
-    except ValueError as error:
-        raise CommandError(str(error)) from error
+    with refusing(KeyError, ValueError), terminal_keys() as keys:
+        tally = asyncio.run(_teleoperate(arguments, task, keys))
     where = "" if arguments.output is None else f"{arguments.output}  "
     print(f"{where}{_counts(tally)}")
     return 0
 
 
 def _task(name: str) -> Task:
-    from urlab_client._extras import need
+    from urlab_client._installation import need
 
     need("gymnasium", extra="gym")
     from urlab_client.integrations.gym import TASKS
@@ -155,8 +120,7 @@ def _task(name: str) -> Task:
     return TASKS[name]()
 
 
-async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Callable[[], str]) -> TeleopTally:
-    from urlab_client.aio import URLabClient
+async def _teleoperate(arguments: Namespace, task: Task | None, keys: Callable[[], str]) -> TeleopTally:
     from urlab_client.integrations.teleop import HandControl, KeyboardOperator, TeleopCommand, teleoperate
 
     address = arguments.address
@@ -199,16 +163,15 @@ async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Call
 
 
 @contextlib.asynccontextmanager
-async def _recorded(client: URLabClient, arguments: TeleopArguments) -> AsyncGenerator[AsyncRecorder | None]:
+async def _recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[AsyncRecorder | None]:
     if arguments.output is None:
         yield None
         return
     from urlab_client.integrations.record import record
 
     wanted = cameras(arguments.camera)
-    async with record(
-        client, arguments.output, cameras=wanted, camera_hz=arguments.camera_hz, overwrite=arguments.overwrite
-    ) as recorder:
+    options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
+    async with record(client, arguments.output, cameras=wanted, **options) as recorder:
         yield recorder
 
 
@@ -221,6 +184,44 @@ def _print_keys() -> None:
 
 def _counts(tally: TeleopTally) -> str:
     return f"{tally.success} success, {tally.failure} failure, {tally.discarded} discarded"
+
+
+@contextlib.contextmanager
+def terminal_keys() -> Generator[Callable[[], str]]:
+    """Yield a function that returns the characters typed since its last call; restore the terminal afterwards."""
+    if not sys.stdin.isatty():
+        raise CommandError("keys are read from a terminal, and standard input is not one")
+    if os.name == "nt":
+        console: Any = importlib.import_module("msvcrt")
+
+        def typed() -> str:
+            found = ""
+            while console.kbhit() and len(found) < _MOST:
+                found += console.getwch()
+            return found
+
+        yield typed
+        return
+    # By name: type checkers know these modules on one kind of system only.
+    termios: Any = importlib.import_module("termios")
+    tty: Any = importlib.import_module("tty")
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+    decode = codecs.getincrementaldecoder("utf-8")(errors="replace").decode
+    tty.setcbreak(descriptor)
+
+    def read() -> str:
+        if not select.select([descriptor], [], [], 0)[0]:
+            return ""
+        data = os.read(descriptor, _MOST)
+        if not data:
+            raise CommandError("the terminal is gone")
+        return decode(data)
+
+    try:
+        yield read
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
 
 class _StatusLine:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from urlab_client.aio import URLabClient
 from urlab_client.cli import console
 from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
+    Parser,
     add_address,
     add_cameras,
-    add_keys,
-    add_ports,
+    add_client,
     add_step_mode,
     cameras,
     hertz,
@@ -21,53 +21,34 @@ from urlab_client.cli._arguments import (
     port,
     seconds,
 )
-from urlab_client.cli._common import CommandError, import_mujoco
-from urlab_client.cli._page_options import PageArguments
+from urlab_client.cli._common import CommandError, import_mujoco, refusing
 from urlab_client.cli._watching import interruptible, run_session
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabClient
     from urlab_client.integrations.view import AsyncView
 
 _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
 
-class ViewArguments(ServerArguments):
-    """The parsed command line."""
-
-    address: str
-    where: str
-    save: Path | None
-    connect: str | None
-    page: bool
-    port: int | None
-    step_mode: StepMode
-    seconds: float | None
-    camera: list[str]
-    camera_hz: float
-    sensors: bool
-    max_hz: float
+DESCRIPTION = (
+    "Show a play session while it runs. In live mode, physics runs by itself and this command watches; "
+    "in direct mode, this command resets and steps it, with all set-points zero. Opens a session, which takes the "
+    "server over from the client that drives it; your own program can call rerun_view(client) or one of its "
+    "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
+    "'urlab-client[foxglove]', --web 'urlab-client[web]'."
+)
+EXAMPLES = (
+    ("urlab view sim://quadruped", "MuJoCo's window"),
+    ("urlab view --rerun --camera all", "the server on this machine in Rerun, with every camera"),
+    ("urlab view sim://arm --rerun --save arm.rrd --seconds 5", "five seconds as a Rerun file"),
+    ("urlab view --foxglove", "a server that Foxglove connects to"),
+)
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "view",
-        help="show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
-        description="Show a play session while it runs. In live mode, physics runs by itself and this command watches; "
-        "in direct mode, this command resets and steps it, with all set-points zero. Opens a session, which takes the "
-        "server over from the client that drives it; your own program can call rerun_view(client) or one of its "
-        "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
-        "'urlab-client[foxglove]', --web 'urlab-client[web]'.",
-        examples=(
-            ("urlab view sim://quadruped", "MuJoCo's window"),
-            ("urlab view --rerun --camera all", "the server on this machine in Rerun, with every camera"),
-            ("urlab view sim://arm --rerun --save arm.rrd --seconds 5", "five seconds as a Rerun file"),
-            ("urlab view --foxglove", "a server that Foxglove connects to"),
-        ),
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
     add_address(parser)
     where = parser.add_mutually_exclusive_group()
     parser.set_defaults(where="viewer")
@@ -86,34 +67,24 @@ def add_parser(commands: Commands) -> None:
         help="with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone",
     )
     parser.add_argument("--port", type=port, metavar="PORT", help="port for --web, --foxglove or --page")
-    add_ports(parser)
     add_step_mode(parser)
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")
-    add_cameras(parser, "a camera to show in Rerun or Foxglove")
-    parser.add_argument(
-        "--camera-hz", type=hertz, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
-    )
+    add_cameras(parser, "a camera to show in Rerun or Foxglove", hz=10.0)
     parser.add_argument("--sensors", action="store_true", help="show sensor readings in Rerun or Foxglove")
     parser.add_argument(
         "--max-hz", type=hertz, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
     )
-    add_keys(parser)
-    parser.set_defaults(run=run)
+    add_client(parser)
 
 
-def run(arguments: ViewArguments) -> int:
-    """Show the simulation until stopped.
-
-    Raises:
-        CommandError: An option cannot be honoured.
-        MissingExtra: A library is missing.
-    """
+def run(arguments: Namespace) -> int:
+    """Show the simulation until stopped."""
     if arguments.where != "rerun" and (arguments.save or arguments.connect or arguments.page):
         raise CommandError("--save, --connect and --page require --rerun")
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
         raise CommandError("give one of --save, --connect and --page")
     if arguments.where == "web":
-        return console.run(_console_arguments(arguments))
+        return _show_console(arguments)
     if arguments.where == "viewer":
         from urlab_client.integrations.view.window import missing_for_window
 
@@ -122,38 +93,22 @@ def run(arguments: ViewArguments) -> int:
             raise CommandError(f"{missing}; without a window, use --web, --rerun --page or --foxglove")
     else:
         import_mujoco()
-    try:
+    with refusing(KeyError, ValueError):
         asyncio.run(_view(arguments))
-    except ValueError as error:
-        raise CommandError(str(error)) from None
-    except KeyError as error:
-        raise CommandError(str(error.args[0])) from None
     return 0
 
 
-def _console_arguments(arguments: ViewArguments) -> PageArguments:
+def _show_console(arguments: Namespace) -> int:
     if arguments.camera or arguments.sensors or arguments.seconds is not None:
         raise CommandError(
             "--camera, --sensors and --seconds do not apply to --web, which shows everything until Ctrl-C"
         )
-    return PageArguments(
-        address=arguments.address,
-        host="127.0.0.1",
-        port=console.PAGE_PORT if arguments.port is None else arguments.port,
-        allow_host=[],
-        open=False,
-        recordings=Path("recordings"),
-        handshake=None,
-        mjcf_options=arguments.mjcf_options,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
-    )
+    parser = Parser()
+    console.add_arguments(parser)
+    return console.run(parser.parse_args([arguments.address], arguments))  # the rest has its default
 
 
-async def _view(arguments: ViewArguments) -> None:
-    from urlab_client.aio import URLabClient
+async def _view(arguments: Namespace) -> None:
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
@@ -171,35 +126,30 @@ async def _view(arguments: ViewArguments) -> None:
     print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states skipped")
 
 
-def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
+def _make(client: URLabClient, arguments: Namespace) -> AsyncView:
     from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 
-    chosen = cameras(arguments.camera)
     if arguments.where == "viewer":
         return window_view(client, max_hz=arguments.max_hz)
+    options: dict[str, Any] = {
+        "cameras": cameras(arguments.camera),
+        "camera_hz": arguments.camera_hz,
+        "sensors": arguments.sensors,
+        "max_hz": arguments.max_hz,
+    }
     if arguments.where == "foxglove":
-        return foxglove_view(
-            client,
-            port=_FOXGLOVE_PORT if arguments.port is None else arguments.port,
-            cameras=chosen,
-            camera_hz=arguments.camera_hz,
-            sensors=arguments.sensors,
-            max_hz=arguments.max_hz,
-        )
+        return foxglove_view(client, port=_FOXGLOVE_PORT if arguments.port is None else arguments.port, **options)
     return rerun_view(
         client,
         save=arguments.save,
         connect=arguments.connect,
         web=arguments.page,
         web_port=_RERUN_PORT if arguments.port is None else arguments.port,
-        cameras=chosen,
-        camera_hz=arguments.camera_hz,
-        sensors=arguments.sensors,
-        max_hz=arguments.max_hz,
+        **options,
     )
 
 
-def _announcement(arguments: ViewArguments, view: AsyncView) -> str:
+def _announcement(arguments: Namespace, view: AsyncView) -> str:
     where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
     exposure = " Rerun serves it on every interface of this machine, to anyone." if arguments.page else ""
     return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{exposure}"

@@ -106,11 +106,7 @@ def _saved(folder: str | os.PathLike[str]) -> list[Path]:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[tuple[dict[str, Any], Any]]:
-    """Yield what an episode's file says and its arrays.
-
-    Raises:
-        ValueError: The file does not contain an episode.
-    """
+    """Yield what an episode's file says and its arrays."""
     try:
         with np.load(path, allow_pickle=False) as file:
             yield json.loads(str(file[_ABOUT])), file

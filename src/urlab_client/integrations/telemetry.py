@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.aio.client_types import CallOutcome, CallRecord
 
 if TYPE_CHECKING:

@@ -3,9 +3,9 @@
 Requires the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs with their own client or transport.
 """
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 
-need("mcp", "mcap", "PIL", "starlette", "uvicorn", extra="mcp")
+need("mcp", "mcap", "PIL", extra="mcp")
 
 from urlab_client.mcp.agent import Agent  # noqa: E402 - its libraries may be missing
 from urlab_client.mcp.call import Limits  # noqa: E402

@@ -19,14 +19,14 @@ from mcp.server.context import ServerRequestContext
 from mcp.shared.exceptions import MCPError
 from msgspec import Struct
 
+from urlab_client.console.lease import NotDriving
+from urlab_client.console.ops import encode
+from urlab_client.console.session import ConsoleSession
 from urlab_client.errors import ServerRestarted, SessionTakenOver, URLabError
 from urlab_client.mcp import editing, looking, moving
 from urlab_client.mcp.call import RESTARTED, TAKEN_OVER, Call, Caller, Limits, Stopped
 from urlab_client.mcp.declaration import Declared, Needs, declared
 from urlab_client.mcp.results import Moment
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import NotDriving
-from urlab_client.web.ops import encode
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette

@@ -13,10 +13,10 @@ import anyio
 from msgspec import Struct
 
 from urlab_client.aio.background import background_task
+from urlab_client.console.lease import NotDriving, Viewer
+from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import NotDriving, Viewer
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from urlab_client.console.messages import LogEntry
 from urlab_client.values.descriptions import Pose, SceneDescription
 from urlab_client.values.types import Contact
-from urlab_client.web.messages import LogEntry
 
 
 class Moment(Struct):

@@ -7,17 +7,19 @@ import contextlib
 import os
 import sys
 from collections.abc import AsyncGenerator
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from mcp.server.stdio import stdio_server
-from mcp.server.transport_security import TransportSecuritySettings
-from starlette.applications import Starlette
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from urlab_client.aio.background import background_thread
 from urlab_client.errors import URLabError
 from urlab_client.mcp.agent import Agent
-from urlab_client.web.access import Access, Guarded
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+    from urlab_client.web import Access
 
 _PATH = "/mcp"
 _CHUNK_BYTES = 65536
@@ -70,6 +72,11 @@ def http_application(agent: Agent, console: ASGIApp | None, access: Access) -> S
         console: The console, if any. The caller runs its lifespan.
         access: Host names and token for agents. Separate from the console's access, which allows more.
     """
+    from mcp.server.transport_security import TransportSecuritySettings
+    from starlette.applications import Starlette
+
+    from urlab_client.web.access import Guarded
+
     inner = agent.server.streamable_http_app(
         streamable_http_path=_PATH,
         transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `access` checks that

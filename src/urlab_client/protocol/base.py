@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from urlab_client.values.plain import Serializable
 from urlab_client.values.rotation import Quat, Vec3
-from urlab_client.values.serializable import Serializable
 
 Floats: TypeAlias = NDArray[np.float64]
 """A vector of numbers on the wire; here an array of shape `(n,)`."""

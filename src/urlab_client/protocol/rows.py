@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.topics import SCENE_SIZES, StreamTopic, TopicKind
 from urlab_client.values.layouts import INT32, BytesLike, check_size, damaged, floats32, vector
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 _JOINT = Layout("<ifff")
 _SENSOR = Layout("<ii")

@@ -1,7 +1,7 @@
 """Layout of the shared-memory regions: header, slots, publication order, torn reads, file names. No files, no mapping.
 
-For the shared-memory transports of client and server, which map files and hand the mapped bytes to `create` and
-`attach`. Which ops may travel this way is the registry's business.
+For the shared-memory transports of client and server, which map files and hand the mapped bytes to `attach`. Which ops
+may travel this way is the registry's business.
 
 A region is a header of 64 bytes and two or more slots of `stride` bytes, each a payload after its size:
 
@@ -16,6 +16,12 @@ A region is a header of 64 bytes and two or more slots of `stride` bytes, each a
 
 All little-endian, which is also the byte order of every platform MuJoCo runs on: sequence and slot number are read
 and written as single native words.
+
+Beside them may be a doorbell, a Unix stream socket over which our client and server wake each other; the plugin has
+none. The regions are authoritative; a ring is only a hint to check them. So a ring may be lost, doubled or late without
+harm. The server listens on `DOORBELL_FILE` in the directory of `req.shm`, and each byte is one message (`Ring`). Both
+sides send without blocking and drop a ring if the peer's buffer is full, because the peer then has rings waiting.
+Unknown bytes are ignored.
 """
 
 from __future__ import annotations
@@ -44,8 +50,11 @@ REQUEST_FILE = "req.shm"
 REPLY_FILE = "rep.shm"
 STATE_FILE = "state.shm"
 LIVE_DIRECTORY = "live"
+DOORBELL_FILE = "doorbell.sock"
+MAX_DOORBELL_PATH_BYTES = 103
+"""Longest path that every system's `sockaddr_un` holds; with a longer one there is no doorbell."""
 
-_HEADER = Layout("<IIIIQI36x")
+HEADER = Layout("<IIIIQI36x")
 _SIZE = Layout("<I")
 _SEQUENCE_MASK = (1 << 64) - 1
 _MIN_STATE_STRIDE = 16_384
@@ -57,8 +66,21 @@ Fence = Callable[[], None]
 """A full memory barrier between the loads and stores before the call and those after it."""
 
 
-def no_fence() -> None:
-    """Do nothing: the fence for processors that keep loads and stores in order as far as a region needs it (x86)."""
+class Ring:
+    """The doorbell's messages."""
+
+    REQUEST = b"q"
+    """From a client: it published a request."""
+    WANT_STATE = b"S"
+    """From a client, once: it wants `STATE`."""
+    WANT_CAMERAS = b"C"
+    """From a client, once: it wants `CAMERA`."""
+    REPLY = b"r"
+    """From the server: it published a reply, or accepted the connection."""
+    STATE = b"s"
+    """From the server: it published a snapshot."""
+    CAMERA = b"c"
+    """From the server: it published a picture."""
 
 
 class RegionNotReady(ProtocolError):
@@ -126,7 +148,7 @@ def parse_header(buffer: bytes | bytearray | memoryview) -> Header:
     head = bytes(buffer[:HEADER_SIZE])
     if len(head) < HEADER_SIZE:
         raise RegionNotReady(f"shared-memory region: {len(head)} bytes, expected a header of {HEADER_SIZE}.", raw=head)
-    magic, version, stride, n_buffers, sequence, latest = _HEADER.unpack(head)
+    magic, version, stride, n_buffers, sequence, latest = HEADER.unpack(head)
     if 0 in (magic, version, stride, n_buffers):
         raise RegionNotReady("shared-memory region: the header is not written yet.", raw=head)
     _check_field("magic", f"{magic:#010x}", f"{MAGIC:#010x}", ok=magic == MAGIC, raw=head)
@@ -150,7 +172,7 @@ def _check_field(field: str, value: object, expected: object, *, ok: bool, raw: 
 class Region:
     """A region in mapped memory, for its one writer or for any of its readers.
 
-    Made by `create` and `attach`. Stride and number of slots are those found then: a later change of the header by the
+    Made by `attach`. Stride and number of slots are those found then: a later change of the header by the
     other side cannot lead outside the buffer.
 
     Attributes:
@@ -239,17 +261,6 @@ class Region:
                 return Publication(sequence, payload)
         return None
 
-    def view_latest(self) -> Publication[memoryview] | None:
-        """Return a live view of the newest publication, None if there is none or the writer gets in the way.
-
-        For readers that do without a copy: what they saw counts only if `holds` says so afterwards.
-
-        Raises:
-            ProtocolError: If slot number or payload size are outside the region.
-        """
-        # The view is the point here; whether it is whole, `holds` tells at the time that matters.
-        return self.read_latest(take=lambda view: view)
-
     def holds(self, sequence: int) -> bool:
         """Return whether what was read since publication `sequence` came out is whole."""
         return not self._is_torn(sequence)
@@ -280,47 +291,12 @@ class Region:
             view.release()
 
 
-def create(buffer: bytearray | memoryview, stride: int, n_buffers: int = 2, *, fence: Fence) -> Region:
-    """Lay out an empty region in a writable buffer, erasing what it held.
-
-    The magic number is written last: until then readers find the region not ready.
-
-    Args:
-        buffer: At least `region_size(stride, n_buffers)` bytes, aligned to 8 as a mapping is.
-        stride: Bytes per slot, the size prefix included.
-        n_buffers: Number of slots, 2 to 64.
-        fence: The memory barrier of this processor; `no_fence` on x86.
-
-    Raises:
-        ValueError: If the numbers make no region, or the buffer is too short or read-only.
-    """
-    if not SIZE_PREFIX < stride < 1 << 32:
-        raise ValueError(f"stride {stride}, expected {SIZE_PREFIX + 1} to {(1 << 32) - 1}")
-    if not 2 <= n_buffers <= MAX_BUFFERS:
-        raise ValueError(f"{n_buffers} slots, expected 2 to {MAX_BUFFERS}")
-    view = memoryview(buffer)
-    if view.readonly:
-        raise ValueError("the buffer is read-only")
-    size = region_size(stride, n_buffers)
-    if len(view) < size:
-        raise ValueError(f"a buffer of {len(view)} bytes, expected {size} (64 + {stride} * {n_buffers})")
-    magic = view[:4].cast("I")
-    magic[0] = 0
-    fence()
-    view[SIZE_PREFIX:HEADER_SIZE] = _HEADER.pack(0, VERSION, stride, n_buffers, 0, 0)[SIZE_PREFIX:]
-    view[HEADER_SIZE:size] = bytes(size - HEADER_SIZE)
-    fence()
-    magic[0] = MAGIC
-    magic.release()
-    return Region(view, stride, n_buffers, fence)
-
-
 def attach(buffer: bytearray | memoryview, *, fence: Fence) -> Region:
     """Open the region that another process laid out in a buffer.
 
     Args:
         buffer: The whole region, aligned to 8 as a mapping is; read-only is enough for reading.
-        fence: The memory barrier of this processor; `no_fence` on x86.
+        fence: The memory barrier of this processor; a function that does nothing on x86.
 
     Raises:
         RegionNotReady: If it is still being created.
@@ -332,7 +308,6 @@ def attach(buffer: bytearray | memoryview, *, fence: Fence) -> Region:
 
 
 _SEPARATORS = re.compile(r"[/\\:\0]")
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]")
 
 
 def camera_file(articulation: str, camera: str) -> str:
@@ -345,16 +320,6 @@ def camera_file(articulation: str, camera: str) -> str:
         if name in {"", ".", ".."} or _SEPARATORS.search(name):
             raise ProtocolError(f"{name!r} cannot be part of a file name.")
     return f"cam_{articulation}_{camera}.shm"
-
-
-def safe_name(name: str) -> str:
-    """Return `name` with every character that may not stand in a key, topic or file name replaced.
-
-    Letters, digits, `_`, `-` and `.` stay; any other character becomes its code point in hexadecimal between dashes.
-    Two names can end up alike: the server makes the results unique.
-    """
-    safe = _UNSAFE.sub(lambda match: f"-{ord(match[0]):x}-", name)
-    return safe if safe.strip(".") else safe.replace(".", "-2e-")
 
 
 def region_directories(shm_session_dir: str | os.PathLike[str], file: str) -> tuple[PurePath, ...]:

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
     from urlab_client.server.initial_level import ModelError
     from urlab_client.server.limits import Limits
-    from urlab_client.server.physics.controllers import ControllerConfig
-    from urlab_client.server.render.opengl import RenderingUnavailable
     from urlab_client.server.rpc.dispatch import ServedRequest
     from urlab_client.server.simulated import SimulatedServer
     from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
     from urlab_client.server.transport.endpoint import PortInUse
+    from urlab_client.simulation.controller_config import ControllerConfig
+    from urlab_client.simulation.opengl import RenderingUnavailable
 
 _HOMES = {
     "bundled_models": "urlab_client.server.assets.bundled_robots",
@@ -31,8 +31,8 @@ _HOMES = {
     "Refuse": "urlab_client.server.faults",
     "ModelError": "urlab_client.server.initial_level",
     "Limits": "urlab_client.server.limits",
-    "ControllerConfig": "urlab_client.server.physics.controllers",
-    "RenderingUnavailable": "urlab_client.server.render.opengl",
+    "ControllerConfig": "urlab_client.simulation.controller_config",
+    "RenderingUnavailable": "urlab_client.simulation.opengl",
     "ServedRequest": "urlab_client.server.rpc.dispatch",
     "SimulatedServer": "urlab_client.server.simulated",
     "CurveServer": "urlab_client.server.transport.curve_authentication",

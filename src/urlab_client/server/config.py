@@ -13,9 +13,9 @@ from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
-from urlab_client.server.physics.controllers import ControllerConfig
-from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.transport.curve_authentication import CurveServer
+from urlab_client.simulation.appearance import RenderQuality
+from urlab_client.simulation.controller_config import ControllerConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class ServerConfig:
         for name in (index.actor_id, index.key, "*"):
             if name and name in self.controllers:
                 return self.controllers[name]
-        return None if index.controller is None else ControllerConfig.of(index.controller)
+        return None if index.controller is None else index.controller
 
     def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
         """Return the mode of an articulation's camera."""

@@ -37,11 +37,11 @@ from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.refusal import CompileFailed
-from urlab_client.server.render.appearance import Appearance
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
+from urlab_client.simulation.appearance import Appearance
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -7,7 +7,6 @@ functions; code tests the individual flag, never the dialect's name. Clients do 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,14 +19,7 @@ from urlab_client.protocol.base import DialectName, Op
 from urlab_client.protocol.messages.session import ForwardOk, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import dialect_ops
-
-_NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
-
-
-def cleaned_name(name: str) -> str:
-    """Return a name as the beta makes it public: ASCII letters, digits and underscores, not beginning with a digit."""
-    cleaned = _NOT_A_NAME.sub("_", name)
-    return f"_{cleaned}" if cleaned[:1].isdigit() else cleaned
+from urlab_client.values.names import cleaned_name
 
 
 class _Shape:

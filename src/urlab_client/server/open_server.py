@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._sandbox.landlock import is_available
+from urlab_client._sandbox.confinement import is_available
 from urlab_client.enums import PIEState, Transport
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo

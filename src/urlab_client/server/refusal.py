@@ -41,11 +41,7 @@ class Refusal(Exception):
 
 
 class CompileFailed(Exception):
-    """MuJoCo rejects the scene.
-
-    Attributes:
-        message: MuJoCo's message on one line.
-    """
+    """MuJoCo rejects the scene."""
 
     message: str
 

@@ -81,11 +81,7 @@ class DriverLease:
             return self._holds()
 
     def acquire(self, ttl_s: float) -> str:
-        """Take it and return its id.
-
-        Raises:
-            Refusal: `busy`.
-        """
+        """Take it and return its id."""
         with self._lock:
             if self._holds():
                 # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
@@ -94,11 +90,7 @@ class DriverLease:
             return self._id
 
     def release(self, lease_id: str) -> None:
-        """Give it back.
-
-        Raises:
-            Refusal: `bad_request` for any id but the holder's.
-        """
+        """Give it back."""
         with self._lock:
             if not self._holds() or lease_id != self._id:
                 raise Refusal("bad_request", "lease_id is not the id of the lease that is held")

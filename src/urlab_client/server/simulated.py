@@ -27,13 +27,13 @@ from urlab_client.server.initial_level import is_level
 from urlab_client.server.limits import Limits
 from urlab_client.server.open_server import OpenServer, open_server
 from urlab_client.server.physics.channels import channel_problem
-from urlab_client.server.physics.controllers import ControllerConfig
-from urlab_client.server.render.appearance import RenderQuality
-from urlab_client.server.render.opengl import find_backend
 from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
+from urlab_client.simulation.appearance import RenderQuality
+from urlab_client.simulation.controller_config import ControllerConfig
+from urlab_client.simulation.opengl import find_backend
 
 _FIRST_PORT: Final = 5559
 _PORTS_EACH: Final = 10

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.viewport import look
 from urlab_client.server.refusal import CompileFailed, Refusal
-from urlab_client.server.render.opengl import RenderingUnavailable, need_backend
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 
 LARGEST_PIXELS: Final = 16384
 """Longest side in pixels, the maximum of common drivers."""
@@ -33,10 +33,8 @@ def take_snapshot(
     """Draw the viewport.
 
     Args:
-        server: The server.
         dispatcher: Dispatcher of its requests, which is paused while the state is read.
         size: Width and height, pixels.
-        frame_all: Frame everything, keeping the direction of the viewport camera.
 
     Returns:
         Red, green, blue and alpha from the top, shape (height, width, 4).

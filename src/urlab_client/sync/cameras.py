@@ -18,7 +18,7 @@ from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -123,7 +123,8 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         """Stream the camera's pictures as the server publishes them.
 
         Servers of the alpha publish pictures in live mode only, the plugin without time or number. Newer servers
-        publish them in every mode, once per state: no pictures arrive while the simulation stands still.
+        publish them in every mode, once per state. While the simulation stands still, a camera that this call switches
+        on sends the present state if it has not sent it before; nothing else arrives.
 
         Args:
             policy: `latest`, or `all` within the limits of the buffer.

@@ -14,9 +14,10 @@ from urlab_client.aio.client_types import STATE_PORT, CallRecord, Diagnosis, Res
 from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState

@@ -6,8 +6,8 @@ from typing import Literal
 
 from msgspec import Struct
 
+from urlab_client.values.plain import Serializable
 from urlab_client.values.rotation import Quat, Vec3
-from urlab_client.values.serializable import Serializable
 
 JointKind = Literal["free", "ball", "slide", "hinge"]
 """Kind of a joint: six degrees of freedom, three rotations, one translation, or one rotation."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
@@ -20,6 +21,7 @@ WINDOWS_DEVICES: Final = frozenset(
 """Names that Windows keeps for devices, whatever follows their first dot."""
 
 _LISTED = 20
+_NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
 _MAX_FILE_NAME_BYTES: Final = 240
 
 
@@ -94,6 +96,12 @@ def is_file_name(name: str) -> bool:
         and len(name.encode()) <= _MAX_FILE_NAME_BYTES
         and name.partition(".")[0].rstrip(" ").upper() not in WINDOWS_DEVICES
     )
+
+
+def cleaned_name(name: str) -> str:
+    """Return a name as the beta makes it public: ASCII letters, digits and underscores, not beginning with a digit."""
+    cleaned = _NOT_A_NAME.sub("_", name)
+    return f"_{cleaned}" if cleaned[:1].isdigit() else cleaned
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

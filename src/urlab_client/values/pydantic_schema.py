@@ -15,9 +15,8 @@ import numpy as np
 from msgspec import NODEFAULT, Struct
 from numpy.typing import NDArray
 
-from urlab_client.values.plain_reading import kinds_of, read_array, read_bytes
+from urlab_client.values.plain import kinds_of, plain, read_array, read_bytes
 from urlab_client.values.schemas import field_notes, prose
-from urlab_client.values.serializable import plain
 
 Schema = dict[str, Any]
 

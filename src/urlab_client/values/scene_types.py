@@ -7,8 +7,8 @@ from typing import Protocol, TypeVar
 
 from msgspec import Struct
 
+from urlab_client.values.plain import Serializable
 from urlab_client.values.rotation import Quat, Vec3
-from urlab_client.values.serializable import Serializable
 
 A_co = TypeVar("A_co", covariant=True)
 

@@ -22,16 +22,17 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from urlab_client.console import mujoco_viewer
+from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
+from urlab_client.console.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
+from urlab_client.console.ops import SERVED, encode, parse
+from urlab_client.console.session import Audience, ConsoleSession
 from urlab_client.errors import URLabError
-from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.body_routes import BodyRoutes
-from urlab_client.web.console_session import Audience, ConsoleSession
-from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.explained_errors import explain_error
-from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
-from urlab_client.web.model_upload import ModelRoutes
-from urlab_client.web.ops import encode, openapi, parse, served
+from urlab_client.web.model_routes import ModelRoutes
+from urlab_client.web.openapi import openapi
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
 from urlab_client.web.route_group import Handler
@@ -207,7 +208,7 @@ class _Site:
         return _json(encode(list(self.console.entries)))
 
     async def _op(self, request: Request) -> Response:
-        op = served(request.path_params["op"])
+        op = SERVED.get(request.path_params["op"])
         if op is None:
             return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
         body = await _body(request)

@@ -8,8 +8,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from urlab_client.values.schemas import prose, schemas
-from urlab_client.web.messages import (
+from urlab_client.console.messages import (
     Ack,
     Ctrl,
     Log,
@@ -23,7 +22,8 @@ from urlab_client.web.messages import (
     World,
     You,
 )
-from urlab_client.web.ops import encode
+from urlab_client.console.ops import encode
+from urlab_client.values.schemas import prose, schemas
 
 _TOLD: tuple[type[Struct], ...] = (You, World, State, Status, Log, Refused, Pong)
 _SAID: tuple[type[Struct], ...] = (Ack, Ctrl, Ping, Name)

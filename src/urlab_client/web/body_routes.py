@@ -8,9 +8,9 @@ import msgspec
 from starlette.requests import Request
 from starlette.responses import Response
 
-from urlab_client.web.body_pushing import BodyPushing, Pick, Push
-from urlab_client.web.driving_lease import Viewer
-from urlab_client.web.ops import encode
+from urlab_client.console.body_pushing import BodyPushing, Pick, Push
+from urlab_client.console.lease import Viewer
+from urlab_client.console.ops import encode
 from urlab_client.web.route_group import Handler
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from urlab_client.console.lease import NotDriving
 from urlab_client.errors import (
     OutcomeUnknown,
     URLabConnectionError,
@@ -11,7 +12,6 @@ from urlab_client.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
-from urlab_client.web.driving_lease import NotDriving
 
 
 def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:

@@ -9,10 +9,10 @@ import anyio.to_thread
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
+from urlab_client.console.lease import Viewer
+from urlab_client.console.ops import encode
 from urlab_client.enums import StepMode
 from urlab_client.web.asyncapi import asyncapi
-from urlab_client.web.driving_lease import Viewer
-from urlab_client.web.ops import encode
 from urlab_client.web.route_group import Handler, RouteGroup
 
 _FLOWING_S = 5.0

@@ -14,9 +14,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
+from urlab_client.console.messages import state_message
+from urlab_client.console.ops import encode
 from urlab_client.integrations._feed.messages import EpisodeOutcome
-from urlab_client.web.messages import state_message
-from urlab_client.web.ops import encode
 from urlab_client.web.route_group import JOB, Handler, RouteGroup
 
 _T = TypeVar("_T")

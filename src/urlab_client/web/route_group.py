@@ -8,8 +8,8 @@ from typing import TypeAlias
 from starlette.requests import Request
 from starlette.responses import Response
 
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import Viewer
+from urlab_client.console.lease import Viewer
+from urlab_client.console.session import ConsoleSession
 
 JOB = "urlab_job"
 """Key in the scope of a long request: its description, for the warning if the server ends meanwhile."""

@@ -16,9 +16,9 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 from starlette.routing import Mount, Route
 
+from urlab_client.console.ops import encode
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.application import app, entrance, showing
-from urlab_client.web.ops import encode
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry

@@ -119,7 +119,7 @@ def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco
         model = mujoco.MjModel.from_xml_string(xml, dict(assets))
         forget_last_document()
         return model
-    from urlab_client.aio.model.compilation import compile_confined  # also run as a program
+    from urlab_client.aio.model.compilation import compile_confined  # rarely needed
 
     try:
         return _from_binary(compile_confined(xml, assets))

@@ -9,15 +9,14 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from urlab_client.aio.defaults import Timeout
-from urlab_client.aio.session.session import Session
-from urlab_client.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
+from urlab_client.errors import OutcomeUnknown, UnknownUpload
+from urlab_client.protocol.base import Request
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
@@ -28,6 +27,7 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelCommit,
     UploadModelCommitOk,
     UploadModelManifest,
+    UploadModelManifestOk,
 )
 from urlab_client.values.types import UploadProgress
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 OnUpload = Callable[[UploadProgress], object]
 """Callback invoked with the progress of an upload on the client's event loop."""
+
+Call = Callable[[Request[Any]], Awaitable[Any]]
 
 _ATTEMPTS: Final = 3
 
@@ -103,9 +105,7 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     return flat
 
 
-async def upload(
-    model: FlatModel, session: Session, timeout: Timeout, on_progress: OnUpload | None
-) -> UploadModelCommitOk:
+async def upload(model: FlatModel, call: Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
     """Send the parts of a model that the server lacks, and import the model.
 
     A chunk whose reply was lost is not sent again, because the server counts bytes. A new manifest then shows what is
@@ -113,18 +113,19 @@ async def upload(
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
-            upload_id = await _send_files(model, session, timeout, on_progress)
+            upload_id = await _send_files(model, call, on_progress)
             break
-        except (UnknownUpload, ConnectionLost, OutcomeUnknown):
+        except (UnknownUpload, OutcomeUnknown):
             if attempt == _ATTEMPTS:
                 raise
     else:
         raise AssertionError("the last attempt returns or raises")
-    return await session.call(UploadModelCommit(upload_id=upload_id), timeout=timeout)
+    imported: UploadModelCommitOk = await call(UploadModelCommit(upload_id=upload_id))
+    return imported
 
 
-async def _send_files(model: FlatModel, session: Session, timeout: Timeout, on_progress: OnUpload | None) -> str:
-    opened = await session.call(model.manifest, timeout=timeout)
+async def _send_files(model: FlatModel, call: Call, on_progress: OnUpload | None) -> str:
+    opened: UploadModelManifestOk = await call(model.manifest)
     missing = [("asset", name, model.files[name]) for name in dict.fromkeys(opened.need_assets)]
     if opened.need_xml:
         missing.insert(0, ("xml", "", model.xml))
@@ -136,7 +137,7 @@ async def _send_files(model: FlatModel, session: Session, timeout: Timeout, on_p
             request = UploadModelChunk(
                 upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
             )
-            await session.call(request, timeout=timeout)
+            await call(request)
             sent += len(chunk)
             if on_progress is not None:
                 on_progress(UploadProgress(file=name or "model.xml", sent_bytes=sent, total_bytes=total))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -379,7 +380,7 @@ class SceneNamespace(SceneOps):
                 hint="Copy the file to the server's machine and use import_xml().",
             )
         flat = await anyio.to_thread.run_sync(flatten, model, abandon_on_cancel=True)
-        reply = await upload(flat, self._session, timeout, on_progress)
+        reply = await upload(flat, partial(self._call, timeout=timeout), on_progress)
         return URLabBlueprint(
             class_path=reply.blueprint_class_path, short_name=reply.blueprint_short_name, imported_now=reply.imported
         )

@@ -32,7 +32,7 @@ from urlab_client.protocol.messages.session import Meta, Step
 from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pixels import decode_camera
+from urlab_client.values.pictures import decode_camera
 
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05

@@ -16,8 +16,8 @@ from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription
 from urlab_client.errors import NoActiveManager, URLabError, URLabRPCError
+from urlab_client.events import ClientEvent, PlayStarted, ServerLost, ServerReconnected
 from urlab_client.protocol.messages.runtime import ListKeyframes
-from urlab_client.protocol.messages.streams import ClientEvent, PlayStarted, ServerLost, ServerReconnected
 from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.values.layouts import BytesLike
 

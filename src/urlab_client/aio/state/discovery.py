@@ -25,9 +25,10 @@ from urlab_client.errors import (
     URLabError,
     URLabVersionMismatch,
 )
+from urlab_client.events import PlayStarted
 from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
-from urlab_client.protocol.messages.streams import PlayStarted, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import StateSnapshot, StreamPolicy
 from urlab_client.values.layouts import BytesLike
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

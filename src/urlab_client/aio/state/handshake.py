@@ -17,7 +17,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.session import CameraInfo, EntityInfo, HelloOk
 from urlab_client.values.names import owner_of
-from urlab_client.values.pixels import check_picture_size
+from urlab_client.values.pictures import check_picture_size
 
 if TYPE_CHECKING:
     import mujoco

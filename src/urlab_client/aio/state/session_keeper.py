@@ -18,15 +18,10 @@ from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.errors import ClientClosed, URLabConnectionError, URLabError, URLabTimeoutError
+from urlab_client.events import ClientEvent, PlayStarted, ServerLost, SessionLost
 from urlab_client.protocol.messages.runtime import ListKeyframes
 from urlab_client.protocol.messages.session import Hello
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    PlayStarted,
-    ServerLost,
-    SessionLost,
-    StreamPolicy,
-)
+from urlab_client.protocol.messages.streams import StreamPolicy
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

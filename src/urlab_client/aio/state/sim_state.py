@@ -33,6 +33,7 @@ from urlab_client.errors import (
     SessionTakenOver,
     URLabRPCError,
 )
+from urlab_client.events import PlayEnded, SessionLost, SessionOpened
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import (
     ArticulationState,
@@ -43,9 +44,9 @@ from urlab_client.protocol.messages.session import (
     StateReply,
     StepOk,
 )
-from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.sim_options import check_sim_options
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import Pixels, decode_camera
 from urlab_client.values.types import SimOptions
 
 log: logging.Logger = logging.getLogger("urlab_client.client")

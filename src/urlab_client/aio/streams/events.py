@@ -11,7 +11,7 @@ from urlab_client.aio.arguments import collection
 from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import client_closed
-from urlab_client.protocol.messages.streams import (
+from urlab_client.events import (
     ClientEvent,
     PlayEnded,
     PlayStarted,
@@ -22,9 +22,9 @@ from urlab_client.protocol.messages.streams import (
     ServerSilent,
     SessionLost,
     SessionOpened,
-    StreamPolicy,
     TaskFailed,
 )
+from urlab_client.protocol.messages.streams import StreamPolicy
 from urlab_client.values.names import did_you_mean
 
 _KINDS: dict[str, type[ClientEvent]] = {

@@ -21,7 +21,7 @@ from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.protocol.messages.streams import StreamPolicy
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pixels import PictureStamp, Pixels, picture_stamp
+from urlab_client.values.pictures import PictureStamp, Pixels, picture_stamp
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 

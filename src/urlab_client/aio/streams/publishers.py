@@ -12,14 +12,14 @@ from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.events import EventBus
 from urlab_client.aio.streams.rows import RowFilter, RowSource
 from urlab_client.aio.streams.sources import Camera, CameraSource, OwnSteps, StateSource
-from urlab_client.aio.transport.curve import ClientKeys
-from urlab_client.aio.transport.regions import Regions
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.connection import ClientKeys
+from urlab_client.aio.transport.shm_regions import ServerRegions
+from urlab_client.aio.transport.shm_streams import Regions
 from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.values.pixels import Pixels
+from urlab_client.values.pictures import Pixels
 
 
 class SharedFrame:
@@ -69,7 +69,7 @@ class Publishers:
         live: Callable[[], bool] = lambda: True,
         features: Callable[[], Features] = Features,
         keys: ClientKeys | None = None,
-        memory: SharedMemoryRegions | None = None,
+        memory: ServerRegions | None = None,
     ) -> None:
         self.default_timeout = default_timeout
         self.subscriptions: Subscriptions = Subscriptions(keys)

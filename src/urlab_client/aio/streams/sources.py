@@ -11,18 +11,16 @@ from typing import TypeVar
 
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.handler import Source
-from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
+from urlab_client.aio.transport.shm_streams import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.enums import CameraMode, known
 from urlab_client.errors import ProtocolError
-from urlab_client.protocol import doorbell
 from urlab_client.protocol.messages.session import CameraInfo, StateReply
 from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot, StreamItem
-from urlab_client.protocol.shm import STATE_FILE, camera_file
+from urlab_client.protocol.shm import STATE_FILE, Ring, camera_file
 from urlab_client.protocol.topics import STATE_FULL, camera_filter, resolve_endpoint
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.pixels import decode_camera
+from urlab_client.values.pictures import PictureMemory, decode_camera
 
 T_co = TypeVar("T_co", bound=StreamItem, covariant=True)
 
@@ -148,7 +146,7 @@ class StateSource(PublishedSource[StateSnapshot]):
         return Subscription(self._endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
 
     def place(self) -> Place:
-        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+        return Place(STATE_FILE, STATE_FULL, Ring.STATE)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Skip snapshots that already arrived: both deliver them when the region takes over from the socket."""
@@ -256,7 +254,7 @@ class CameraSource(PublishedSource[CameraSample]):
         topic = self.camera.info.zmq_topic
         separator = "/camera/" if "/camera/" in topic else "/"
         articulation, _, camera = topic.strip().partition(separator)
-        return Place(camera_file(articulation, camera), camera_filter(topic), doorbell.CAMERA)
+        return Place(camera_file(articulation, camera), camera_filter(topic), Ring.CAMERA)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Skip a picture that was already read in place of its predecessor."""

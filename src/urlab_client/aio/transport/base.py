@@ -8,9 +8,9 @@ from typing import Protocol, TypeAlias
 
 from msgspec import Struct
 
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent
 
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
 """Callback invoked with a future when the caller abandons a request that was sent. The future receives the late reply,

@@ -15,16 +15,14 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Final, NamedTuple
 
 from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
-from urlab_client.aio.transport.busy_poll import BusyPoll
-from urlab_client.aio.transport.delivery import deliver
-from urlab_client.aio.transport.mapped_region import RegionInUse
-from urlab_client.aio.transport.poller import ReplyPoll
-from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
-from urlab_client.aio.transport.server_regions import SharedMemoryRegions
-from urlab_client.aio.transport.shm_way import way_of
+from urlab_client.aio.transport.shm_channel import RegionChannel, answers, envelope_of, succeeded
+from urlab_client.aio.transport.shm_regions import RegionInUse, ServerRegions
+from urlab_client.aio.transport.waiting import BusyPoll
 from urlab_client.errors import (
     ClientClosed,
     ConnectionLost,
@@ -34,11 +32,10 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol import doorbell
-from urlab_client.protocol.base import Effect, Op
-from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
-from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
+from urlab_client.events import ClientEvent, ServerLost
+from urlab_client.protocol.base import Effect, Needs, Op
+from urlab_client.protocol.messages.session import HelloOk, StateReply
+from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, Ring
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
@@ -52,25 +49,53 @@ _SETTLE_LOOK_S = 1e-3
 # No request over shared memory takes this long, so nothing reads these regions any more.
 _DEAD_S = 30.0
 _IDLE_S = 0.5
-# Poll at this interval in any case, so that a lost ring delays a reply no longer.
-_GLANCE_S = 0.05
+# Look for the reply at this interval in any case, so that a lost ring delays it no longer.
+_LOOK_S = 0.05
 
-# Time to poll on the loop before the thread takes over.
+# Time to poll on the loop before it sleeps.
 _SPIN_S = 400e-6
 _LONGEST_SPIN_S = 2e-3
 
+# Ops whose replies grow with the scene, regardless of their earlier size.
+_UNBOUNDED: Final = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
+# Chunks are larger than slots, and a chunk that was executed without a reply must not be sent again.
+_UPLOADS: Final = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 
-class _Pending:
+
+class Route(NamedTuple):
+    """Properties of an op that determine the transport of its requests.
+
+    Attributes:
+        zmq: Why its requests always use ZeroMQ; empty if they may use shared memory.
+        pictures: Whether its requests may ask for pictures, which do not fit.
+        state: Whether its replies contain the state, whose size is nearly constant.
+    """
+
+    zmq: str
+    pictures: bool
+    state: bool
+
+
+@cache
+def route_of(op: Op) -> Route:
+    """Return the properties of an op that determine its transport."""
+    zmq = ""
+    if op.needs is Needs.EDITOR:
+        zmq = "editor op"
+    elif op.ns == "scene" or op.name in _UPLOADS:
+        zmq = "upload"  # its chunks and its reply exceed a slot
+    elif op.name in _UNBOUNDED:
+        zmq = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
+    return Route(zmq, op.name == "step", issubclass(op.reply, StateReply))
+
+
+class _Pending(NamedTuple):
     """The request in progress."""
 
-    __slots__ = ("at", "deadline", "future", "op", "watch")
-
-    def __init__(self, op: Op, future: asyncio.Future[bytes], at: float, deadline: float | None) -> None:
-        self.op = op
-        self.future = future
-        self.at = at
-        self.deadline = deadline
-        self.watch: ReplyPoll | None = None
+    op: Op
+    future: asyncio.Future[bytes]
+    at: float
+    deadline: float | None
 
 
 class ShmTransport:
@@ -78,26 +103,25 @@ class ShmTransport:
 
     Args:
         inner: The other transport, which also detects whether the server is alive.
-        memory: Location of the server's regions.
+        regions: Location of the server's regions.
     """
 
-    def __init__(self, inner: RequestTransport, memory: SharedMemoryRegions) -> None:
+    def __init__(self, inner: RequestTransport, regions: ServerRegions) -> None:
         self.on_event: Callable[[ClientEvent], None] | None = None
         self.stats: TransportStats = inner.stats
         self._inner = inner
-        self._memory = memory
+        self._regions = regions
         inner.on_event = self._on_event
-        memory.rung[doorbell.REPLY].append(self._on_ring)
+        regions.on_ring[Ring.REPLY].append(self._on_news)
         self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
         self._used_at = 0.0
         self._pending: _Pending | None = None
-        # One of each for all requests: most replies arrive long before, and creating and cancelling a timer takes a
-        # tenth of the time of a step.
+        # One for all requests: most replies arrive long before, and creating and cancelling a timer takes a tenth of
+        # the time of a step.
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
-        self._glances: asyncio.TimerHandle | None = None
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
@@ -131,12 +155,12 @@ class ShmTransport:
         Raises:
             URLabConnectionError: The regions do not exist or are not valid.
         """
-        moved = self._memory.follow(hello)
+        moved = self._regions.follow(hello)
         self._largest_state = 0
         self._refused.clear()
         if self._channel is not None and (moved or not self._channel.intact() or self._channel.replaced()):
             self._drop("the server moved")
-        if self._memory.directory is None:
+        if self._regions.directory is None:
             self._obstacle = "play has not begun"
             return
         loop = asyncio.get_running_loop()
@@ -159,10 +183,12 @@ class ShmTransport:
         channel = self._channel
         if channel is None:
             return
-        self._memory.connect_bell()
+        self._regions.connect_doorbell()
         give_up = loop.time() + _SETTLE_S
-        while self._settling(channel) and loop.time() < give_up:  # noqa: ASYNC110 - a region has no event
-            await asyncio.sleep(_SETTLE_LOOK_S)
+        while loop.time() < give_up and self._channel is channel and self._pending is None:
+            if self._is_clean(channel):
+                return
+            await asyncio.sleep(_SETTLE_LOOK_S)  # a region has no event
 
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
@@ -170,33 +196,31 @@ class ShmTransport:
         """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
         if self._channel is not None and self._channel.abandoned_at is not None:
             await self._let_it_end(op, deadline)
-        way = way_of(op)
-        pictures = way.pictures and b"include_cameras" in frame
-        detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
-        if not detour and self._inner.owed:
-            detour = "behind an abandoned request"
-        channel = None
-        if not detour:
+        route = route_of(op)
+        pictures = route.pictures and b"include_cameras" in frame
+        why_zmq = route.zmq or ("pictures" if pictures else self._refused.get(op.name, ""))
+        if not why_zmq and self._inner.owed:
+            why_zmq = "behind an abandoned request"
+        if not why_zmq:
             loop = asyncio.get_running_loop()
             now = loop.time()
             channel = self._usable_channel(now)
             if channel is None:
-                detour = self._obstacle
+                why_zmq = self._obstacle
             elif len(frame) > channel.limit:
-                detour = "request too large"
-            elif way.state and not 0 < self._largest_state * _GROWTH <= channel.limit:
-                detour = "reply may be too large" if self._largest_state else "size of the reply not known yet"
+                why_zmq = "request too large"
+            elif route.state and not 0 < self._largest_state * _GROWTH <= channel.limit:
+                why_zmq = "reply may be too large" if self._largest_state else "size of the reply not known yet"
             else:
-                pending = _Pending(op, loop.create_future(), now, deadline)
-                answer = await self._over_shm(channel, frame, pending, loop)
-                detour = self._refusal(answer, op)
-                if not detour:
-                    if way.state and len(answer) > self._largest_state:
+                answer = await self._over_shm(channel, frame, _Pending(op, loop.create_future(), now, deadline), loop)
+                why_zmq = self._refusal(answer, op)
+                if not why_zmq:
+                    if route.state and len(answer) > self._largest_state:
                         self._largest_state = len(answer)
                     return answer
-        self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
+        self.stats.over_zmq[why_zmq] = self.stats.over_zmq.get(why_zmq, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if way.state and not pictures and _succeeded(answer, op):  # a refusal does not show the size of the state
+        if route.state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
@@ -206,13 +230,11 @@ class ShmTransport:
         closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
         self._fail(lambda _: closed)
         self._drop("closed")
-        for timer in (self._timer, self._glances):
-            if timer is not None:
-                timer.cancel()
-        self._memory.close()
+        if self._timer is not None:
+            self._timer.cancel()
         await self._inner.aclose()
 
-    # Which way
+    # Routing
 
     def _usable_channel(self, now: float) -> RegionChannel | None:
         """Return the channel if it can be used now."""
@@ -225,7 +247,7 @@ class ShmTransport:
             self._drop("the regions were replaced")
             channel = None
         if channel is None:
-            if self._memory.directory is None or now < self._retry_at or not self._inner.connected:
+            if self._regions.directory is None or now < self._retry_at or not self._inner.connected:
                 return None
             try:
                 channel = self._open()
@@ -238,10 +260,6 @@ class ShmTransport:
                 self._obstacle = "waiting for an old reply"
             return None
         return channel
-
-    def _settling(self, channel: RegionChannel) -> bool:
-        """Return whether `channel` is still in use, free of other tasks' requests, and not yet clean."""
-        return self._channel is channel and self._pending is None and not self._is_clean(channel)
 
     async def _let_it_end(self, op: Op, deadline: float | None) -> None:
         """Wait until the server is done with the request whose caller gave up.
@@ -280,17 +298,16 @@ class ShmTransport:
         """Open the regions. Raises the same errors as `MappedRegion`."""
         paths: list[Path] = []
         for file in (REQUEST_FILE, REPLY_FILE):
-            path = self._memory.find(file)
+            path = self._regions.find(file)
             if path is None:
-                paths_tried = ", ".join(map(str, self._memory.candidates(file)))
+                paths_tried = ", ".join(map(str, self._regions.candidates(file)))
                 raise FileNotFoundError(f"there is no {paths_tried}")
             paths.append(path)
-        self._channel = RegionChannel(paths[0], paths[1], self._memory.events(paths[0]))
-        self._memory.connect_bell()
+        self._channel = RegionChannel(paths[0], paths[1], self._regions.events(paths[0]))
+        self._regions.connect_doorbell()
         self._used_at = asyncio.get_running_loop().time()
-        log.info(
-            "shared memory in %s, %s", paths[0].parent, "with a doorbell" if self._memory.bell else "without a doorbell"
-        )
+        with_doorbell = "without" if self._regions.doorbell is None else "with"
+        log.info("shared memory in %s, %s a doorbell", paths[0].parent, with_doorbell)
         return self._channel
 
     def _put_off(self, error: Exception) -> None:
@@ -300,7 +317,7 @@ class ShmTransport:
 
     def _refusal(self, answer: bytes, op: Op) -> str:
         """Return why a reply requires sending the request over ZMQ; empty if the reply is final."""
-        if answer.startswith(opening_of(op), 1):
+        if succeeded(answer, op):
             return ""
         code = envelope_of(answer).code
         if code == "wrong_transport":  # the server did not execute the request
@@ -316,7 +333,7 @@ class ShmTransport:
     async def _over_shm(
         self, channel: RegionChannel, frame: bytes, pending: _Pending, loop: asyncio.AbstractEventLoop
     ) -> bytes:
-        op, deadline = pending.op, pending.deadline
+        op, future, _, deadline = pending
         self._pending = pending
         # If the wait ends without the reply, that reply is still outstanding.
         channel.dirty = True
@@ -326,23 +343,18 @@ class ShmTransport:
             self.stats.sent += 1
             self.stats.over_shm += 1
             self._ring()
-            if deadline is not None and (self._timer is None or deadline < self._due):
-                self._expire_at(loop, deadline)
+            if self._timer is None or (deadline is not None and deadline < self._due):
+                self._look_at(loop, deadline)
             awake = self._busy_poll.pays(op.name)
             if awake:
-                await self._busy_poll.look(op.name, pending.future, lambda: self._look_at(channel))
-            if not pending.future.done():
-                if self._memory.bell is None:
-                    self._watch()
-                if self._glances is None:
-                    self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
-            answer = await pending.future
+                await self._busy_poll.look(op.name, future, self._look)
+            if not future.done() and self._regions.doorbell is None:
+                self._on_news()
+            answer = await future
         except BaseException:
             channel.abandoned_at = loop.time()
             raise
         finally:
-            if pending.watch is not None:
-                self._unwatch()
             self._pending = None
             self._used_at = loop.time()
         channel.dirty = False
@@ -351,72 +363,24 @@ class ShmTransport:
         return answer
 
     def _ring(self) -> None:
-        bell = self._memory.bell
-        if bell is not None:
-            bell.ring(doorbell.REQUEST)
+        if self._regions.doorbell is not None:
+            self._regions.doorbell.ring(Ring.REQUEST)
 
-    def _look_at(self, channel: RegionChannel) -> None:
-        # Between two polls another task may have blocked the loop for as long as a server takes to restart.
-        if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
-            self._look()
-
-    def _glance(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._glances = None
-        pending = self._pending
-        if pending is None:
-            return
-        self._glances = loop.call_later(_GLANCE_S, self._glance, loop)  # first, whatever happens below
+    def _on_news(self) -> None:
+        """Deliver the reply if it has arrived; otherwise wait for the next news."""
         self._look()
-        if not pending.future.done() and self._channel is not None and self._channel.replaced():
-            self._drop("the regions were replaced")
-
-    def _watch(self) -> None:
-        """Let the thread poll for the reply."""
-        pending, channel = self._pending, self._channel
-        if pending is None or pending.future.done() or pending.watch is not None or channel is None:
-            return
-        replies, event = channel.replies, channel.reply_event
-
-        def news() -> bool:
-            return not replies.intact() or replies.region.sequence != channel.seen
-
-        pending.watch = ReplyPoll(news, self._take, event.wait if event.exists else None)
-        self._memory.waiter.add(pending.watch)
-
-    def _unwatch(self) -> None:
-        if self._pending is not None and self._pending.watch is not None:
-            self._memory.waiter.remove(self._pending.watch)
-            self._pending.watch = None
-
-    def _on_ring(self) -> None:
-        if self._memory.bell is None:
-            self._look()
-            self._watch()
-        else:
-            self._take()
-
-    def _take(self) -> None:
-        """Deliver the reply if it has arrived and resume its task immediately. A callback of the loop."""
-        pending = self._pending
-        answer = self._found()
-        if answer is not None and pending is not None:
-            deliver(pending.future, answer)
+        waits = self._pending is not None and not self._pending.future.done()
+        if waits and self._regions.doorbell is None and self._channel is not None:
+            self._channel.expect(self._on_news, self._regions.tell)
 
     def _look(self) -> None:
-        """Deliver the reply if it has arrived; its task resumes in the loop's next iteration."""
-        pending = self._pending
-        answer = self._found()
-        if answer is not None and pending is not None:
-            pending.future.set_result(answer)
-
-    def _found(self) -> bytes | None:
-        """Return the reply to the request in progress if it has arrived and the request still waits."""
+        """Deliver the reply if it has arrived."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.future.done() or channel is None:
-            return None
+            return
         if not channel.replies.intact():
             self._drop("the reply region was cut off")
-            return None
+            return
         try:
             found = channel.replies.region.read_latest(channel.seen)
         except ProtocolError as error:
@@ -424,62 +388,46 @@ class ShmTransport:
                 ProtocolError(f"{pending.op.name}: {channel.replies.path}: {error.args[0]}", op=pending.op.name)
             )
             self._drop("the reply region is damaged")
-            return None
+            return
         if found is None:
             sequence = channel.replies.region.sequence
             if sequence == 0:  # reinitialised: it counts from one again
                 channel.seen = 0
             if sequence != channel.seen:  # it kept changing while it was read
                 asyncio.get_running_loop().call_soon(self._look)
-            elif pending.watch is not None:
-                pending.watch.resume()
-            return None
+            return
         channel.seen = found.sequence
-        if self._answers(found.payload, pending.op):
-            return found.payload
-        self.stats.late += 1
-        if pending.watch is not None:
-            pending.watch.resume()
-        log.debug("%s: dropped a reply to another request", channel.replies.path)
-        return None
+        if answers(found.payload, pending.op):
+            pending.future.set_result(found.payload)
+        else:
+            self.stats.late += 1
+            log.debug("%s: dropped a reply to another request", channel.replies.path)
 
-    @staticmethod
-    def _answers(reply: bytes, op: Op) -> bool:
-        if reply.startswith(opening_of(op), 1):
-            return True
-        found = envelope_of(reply)
-        if not found.op:  # not a reply to any request: decoding it raises, instead of waiting in vain
-            return True
-        if found.op == "error":
-            return not (found.code == "session_expired" and SYNC_PREFIX in found.message)
-        return found.op == op.reply_name
-
-    def _expire_at(self, loop: asyncio.AbstractEventLoop, deadline: float) -> None:
+    def _look_at(self, loop: asyncio.AbstractEventLoop, deadline: float | None) -> None:
+        """Look for the reply after a pause, or at the deadline."""
         if self._timer is not None:
             self._timer.cancel()
-        self._due = deadline
-        self._timer = loop.call_at(deadline, self._expire, loop)
+        self._due = loop.time() + _LOOK_S
+        if deadline is not None:
+            self._due = min(self._due, deadline)
+        self._timer = loop.call_at(self._due, self._on_timer, loop)
 
-    def _expire(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _on_timer(self, loop: asyncio.AbstractEventLoop) -> None:
         self._timer = None
         pending = self._pending
-        if pending is None or pending.deadline is None:
+        if pending is None:
             return
-        if pending.deadline > self._due:  # not the current time: the loop may be early by its resolution
-            self._expire_at(loop, pending.deadline)
-            return
-        self._look()
+        # Not compared to the current time: the loop may be early by its resolution.
+        expired = pending.deadline is not None and pending.deadline <= self._due
+        if not expired:
+            self._look_at(loop, pending.deadline)  # first, whatever happens below
+        self._on_news()
         if pending.future.done():
             return
-        waited_ms = 1000 * (pending.deadline - pending.at)
-        executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
-        pending.future.set_exception(
-            URLabTimeoutError(
-                f"{pending.op.name}: no reply in shared memory within {waited_ms:.0f} ms.{executed}",
-                op=pending.op.name,
-                hint="The server is busy or blocked; allow more time with timeout=…",
-            )
-        )
+        if expired:
+            pending.future.set_exception(_too_late(pending, self._due))
+        elif self._channel is not None and self._channel.replaced():
+            self._drop("the regions were replaced")
 
     # When the server goes
 
@@ -493,11 +441,10 @@ class ShmTransport:
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
         self._fail(self._lost)
-        self._unwatch()
         if self._channel is not None:
             self._channel.close()
             self._channel = None
-        self._memory.disconnect()
+        self._regions.close()
 
     def _fail(self, error: Callable[[Op], URLabError]) -> None:
         pending = self._pending
@@ -511,8 +458,13 @@ class ShmTransport:
         return OutcomeUnknown(text, op=op.name, hint="It may have been executed: call discover() and check the state.")
 
 
-def _succeeded(answer: bytes, op: Op) -> bool:
-    return answer.startswith(opening_of(op), 1) or envelope_of(answer).op == op.reply_name
+def _too_late(pending: _Pending, now: float) -> URLabTimeoutError:
+    executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
+    return URLabTimeoutError(
+        f"{pending.op.name}: no reply in shared memory within {1000 * (now - pending.at):.0f} ms.{executed}",
+        op=pending.op.name,
+        hint="The server is busy or blocked; allow more time with timeout=…",
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -15,17 +15,22 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import zmq
 from msgspec import Struct
-from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._platform.signals import uninterrupted
 from urlab_client.aio.background import running_loop
-from urlab_client.aio.transport import connection_status
-from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
-from urlab_client.aio.transport.readiness import Readiness, watch_socket
+from urlab_client.aio.transport.connection import (
+    FAILED_HANDSHAKES,
+    RECONNECT_MAX_MS,
+    SERVER_KEY_HINT,
+    UNANSWERED,
+    ClientKeys,
+    Connection,
+    Context,
+)
 from urlab_client.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.values.layouts import BytesLike
 
@@ -43,7 +48,7 @@ _BATCH_BYTES = 8 * 1024 * 1024
 
 # A context that is garbage-collected before its sockets waits for them forever. This set keeps contexts alive until
 # they are closed, even if a client is never closed.
-_contexts: set[zmq.Context[zmq.Socket[bytes]]] = set()
+_contexts: set[Context] = set()
 
 # Only a malfunctioning server produces an endless number of topics; then clear the cache.
 _REMEMBERED_TOPICS = 4096
@@ -143,7 +148,7 @@ class _Subscriber:
 
     def __init__(
         self,
-        context: zmq.Context[zmq.Socket[bytes]],
+        context: Context,
         loop: asyncio.AbstractEventLoop,
         endpoint: str,
         *,
@@ -153,33 +158,18 @@ class _Subscriber:
         self.endpoint = endpoint
         self.connected = False
         self.connects = 0
-        self.obstacle = connection_status.UNANSWERED
+        self.obstacle = UNANSWERED
         self._loop = loop
         self._copy = not pictures
         self._handlers: dict[MessageHandler, Subscription] = {}
         self._routes: dict[bytes, tuple[MessageHandler, ...]] = {}
         self._down_since: float | None = None
-        self._retrying = False
         self._closed = False
-        self._attempts = connection_status.Attempts(loop.time())
         socket = self._socket = context.socket(zmq.SUB)
-        connection_status.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
-        # A full queue delays heartbeats until the connection is closed. Without this option, libzmq 4.3.5 (issue 3937)
-        # aborts the process when the queue is read after that, because the next connection would reuse the old pipe.
-        socket.immediate = True
         socket.maxmsgsize = _MAX_MESSAGE_BYTES
-        if keys is not None:
-            keys.protect(socket)
-        self._monitor = socket.get_monitor_socket(connection_status.WATCHED)
-        self._watched: tuple[Readiness, ...] = ()
-        try:
-            socket.connect(endpoint)
-        except zmq.ZMQError as error:
-            self.close()
-            raise ValueError(f"{endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
-        self._watched = watch_socket(loop, self._monitor, self._on_event), watch_socket(loop, socket, self._on_readable)
-        loop.call_soon(self._on_event)
+        self._connection = Connection(loop, socket, endpoint, keys, self._note)
+        self._connection.watch(self._on_readable)
 
     @property
     def idle(self) -> bool:
@@ -202,11 +192,7 @@ class _Subscriber:
 
     def close(self) -> None:
         self._closed = True
-        for readiness in self._watched:
-            readiness.close()
-        self._socket.disable_monitor()
-        self._monitor.close(linger=0)
-        self._socket.close(linger=0)
+        self._connection.close()
 
     def _on_readable(self) -> None:
         socket, touched = self._socket, dict[MessageHandler, None]()
@@ -220,7 +206,7 @@ class _Subscriber:
                 topic = socket.recv(zmq.NOBLOCK)
                 if messages == 0 or not self.connected:
                     # The event of a new connection precedes its messages, but arrives on another socket.
-                    self._on_event()
+                    self._connection.read_events()
                 messages += 1
                 size += self._take(topic, touched)
         finally:
@@ -262,14 +248,7 @@ class _Subscriber:
         self._routes[topic] = route
         return route
 
-    def _on_event(self) -> None:
-        while not self._closed and cast("int", self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            message = cast("dict[str, Any]", recv_monitor_message(self._monitor, zmq.NOBLOCK))
-            self._note(zmq.Event(message["event"]), message["value"])
-
-    def _note(self, event: zmq.Event, value: int) -> None:
-        obstacle = self._attempts.obstacle(event, value, self._loop.time())
-        self._retrying = self._retrying or event in connection_status.RETRYING
+    def _note(self, event: zmq.Event, value: int, obstacle: str | None) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self.connected = True
             self.connects += 1
@@ -286,28 +265,16 @@ class _Subscriber:
                 log.info("lost %s; reconnecting", self.endpoint)
                 self.connected = False
                 self._down_since = self._loop.time()
-                self._retrying = False
-                self._loop.call_later(connection_status.REVIVE_S, self._revive)
+                self._connection.revive(was_connected=True)
                 self._tell_line()
         elif obstacle is not None and self.connects == 0:
-            self.obstacle = (
-                f"{obstacle}. {SERVER_KEY_HINT}" if event in connection_status.FAILED_HANDSHAKES else obstacle
-            )
+            self.obstacle = f"{obstacle}. {SERVER_KEY_HINT}" if event in FAILED_HANDSHAKES else obstacle
             if event is not zmq.Event.CONNECTED:  # the handshake may still follow
                 for handler in tuple(self._handlers):
                     handler.on_refusal()
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
             # ZeroMQ does not retry on its own, but the server may learn the key.
-            self._loop.call_later(connection_status.RECONNECT_MAX_MS / 1000, self._reconnect)
-
-    def _reconnect(self) -> None:
-        if not self._closed:
-            connection_status.reconnect(self._socket, self.endpoint)
-
-    def _revive(self) -> None:
-        self._on_event()
-        if not self._retrying:
-            self._reconnect()
+            self._loop.call_later(RECONNECT_MAX_MS / 1000, self._connection.reconnect)
 
     def _tell_line(self) -> None:
         for handler in tuple(self._handlers):
@@ -323,7 +290,7 @@ class Subscriptions:
 
     def __init__(self, keys: ClientKeys | None = None) -> None:
         self._keys = keys
-        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._context: Context | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
         self._attached: dict[MessageHandler, tuple[Subscription, Callable[[], Subscription]]] = {}

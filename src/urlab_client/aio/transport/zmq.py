@@ -12,20 +12,24 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import zmq
 from msgspec import Struct
-from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client.aio.background import running_loop
-from urlab_client.aio.transport import connection_status
-from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport.base import LateReply, TransportStats
-from urlab_client.aio.transport.busy_poll import BusyPoll
-from urlab_client.aio.transport.curve import ClientKeys
-from urlab_client.aio.transport.delivery import deliver
-from urlab_client.aio.transport.readiness import Readiness, watch_socket
+from urlab_client.aio.transport.connection import (
+    FAILED_HANDSHAKES,
+    UNANSWERED,
+    ClientKeys,
+    Connection,
+    Context,
+    Socket,
+    borrow_context,
+    give_back_context,
+)
+from urlab_client.aio.transport.waiting import BusyPoll, Watch
 from urlab_client.errors import (
     AuthenticationFailed,
     ClientClosed,
@@ -35,17 +39,10 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
 from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.streams import (
-    ClientEvent,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-)
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
@@ -93,11 +90,10 @@ class ZmqTransport:
         self._rejections = 0
         self._given_up = False
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
-        self._socket: zmq.Socket[bytes] | None = None
-        self._monitor: zmq.Socket[bytes] | None = None
-        self._replies: Readiness | None = None
-        self._events: Readiness | None = None
+        self._context: Context | None = None
+        self._connection: Connection | None = None
+        self._socket: Socket | None = None
+        self._replies: Watch | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
@@ -110,12 +106,10 @@ class ZmqTransport:
         self._get: _Get | None = None
         self._connected = False
         self._closed = False
-        self._obstacle = connection_status.UNANSWERED
-        self._attempts = connection_status.Attempts(0.0)
+        self._obstacle = UNANSWERED
         self.lost_at: float = 0.0
         self.refused: bool = False
         self._silent_since: float | None = None
-        self._retrying = False
         self.on_event: Callable[[ClientEvent], None] | None = None
 
     @property
@@ -159,7 +153,7 @@ class ZmqTransport:
                 send(frame, _NOBLOCK)
             except zmq.Again:
                 # The connection was lost and its event has not been read yet, or the queue is full.
-                self._on_event()
+                self._read_events()
                 if self._connected:
                     raise self._clogged(op) from None
                 continue
@@ -210,17 +204,11 @@ class ZmqTransport:
         closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Create a new client.")
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
-        if self._loop is None or self._socket is None or self._monitor is None or self._context is None:
-            return
         if self._timer is not None:
             self._timer.cancel()
-        for readiness in (self._replies, self._events):
-            if readiness is not None:
-                readiness.close()
-        self._socket.disable_monitor()
-        self._monitor.close(linger=0)
-        self._socket.close(linger=0)
-        shared_context.give_back(self._context)
+        if self._connection is not None and self._context is not None:
+            self._connection.close()
+            give_back_context(self._context)
 
     def _open(self) -> tuple[asyncio.AbstractEventLoop, _Send, _Get]:
         if self._closed:
@@ -228,28 +216,16 @@ class ZmqTransport:
         loop = running_loop(self._loop)
         if self._send is not None and self._get is not None:
             return loop, self._send, self._get
-        context = shared_context.borrow()
+        context = borrow_context()
         socket = context.socket(zmq.DEALER)
-        connection_status.configure(socket)
-        # A request must not queue for a server that is gone, because it would reach the next one.
-        socket.immediate = True
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
-        if self._keys is not None:
-            self._keys.protect(socket)
-        monitor = socket.get_monitor_socket(connection_status.WATCHED)
-        self._attempts = connection_status.Attempts(loop.time())
         try:
-            socket.connect(self._endpoint)
-        except zmq.ZMQError as error:
-            socket.disable_monitor()
-            monitor.close(linger=0)
-            socket.close(linger=0)
-            shared_context.give_back(context)
-            raise ValueError(f"{self._endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
-        self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
-        self._events = watch_socket(loop, monitor, self._on_event, tell=self._tell)
-        self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
-        loop.call_soon(self._on_event)
+            connection = Connection(loop, socket, self._endpoint, self._keys, self._note, tell=self._tell)
+        except ValueError:
+            give_back_context(context)
+            raise
+        self._loop, self._context, self._connection, self._socket = loop, context, connection, socket
+        self._replies = connection.watch(self._on_readable, on_demand=True)
         send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
         get = self._get = cast("_Get", socket.get)
         return loop, send, get
@@ -266,22 +242,17 @@ class ZmqTransport:
             coming.cancel()
         return coming
 
-    def _awaited(self) -> bool:
-        """Return whether a reply is expected, possibly to an abandoned request."""
-        pending = self._abandoned or any(not entry.reply.done() for entry in self._sent.values())
-        return self._silent_since is not None or bool(pending)
-
     async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
         waiter: asyncio.Future[None] = loop.create_future()
         started = loop.time()
         self._waiting.add(waiter)
-        if self._given_up and self._socket is not None:
+        if self._given_up and self._connection is not None:
             # ZeroMQ does not retry after this rejection, but the server may have learnt the key by now.
             self._given_up = False
-            connection_status.reconnect(self._socket, self._endpoint)
+            self._connection.reconnect()
 
         def give_up() -> None:
-            self._on_event()  # as in `_expire`
+            self._read_events()  # as in `_expire`
             if not waiter.done():
                 waiter.set_exception(
                     ServerUnreachable(
@@ -339,22 +310,17 @@ class ZmqTransport:
             self._take()
 
     def _on_readable(self) -> None:
-        """Receive replies and resume the last waiting task immediately. A callback of the loop."""
-        answered = self._receive()
-        if answered is not None:
-            deliver(*answered)
+        self._take()
+        # A reply may be expected to an abandoned request, too.
+        unanswered = self._abandoned or self._silent_since is not None
+        if self._replies is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
+            self._replies.expect()
 
     def _take(self) -> None:
-        """Receive replies; the waiting tasks resume in the loop's next iteration."""
-        answered = self._receive()
-        if answered is not None:
-            answered[0].set_result(answered[1])
-
-    def _receive(self) -> tuple[asyncio.Future[bytes], bytes] | None:
-        """Read until no request waits. Return the future and reply of the last one, which is not completed yet."""
+        """Receive replies until no request waits for one."""
         socket, get = self._socket, self._get
         if socket is None or get is None:  # it has been closed
-            return None
+            return
         receive = socket.recv
         while True:
             try:
@@ -362,7 +328,7 @@ class ZmqTransport:
                 delimiter = receive(_NOBLOCK)
                 last = receive(_NOBLOCK, copy=False)  # the frame itself shows whether it is the last
             except zmq.Again:
-                return None
+                return
             if delimiter or last.more:
                 while get(_RCVMORE):
                     receive(_NOBLOCK)
@@ -380,11 +346,11 @@ class ZmqTransport:
                 self._deliver_late(key, last.bytes)
                 continue
             self.stats.received += 1
+            entry.reply.set_result(last.bytes)
             if len(self._sent) == 1 and not self._late:
                 # Only replies that no request waits for may remain. The socket is polled before the next wait, because
                 # its descriptor does not signal messages that arrived earlier.
-                return entry.reply, last.bytes
-            entry.reply.set_result(last.bytes)
+                return
 
     def _deliver_late(self, key: bytes, answer: bytes) -> None:
         if self._late is not None and self._late[0] == key:
@@ -403,17 +369,11 @@ class ZmqTransport:
         self.stats.late += 1
         log.debug("%s: dropped a reply that no request waits for", self._endpoint)
 
-    def _on_event(self) -> None:
-        while self._monitor is not None and not self._closed:
-            try:
-                message = cast("dict[str, Any]", recv_monitor_message(self._monitor, zmq.NOBLOCK))
-            except zmq.Again:
-                return
-            self._note(zmq.Event(message["event"]), message["value"])
+    def _read_events(self) -> None:
+        if self._connection is not None:
+            self._connection.read_events()
 
-    def _note(self, event: zmq.Event, value: int) -> None:
-        obstacle = self._attempts.obstacle(event, value, 0.0 if self._loop is None else self._loop.time())
-        self._retrying = self._retrying or event in connection_status.RETRYING
+    def _note(self, event: zmq.Event, value: int, obstacle: str | None) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
             self._rejections = 0
@@ -427,9 +387,9 @@ class ZmqTransport:
             self._lose()
         elif obstacle is not None:
             self._obstacle = obstacle
-            if event is not zmq.Event.CONNECTED and obstacle != connection_status.UNANSWERED:
+            if event is not zmq.Event.CONNECTED and obstacle != UNANSWERED:
                 self.refused = True
-            if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # means a timeout
+            if event in FAILED_HANDSHAKES and value != errno.EAGAIN:  # means a timeout
                 self._rejections += 1
                 self._note_rejection(event, value)
 
@@ -462,20 +422,12 @@ class ZmqTransport:
             self._tell(ServerLost(endpoint=self._endpoint))
         else:
             self.refused = True  # a tunnel accepts connections even if the server is down
-        if self._loop is not None:
+        if self._connection is not None:
             # Also after an aborted handshake: ZeroMQ does not retry after invalid data in it.
-            self._retrying = False
-            self._loop.call_later(
-                connection_status.REVIVE_S if self._connected else connection_status.RETRY_S, self._revive
-            )
+            self._connection.revive(was_connected=self._connected)
         self._connected = False
         self._silent_since = None
         self._fail_sent(self._lost)
-
-    def _revive(self) -> None:
-        self._on_event()
-        if not self._retrying and not self._closed and self._socket is not None:
-            connection_status.reconnect(self._socket, self._endpoint)
 
     def _tell_connected(self) -> None:
         if self.stats.connects == 1 or self._loop is None:

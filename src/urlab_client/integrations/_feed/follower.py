@@ -45,9 +45,6 @@ class Follower(ClientObserver):
         camera_hz: Maximum number of pictures per second of simulation time.
         needs_model: Hint for the error if there is no local model; None if none is needed.
         buffer: Number of published states that may wait so that none is missed; 0 for only the newest.
-
-    Raises:
-        ValueError: `cameras` is a single name.
     """
 
     def __init__(
@@ -81,12 +78,7 @@ class Follower(ClientObserver):
         self._live = False
 
     def check(self) -> FollowedScene:
-        """Describe the scene.
-
-        Raises:
-            URLabError: There was no handshake yet, or the local model is missing.
-            KeyError: A camera is unknown.
-        """
+        """Describe the scene."""
         if not self._client.urlab_version:
             raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:

@@ -19,9 +19,7 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.values.picture_files import encoded, jpeg, pillow_image
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.values.pictures import PictureMemory, Pixels, decode_camera, encoded, jpeg, pillow_image
 
 if TYPE_CHECKING:
     from urlab_client.randomise.variation import EpisodeDraws

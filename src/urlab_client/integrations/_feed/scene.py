@@ -28,7 +28,7 @@ from urlab_client.integrations._feed.messages import (
 )
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
-from urlab_client.server.dialects import cleaned_name
+from urlab_client.values.names import cleaned_name
 
 if TYPE_CHECKING:
     import mujoco
@@ -307,12 +307,12 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
         count = int(counts[actuator])
         ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
     slides = [name for name, joint in layout.joints.items() if int(model.jnt_type[joint]) == _SLIDE]
-    kinds = sensor_kinds()
+    kinds = _sensor_kinds()
     sensors = {name: kinds.get(int(model.sensor_type[sensor]), "") for name, sensor in layout.sensors.items()}
     return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl), slides=slides, sensors=sensors)
 
 
-def sensor_kinds() -> dict[int, str]:
+def _sensor_kinds() -> dict[int, str]:
     """Return the MJCF name of each number in `model.sensor_type`."""
     import mujoco
 

@@ -47,17 +47,12 @@ from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vec
 from urlab_client.integrations.gym.warp_batch import WarpBatch
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import declared_in
-from urlab_client.server.physics.controllers import (
-    Actuated,
-    Controller,
-    ControllerConfig,
-    PassthroughController,
-    PDController,
-)
+from urlab_client.simulation.controller_config import ControllerConfig
+from urlab_client.simulation.controllers import Actuated, Controller, PassthroughController, PDController
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import compiled_names
-from urlab_client.values.pixels import Pixels, observed_pixels, to_rgb
+from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 

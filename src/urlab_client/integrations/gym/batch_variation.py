@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation
-from urlab_client.server.physics.controllers import Controller, PDController
+from urlab_client.simulation.controllers import Controller, PDController
 
 Indices = NDArray[np.intp]
 

@@ -36,7 +36,7 @@ from urlab_client.protocol.messages.session import StepOk
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
-from urlab_client.values.pixels import Pixels, observed_pixels, to_rgb
+from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 
 def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:

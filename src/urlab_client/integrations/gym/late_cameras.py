@@ -9,7 +9,7 @@ from typing import Final
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.server.render.latency import Instant, Latency
+from urlab_client.simulation.cameras import Instant, Latency
 
 _UNSEEN: Final = 0
 """Snapshot number; unused here."""

@@ -24,13 +24,13 @@ from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.episode import client_camera
 from urlab_client.integrations.gym.spaces import Space, camera_space
 from urlab_client.protocol.base import Floats
-from urlab_client.server.compile.scene_index import SceneCamera
-from urlab_client.server.dialects import cleaned_name
-from urlab_client.server.render.appearance import Appearance
-from urlab_client.server.render.drawing import Stage
-from urlab_client.server.render.opengl import Backend, need_backend
-from urlab_client.server.render.tints import Tints
-from urlab_client.values.pixels import Pixels, decode_camera
+from urlab_client.simulation.appearance import Appearance
+from urlab_client.simulation.cameras import SceneCamera
+from urlab_client.simulation.drawing import Stage
+from urlab_client.simulation.opengl import Backend, need_backend
+from urlab_client.simulation.tints import Tints
+from urlab_client.values.names import cleaned_name
+from urlab_client.values.pictures import Pixels, decode_camera
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""

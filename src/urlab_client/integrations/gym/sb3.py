@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.integrations.gym.spaces import Observation
 from urlab_client.integrations.gym.vectorized import Vectorized
 

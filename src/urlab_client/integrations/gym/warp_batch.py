@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.errors import URLabError
 
 Indices = NDArray[np.intp]

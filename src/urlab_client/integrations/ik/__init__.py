@@ -3,7 +3,7 @@
 The solver is mink. Needs the extra `teleop`.
 """
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 
 need("mink", extra="teleop")
 

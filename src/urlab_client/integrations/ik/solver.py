@@ -22,7 +22,7 @@ from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import split_prefix, unknown_name
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 Vector = Sequence[float] | Floats
 

@@ -15,7 +15,7 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.policy.policy import Policy
 from urlab_client.integrations.policy.runner import run
 from urlab_client.protocol.base import Floats
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv

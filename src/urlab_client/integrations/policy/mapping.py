@@ -36,7 +36,7 @@ from urlab_client.integrations.policy.spec import (
 )
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
-from urlab_client.values.pixels import observed_pixels
+from urlab_client.values.pictures import observed_pixels
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 

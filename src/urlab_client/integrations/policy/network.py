@@ -10,7 +10,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 

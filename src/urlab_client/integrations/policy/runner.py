@@ -20,7 +20,7 @@ from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 _STANDSTILL_S: Final = 5.0
 _SMOOTHING_S: Final = 0.5

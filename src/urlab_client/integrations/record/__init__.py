@@ -3,7 +3,7 @@
 Requires the extra `mcap`; some conversions require `video` or `dataset`.
 """
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 
 need("mcap", "PIL", extra="mcap")
 

@@ -1,15 +1,13 @@
 """Writes a LeRobot dataset while its frames arrive. Runs in an interpreter with LeRobot, but without this project.
 
 It imports nothing of this project. Its only argument is a folder with `plan.json`. Each line of standard input names a
-file of frames in that folder, and whether they end an episode. It answers each with a line after it has read the
-frames.
+file of frames in that folder, and whether they end an episode. It deletes each file when its frames are in the dataset.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,40 +17,32 @@ import numpy as np
 
 def main(work: Path) -> None:
     """Write the dataset that `work/plan.json` describes, from the frames that standard input names."""
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as replies:
-        os.dup2(2, 1)  # output of libraries must not look like a reply
-        plan: dict[str, Any] = json.loads((work / "plan.json").read_text(encoding="utf-8"))
-        dataset: Any = None
-        for line in sys.stdin:
-            order: dict[str, Any] = json.loads(line)
-            file = work / order["file"]
-            with np.load(file, allow_pickle=False) as arrays:
-                frames: dict[str, Any] = {name: arrays[name] for name in arrays.files}
-            file.unlink()
-            if dataset is None:
-                dataset = _create(plan, frames)
-            _add(dataset, plan, frames)
-            if order["ends_episode"]:
-                dataset.save_episode()
-            replies.write("taken\n")
-            replies.flush()
-        if hasattr(dataset, "finalize"):
-            dataset.finalize()
+    plan: dict[str, Any] = json.loads((work / "plan.json").read_text(encoding="utf-8"))
+    dataset: Any = None
+    for line in sys.stdin:
+        order: dict[str, Any] = json.loads(line)
+        file = work / order["file"]
+        with np.load(file, allow_pickle=False) as arrays:
+            frames: dict[str, Any] = {name: arrays[name] for name in arrays.files}
+        if dataset is None:
+            dataset = _create(plan, frames)
+        _add(dataset, plan, frames)
+        if order["ends_episode"]:
+            dataset.save_episode()
+        file.unlink()
+    if hasattr(dataset, "finalize"):
+        dataset.finalize()
 
 
 def _create(plan: dict[str, Any], frames: dict[str, Any]) -> Any:
     library: Any = importlib.import_module("lerobot.datasets.lerobot_dataset")
 
-    features: dict[str, Any] = {
-        "observation.state": {"dtype": "float32", "shape": (len(plan["state"]),), "names": plan["state"]},
-        "action": {"dtype": "float32", "shape": (len(plan["action"]),), "names": plan["action"]},
-    }
+    vectors = {"observation.state": plan["state"], "action": plan["action"]}
     if plan["goal"]:
-        features["observation.environment_state"] = {
-            "dtype": "float32",
-            "shape": (len(plan["goal"]),),
-            "names": plan["goal"],
-        }
+        vectors["observation.environment_state"] = plan["goal"]
+    features: dict[str, Any] = {
+        key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in vectors.items()
+    }
     for i, name in enumerate(plan["cameras"]):
         features[f"observation.images.{name}"] = {
             "dtype": "video" if plan["video"] else "image",

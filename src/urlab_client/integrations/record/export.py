@@ -20,13 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client._platform.files import replaced
 from urlab_client.integrations.record import tables
-from urlab_client.integrations.record.contents import Table
+from urlab_client.integrations.record.contents import Table, even, farthest, visible
 from urlab_client.integrations.record.index import Progress
 from urlab_client.integrations.record.lerobot import write_lerobot
-from urlab_client.integrations.record.pictures import even, farthest, visible
 from urlab_client.integrations.record.reader import Run, phases
 from urlab_client.integrations.record.transitions import Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
@@ -212,11 +211,7 @@ def _save(
     count: int,
     report: Callable[[], None] = lambda: None,
 ) -> None:
-    """Add an array of `count` rows to an archive like `numpy.savez`, with only a part of it in memory.
-
-    Raises:
-        ValueError: The parts do not match, or have fewer rows.
-    """
+    """Add an array of `count` rows to an archive like `numpy.savez`, with only a part of it in memory."""
     rows, form = 0, None
     with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
         for part in parts:

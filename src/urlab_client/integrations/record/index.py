@@ -143,9 +143,6 @@ class RecordingIndex:
         Args:
             path: The file.
             progress: Called occasionally with the number of bytes read so far of a file without an index.
-
-        Raises:
-            RecordingError: The file is not an MCAP file.
         """
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -227,11 +224,7 @@ class RecordingIndex:
                     progress(block.start)
 
     def first(self, channel: int) -> RecordedMessage | None:
-        """Return the first message of a channel in the file, or None.
-
-        Raises:
-            RecordingError: The file is damaged there.
-        """
+        """Return the first message of a channel in the file, or None."""
         for number, block in enumerate(self._blocks):
             if channel in block.channels and (rows := self._contents(number).positions.get(channel)) is not None:
                 return self._checked(number, int(rows[:, 1].min()))
@@ -243,9 +236,6 @@ class RecordingIndex:
         Args:
             channel: Id of the channel.
             at: The time, nanoseconds; None for the end of the file.
-
-        Raises:
-            RecordingError: The file is damaged there.
         """
         last = len(self._blocks) if at is None else int(np.searchsorted(self._earliest, np.uint64(at), side="right"))
         for number in range(last - 1, -1, -1):
@@ -523,11 +513,7 @@ def _by_time(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Return the records of a chunk.
-
-    Raises:
-        ValueError: It does not contain what it declares, or declares too much.
-    """
+    """Return the records of a chunk."""
     packed, size = chunk.data, chunk.uncompressed_size
     if size > min(max(_CHUNK_BYTES, _CHUNK_RATIO * len(packed)), _LARGEST_CHUNK):
         raise ValueError(f"a chunk of {len(packed)} bytes declares that it unpacks to {size}")

@@ -8,12 +8,10 @@ from collections.abc import Collection, Generator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations._feed.quantities import quantities
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import (
     Column,
@@ -25,10 +23,11 @@ from urlab_client.integrations.record.contents import (
 )
 from urlab_client.integrations.record.index import IndexedChannel, Progress
 from urlab_client.integrations.record.reader import Run
+from urlab_client.integrations.record.tables import quantities
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.server.physics.recording import Frame, decode_json
+from urlab_client.simulation.joint_recording import Frame, decode_json
 
-OWNER: Final = "joints"
+OWNER = "joints"
 """Key of the only articulation, because the file names compiled joints and no robots."""
 
 _NS = 1e9
@@ -49,11 +48,10 @@ def is_joint_states(path: Path) -> bool:
 
 
 class JointStatesRun(Run):
-    """A recording of joint states only, without set-points, sensors and pictures."""
+    """A recording of joint states only, without set-points, sensors and pictures. A JSON file is read whole."""
 
     def summary(self, progress: Progress | None = None, *, verify: bool = False) -> Summary:
         """Return a summary of the contents. Reading the file verifies it."""
-        del progress, verify
         table = self.table()
         stamps = (table.time * _NS).astype(np.int64)
         topic = f"/{OWNER}"
@@ -73,46 +71,24 @@ class JointStatesRun(Run):
         )
 
     def table(self, progress: Progress | None = None, *, fields: Collection[str] | None = None) -> Table:
-        """Return all states as `joints/qpos` and `joints/qvel`; values have the names of compiled joints.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
-        del progress
-        size = self.path.stat().st_size
-        if size > _LARGEST_FILE:
-            raise RecordingError(f"{self.path}: {size} bytes are too many for a recording of joint states.")
-        try:
-            frames = decode_json(self.path.read_bytes())
-        except ValueError as error:
-            raise RecordingError(f"{self.path}: {str(error).rstrip('.')}.") from error
-        sim_time = np.array([frame.time for frame in frames], dtype=np.float64)
-        bounded = sim_time.clip(-_LATEST_S, _LATEST_S)
-        steps = np.diff(bounded, prepend=bounded[:1])
-        time = np.cumsum(np.maximum(steps, 0.0))
-        if len(frames) and max(abs(bounded).max(), time[-1]) >= _LATEST_S:
-            raise RecordingError(f"{self.path}: its times reach {_LATEST_S:.0f} s and more.")
-        width = max(len(frames[0].qpos), len(frames[0].qvel)) if frames else 0
-        if width > _WIDEST or len(frames) * width > max(_MOST_VALUES, size):
-            raise RecordingError(f"{self.path}: {len(frames)} frames of {width} values do not fit its size.")
+        """Return all states as `joints/qpos` and `joints/qvel`; values have the names of compiled joints."""
+        frames = self._frames()
         layout = frames[0].layout if frames else None
         names = dict(layout.joints) if layout else {}
         columns: dict[str, Column] = {}
-        for field, kinds in (("qpos", _COORDINATES), ("qvel", _VELOCITIES)):
-            labels = [
-                f"{name}{part}"
-                for name, slices in names.items()
-                for part in _parts(kinds, slices[0 if field == "qpos" else 1])
-            ]
+        for field, kinds, place in (("qpos", _COORDINATES, 0), ("qvel", _VELOCITIES, 1)):
+            labels = [f"{name}{part}" for name, slices in names.items() for part in _parts(kinds, slices[place])]
             if labels and (fields is None or field in fields):
                 values = np.full((len(frames), len(labels)), np.nan)
                 for row, frame in enumerate(frames):
-                    given = _values(frame, field)
+                    given = frame.qpos if field == "qpos" else frame.qvel
                     if frame.layout is layout:
                         values[row] = given
                 columns[f"{OWNER}/{field}"] = Column(labels, values, quantities(SceneLayout(), field, labels), labels)
+        sim_time = np.array([frame.time for frame in frames], dtype=np.float64)
+        steps = np.diff(sim_time, prepend=sim_time[:1])
         return Table(
-            time=time,
+            time=np.cumsum(np.maximum(steps, 0.0)),
             sim_time=sim_time,
             wall_ns=(sim_time * _NS).astype(np.int64),
             step=np.arange(len(frames), dtype=np.int64),
@@ -120,16 +96,29 @@ class JointStatesRun(Run):
             columns=columns,
         )
 
+    def _frames(self) -> list[Frame]:
+        """Return the frames, after checks of what a file from anywhere may make a reader compute and allocate."""
+        size = self.path.stat().st_size
+        if size > _LARGEST_FILE:
+            raise RecordingError(f"{self.path}: {size} bytes are too many for a recording of joint states.")
+        try:
+            frames = decode_json(self.path.read_bytes())
+        except ValueError as error:
+            raise RecordingError(f"{self.path}: {str(error).rstrip('.')}.") from error
+        times = np.array([frame.time for frame in frames], dtype=np.float64).clip(-_LATEST_S, _LATEST_S)
+        forward = np.maximum(np.diff(times, prepend=times[:1]), 0.0)
+        if len(frames) and max(abs(times).max(), forward.sum()) >= _LATEST_S:
+            raise RecordingError(f"{self.path}: its times reach {_LATEST_S:.0f} s and more.")
+        width = max(len(frames[0].qpos), len(frames[0].qvel)) if frames else 0
+        if width > _WIDEST or len(frames) * width > max(_MOST_VALUES, size):
+            raise RecordingError(f"{self.path}: {len(frames)} frames of {width} values do not fit its size.")
+        return frames
+
     @contextlib.contextmanager
     def stored_table(
         self, folder: Path, progress: Progress | None = None, *, fields: Collection[str] | None = None
     ) -> Generator[Table]:
-        """Yield all states, in memory: a JSON file is read whole.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
-        del folder
+        """Yield all states, in memory."""
         yield self.table(progress, fields=fields)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
@@ -147,12 +136,7 @@ class JointStatesRun(Run):
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
     def state_at(self, time: float) -> RecordedState | None:
-        """Return the newest state at or before a time, or None; all joints are one articulation.
-
-        Raises:
-            RecordingError: The file is not a recording.
-            ValueError: The time is NaN.
-        """
+        """Return the newest state at or before a time, or None; all joints are one articulation."""
         if math.isnan(time):
             raise ValueError("the time is NaN")
         table = self.whole
@@ -160,9 +144,9 @@ class JointStatesRun(Run):
         if row < 0:
             return None
         nothing = np.zeros(0)
-        values = {name.rpartition("/")[2]: column.values[row] for name, column in table.columns.items()}
-        joints = RecordedArticulation(
-            values.get("qpos", nothing), values.get("qvel", nothing), nothing, nothing, nothing, {}
+        qpos, qvel = (
+            table.columns[key].values[row] if key in table.columns else nothing
+            for key in (f"{OWNER}/qpos", f"{OWNER}/qvel")
         )
         return RecordedState(
             time=float(table.time[row]),
@@ -170,7 +154,7 @@ class JointStatesRun(Run):
             wall_ns=int(table.wall_ns[row]),
             step=int(table.step[row]),
             episode=int(table.episode[row]),
-            articulations={OWNER: joints},
+            articulations={OWNER: RecordedArticulation(qpos, qvel, nothing, nothing, nothing, {})},
             entities={},
         )
 
@@ -190,7 +174,3 @@ class JointStatesRun(Run):
 def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:
     width = where.stop - where.start
     return kinds.get(width, tuple(f".{i}" for i in range(width)))
-
-
-def _values(frame: Frame, field: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return frame.qpos if field == "qpos" else frame.qvel

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import queue
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -21,12 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._platform.children import APART
-from urlab_client.aio.background import background_thread
-from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations.record.contents import Table
+from urlab_client.integrations.record.contents import Column, Table, even, farthest, visible
 from urlab_client.integrations.record.index import Progress
-from urlab_client.integrations.record.pictures import even, farthest, visible
 from urlab_client.integrations.record.reader import Run, phases
 from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, pair_rows, pairs_at, with_goals
 from urlab_client.integrations.record.writer import RecordingError
@@ -35,7 +31,7 @@ from urlab_client.protocol.base import Floats
 _SCRIPT = Path(__file__).with_name("_lerobot_script.py")
 _DEADLINE_S = 600.0
 _FRAME_S = 2.0  # which may pass for each frame of an episode besides, while that is encoded
-_LOOK_S = 0.5  # on Windows nothing interrupts a thread that waits
+_LOOK_S = 0.02
 _ENDING_S = 10.0
 _AHEAD = 2  # pending files
 _PROBE_S = 120.0
@@ -168,11 +164,7 @@ class _Pictures:
         self._pixels: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 
     def take(self, numbers: NDArray[np.intp]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Return pictures, shape (k, H, W, 3), and which of them each of some frames shows.
-
-        Raises:
-            RecordingError: They are not all of one size, or some that were there before are missing.
-        """
+        """Return pictures, shape (k, H, W, 3), and which of them each of some frames shows."""
         wanted, places = np.unique(numbers, return_inverse=True)
         found = [self._picture(number) for number in wanted.tolist()]
         if any(one.shape != found[0].shape for one in found):
@@ -266,11 +258,7 @@ def _resampled(
 def _newest(
     run: Run, camera: str, times: NDArray[np.float64], states: NDArray[np.float64], limit: float
 ) -> NDArray[np.intp]:
-    """Return the newest picture at each state.
-
-    Raises:
-        RecordingError: One is older than `limit` seconds.
-    """
+    """Return the newest picture at each state."""
     chosen = np.searchsorted(times, states + _SLACK_S, side="right") - 1
     age = states - times[chosen]
     stale = np.flatnonzero(age > _SLACK * limit + _SLACK_S)
@@ -284,22 +272,26 @@ def _newest(
     return chosen
 
 
-def _goal(table: Table) -> tuple[list[str], NDArray[np.float64]]:
-    chosen = {key.partition("/")[2]: column for key, column in table.columns.items() if key.startswith(f"{GOAL}/")}
-    names = [f"{key}.{name}" for key, column in chosen.items() for name in column.names]
-    values = [column.values for column in chosen.values()]
-    return names, np.concatenate(values, axis=1) if values else np.zeros((len(table), 0))
+def _goal(table: Table) -> tuple[list[str], Floats]:
+    return _together(
+        {key.partition("/")[2]: one for key, one in table.columns.items() if key.startswith(f"{GOAL}/")}, len(table)
+    )
 
 
-def _joined(table: Table, field: str) -> tuple[list[str], NDArray[np.float64]]:
+def _joined(table: Table, field: str) -> tuple[list[str], Floats]:
     chosen = {key: column for key, column in table.columns.items() if key.endswith(f"/{field}")}
-    names = [f"{key.rpartition('/')[0]}.{name}" for key, column in chosen.items() for name in column.names]
-    values = [column.values for column in chosen.values()]
-    return names, np.concatenate(values, axis=1) if values else np.zeros((len(table), 0))
+    return _together({key.rpartition("/")[0]: column for key, column in chosen.items()}, len(table))
+
+
+def _together(columns: Mapping[str, Column], rows: int) -> tuple[list[str], Floats]:
+    """Return names and values of all columns side by side."""
+    names = [f"{key}.{name}" for key, column in columns.items() for name in column.names]
+    values = [column.values for column in columns.values()]
+    return names, np.concatenate(values, axis=1) if values else np.zeros((rows, 0))
 
 
 class LeRobot:
-    """Writes one dataset. Killed if the block ends before `finish`.
+    """Writes one dataset, from files of frames that it deletes one by one. Killed if the block ends before `finish`.
 
     Args:
         python: The interpreter.
@@ -309,21 +301,17 @@ class LeRobot:
     def __init__(self, python: str, work: Path) -> None:
         self._work = work
         self._frames = self._files = 0
-        self._waiting: deque[float] = deque()
-        """Seconds within which LeRobot must read each file, from the start of the wait for it."""
-        self._replies: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._pending: deque[Path] = deque()
         with (work / "errors.txt").open("wb") as errors:
             self._process = subprocess.Popen(  # noqa: S603  # the user's own interpreter
                 [python, "-P", str(_SCRIPT), str(work)],
                 stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
                 stderr=errors,
                 text=True,
                 encoding="utf-8",
                 **APART,
             )
-        self._failure: URLabError | None = None
-        background_thread("urlab-lerobot", self._listen, failed=self._die).start()
 
     def __enter__(self) -> Self:
         return self
@@ -332,9 +320,7 @@ class LeRobot:
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._kill()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):  # if LeRobot has stopped reading
-                self._process.stdin.close()
+        self._close_input()
 
     def add(self, arrays: Mapping[str, NDArray[Any]], *, ends_episode: bool) -> None:
         """Pass on frames, and wait while too many are pending.
@@ -342,13 +328,13 @@ class LeRobot:
         Raises:
             RecordingError: LeRobot failed, or takes too long.
         """
-        while len(self._waiting) >= _AHEAD:
-            self._wait()
+        while len(self._pending) >= _AHEAD:
+            self._wait_for_next()
         name = f"{self._files}.npz"
         np.savez(self._work / name, allow_pickle=False, **dict[str, Any](arrays))
         self._files += 1
         self._frames += len(arrays["state"])
-        self._waiting.append(_DEADLINE_S + _FRAME_S * self._frames)
+        self._pending.append(self._work / name)
         try:
             if self._process.stdin is not None:
                 self._process.stdin.write(json.dumps({"file": name, "ends_episode": ends_episode}) + "\n")
@@ -362,46 +348,32 @@ class LeRobot:
         Raises:
             RecordingError: LeRobot failed, or takes too long.
         """
-        while self._waiting:
-            self._wait()
-        if self._process.stdin is not None:
-            self._process.stdin.close()
-        self._waiting.append(_DEADLINE_S + _FRAME_S * self._frames)
-        try:
-            failed = self._reply() or self._process.wait(_DEADLINE_S)
-        except subprocess.TimeoutExpired:
-            raise RecordingError(f"LeRobot did not end within {_DEADLINE_S:g} s.") from None
-        if failed:
+        while self._pending:
+            self._wait_for_next()
+        self._close_input()
+        self._wait(lambda: self._process.poll() is not None)
+        if self._process.returncode:
             raise self._broken_off()
 
-    def _wait(self) -> None:
-        if not self._reply():
-            raise self._broken_off()
+    def _wait_for_next(self) -> None:
+        file = self._pending.popleft()
+        self._wait(lambda: not file.exists())
 
-    def _reply(self) -> str:
-        """Return the next reply, which is empty when there are no more."""
-        allowed = self._waiting.popleft()
+    def _wait(self, over: Callable[[], bool]) -> None:
+        # By looking: its output would stay open as long as encoders of videos that outlive it.
+        allowed = _DEADLINE_S + _FRAME_S * self._frames
         until = time.monotonic() + allowed
-        while True:
-            try:
-                return self._replies.get(timeout=_LOOK_S)
-            except queue.Empty:
-                if time.monotonic() > until:
-                    raise RecordingError(f"LeRobot did not finish within {allowed:g} s.") from None
+        while not over():
+            if self._process.poll() is not None and not over():
+                raise self._broken_off()
+            if time.monotonic() > until:
+                raise RecordingError(f"LeRobot did not finish within {allowed:g} s.")
+            time.sleep(_LOOK_S)
 
-    def _listen(self) -> None:
-        output = self._process.stdout
-        if output is not None:
-            with (
-                output
-            ):  # closed here and not by the waiting thread, because encoders may outlive LeRobot and keep it open
-                for line in output:
-                    self._replies.put(line)
-        self._replies.put("")
-
-    def _die(self, error: URLabError) -> None:
-        self._failure = error
-        self._replies.put("")
+    def _close_input(self) -> None:
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):  # if LeRobot has stopped reading
+                self._process.stdin.close()
 
     def _kill(self) -> None:
         if self._process.poll() is None:
@@ -412,10 +384,6 @@ class LeRobot:
             self._process.wait()
 
     def _broken_off(self) -> RecordingError:
-        if self._failure is not None:
-            failed = RecordingError(f"LeRobot's replies could not be read: {self._failure.__cause__!r}.")
-            failed.__cause__ = self._failure.__cause__
-            return failed
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_ENDING_S)  # its reason is complete when it has ended
         self._kill()

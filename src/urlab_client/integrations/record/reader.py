@@ -33,13 +33,13 @@ from urlab_client.integrations.record.contents import (
     Camera,
     RecordedArticulation,
     RecordedEntity,
+    RecordedPicture,
     RecordedState,
     Summary,
     Table,
     describe_topic,
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
-from urlab_client.integrations.record.pictures import RecordedPicture
 from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
@@ -452,11 +452,7 @@ def _newest(index: RecordingIndex, channels: Sequence[IndexedChannel], time: flo
 
 
 def _decoded(index: RecordingIndex, message: RecordedMessage, decode: Callable[[bytes], _T]) -> _T:
-    """Return the contents of a message.
-
-    Raises:
-        RecordingError: They are not what its channel says.
-    """
+    """Return the contents of a message."""
     if len(message.data) > _MESSAGE_BYTES and message.channel.schema not in _PICTURES:
         raise index.unreadable(message, f"it has {len(message.data)} bytes, more than {_MESSAGE_BYTES}")
     try:

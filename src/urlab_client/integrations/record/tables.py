@@ -1,4 +1,7 @@
-"""Building a table from successive states, of which an overnight recording has millions: in memory, or in a file."""
+"""Building a table from successive states, of which an overnight recording has millions: in memory, or in a file.
+
+Its columns have the quantity and unit of each value, for axis labels.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,6 @@ from typing import IO, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
@@ -22,6 +24,54 @@ PIECE_VALUES = 1 << 20
 
 _MOST_COLUMNS = 1_000_000
 _NS = 1e9
+
+_SENSORS: dict[str, str] = {
+    "touch": "contact force (N)",
+    "accelerometer": "linear acceleration (m/s²)",
+    "velocimeter": "linear velocity (m/s)",
+    "gyro": "angular velocity (rad/s)",
+    "force": "force (N)",
+    "torque": "torque (N m)",
+    "magnetometer": "magnetic flux",
+    "rangefinder": "distance (m)",
+    "camprojection": "image position (pixels)",
+    "jointpos": "joint position (rad, m)",
+    "jointvel": "joint velocity (rad/s, m/s)",
+    "tendonpos": "tendon length (m)",
+    "tendonvel": "tendon velocity (m/s)",
+    "actuatorpos": "actuator length",
+    "actuatorvel": "actuator velocity",
+    "actuatorfrc": "actuator force (N, N m)",
+    "jointactfrc": "joint force (N m, N)",
+    "tendonactfrc": "tendon force (N)",
+    "ballquat": "orientation (w, x, y, z)",
+    "ballangvel": "angular velocity (rad/s)",
+    "jointlimitpos": "distance to limit (rad, m)",
+    "jointlimitvel": "velocity to limit (rad/s, m/s)",
+    "jointlimitfrc": "limit force (N m, N)",
+    "tendonlimitpos": "distance to limit (m)",
+    "tendonlimitvel": "velocity to limit (m/s)",
+    "tendonlimitfrc": "limit force (N)",
+    "framepos": "position (m)",
+    "framequat": "orientation (w, x, y, z)",
+    "framexaxis": "x axis",
+    "frameyaxis": "y axis",
+    "framezaxis": "z axis",
+    "framelinvel": "linear velocity (m/s)",
+    "frameangvel": "angular velocity (rad/s)",
+    "framelinacc": "linear acceleration (m/s²)",
+    "frameangacc": "angular acceleration (rad/s²)",
+    "subtreecom": "centre of mass (m)",
+    "subtreelinvel": "linear velocity (m/s)",
+    "subtreeangmom": "angular momentum (kg m²/s)",
+    "geomdist": "distance (m)",
+    "geomnormal": "normal",
+    "geomfromto": "segment (m)",
+    "e_potential": "potential energy (J)",
+    "e_kinetic": "kinetic energy (J)",
+    "clock": "time (s)",
+}
+_QUATERNIONS = frozenset({"ballquat", "framequat"})
 
 Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
 """A number as decoded; numbers that JSON cannot represent are text."""
@@ -118,9 +168,6 @@ class TableBuilder:
         folder: Folder of a temporary file for the values, which the table then maps; None keeps them in memory.
         only: Fields to keep, such as `qpos`; None keeps all.
         most: Largest number of values of the whole table, missing ones included.
-
-    Raises:
-        OSError: The file cannot be created.
     """
 
     def __init__(self, folder: Path | None, only: Collection[str] | None = None, *, most: int) -> None:
@@ -141,11 +188,7 @@ class TableBuilder:
         return self._sources.setdefault(key, _Source(key, layout))
 
     def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
-        """Add a part of a sample.
-
-        Raises:
-            ValueError: It is not the next one, or the table becomes too large.
-        """
+        """Add a part of a sample."""
         new = sample > self._sample
         if sample < self._sample or (not new and source.key in self._present):
             raise ValueError(f"sample {sample} comes after sample {self._sample}")
@@ -227,3 +270,56 @@ def _column(source: _Source, name: str, values: Floats) -> Column:
         names = [str(i) for i in range(values.shape[1])]
     labels = [component_name(layout, value) for value in names] if name == "sensors" else names
     return Column(names, values, quantities(layout, name, names), labels)
+
+
+def quantities(layout: SceneLayout, field: str, names: list[str]) -> list[str]:
+    """Return quantity and unit of each value of a field, as axis labels."""
+    match field:
+        case "qpos":
+            return [_position(layout, name) for name in names]
+        case "qvel":
+            return [_velocity(layout, name) for name in names]
+        case "sensors":
+            return [_SENSORS.get(_kind(layout, name), _kind(layout, name) or "reading") for name in names]
+        case "pose":
+            return ["position (m)" if name in "xyz" else "orientation (w, x, y, z)" for name in names]
+        case "ctrl" | "set_points":
+            return ["control" if field == "ctrl" else "set-point"] * len(names)
+        case _:
+            return [field] * len(names)
+
+
+def component_name(layout: SceneLayout, name: str) -> str:
+    """Return the name of a sensor's value with its axis, `imu.x` for `imu.0`, if sensors of its kind have axes."""
+    sensor, dot, index = name.rpartition(".")
+    kind = layout.sensors.get(sensor, "")
+    if not dot or not index.isdecimal() or not kind:
+        return name
+    axes = "wxyz" if kind in _QUATERNIONS else "xyz"
+    return f"{sensor}.{axes[int(index)]}" if int(index) < len(axes) and kind in _SENSORS else name
+
+
+def _kind(layout: SceneLayout, name: str) -> str:
+    return layout.sensors.get(name) or layout.sensors.get(name.rpartition(".")[0], "")
+
+
+def _position(layout: SceneLayout, name: str) -> str:
+    component = name.rpartition(".")[2]
+    if component in ("x", "y", "z"):
+        return "position (m)"
+    if component in ("qw", "qx", "qy", "qz"):
+        return "orientation (w, x, y, z)"
+    if layout.slides is None:
+        return "position (rad, m)"
+    return "position (m)" if name in layout.slides else "angle (rad)"
+
+
+def _velocity(layout: SceneLayout, name: str) -> str:
+    component = name.rpartition(".")[2]
+    if component in ("vx", "vy", "vz"):
+        return "velocity (m/s)"
+    if component in ("wx", "wy", "wz"):
+        return "angular velocity (rad/s)"
+    if layout.slides is None:
+        return "velocity (rad/s, m/s)"
+    return "velocity (m/s)" if name in layout.slides else "angular velocity (rad/s)"

@@ -48,8 +48,8 @@ from urlab_client.integrations._feed.samples import (
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.values.picture_memory import PictureMemory
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.pictures import PictureMemory
+from urlab_client.values.plain import Serializable
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
 

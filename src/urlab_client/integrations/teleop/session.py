@@ -18,7 +18,7 @@ from urlab_client.integrations.teleop.hand import HandControl
 from urlab_client.protocol.base import Floats
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task

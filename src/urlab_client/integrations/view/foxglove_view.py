@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, overload
 import numpy as np
 from msgspec import Struct
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import (

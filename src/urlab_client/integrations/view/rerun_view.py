@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
-from urlab_client._extras import need
+from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError

@@ -26,7 +26,7 @@ from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 log: logging.Logger = logging.getLogger("urlab_client.view")
 

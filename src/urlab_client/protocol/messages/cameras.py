@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from msgspec import Struct
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 
 class CameraTransports(Serializable, Struct, kw_only=True, omit_defaults=True):

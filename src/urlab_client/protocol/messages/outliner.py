@@ -21,8 +21,8 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
+from urlab_client.values.plain import Serializable
 from urlab_client.values.scene_types import ActorBounds, BlueprintInfo
-from urlab_client.values.serializable import Serializable
 
 
 class QuickConvert(Serializable, Struct, kw_only=True):

@@ -20,7 +20,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 from urlab_client.values.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 

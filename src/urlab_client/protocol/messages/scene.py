@@ -23,8 +23,8 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
+from urlab_client.values.plain import Serializable
 from urlab_client.values.scene_types import ActorHierarchyNode
-from urlab_client.values.serializable import Serializable
 
 
 class LevelReply(Reply, kw_only=True):

@@ -21,7 +21,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 NOT_SENT: Final = msgspec.Raw()
 """Value of an undecoded field that is absent; encoding omits a field that holds this very object."""

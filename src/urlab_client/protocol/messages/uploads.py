@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from msgspec import Struct, field
 
 from urlab_client.protocol.base import Int32, Needs, Op, Reply, Request, doc
-from urlab_client.values.serializable import Serializable
+from urlab_client.values.plain import Serializable
 
 MAX_BLOB_BYTES: Final = 64 << 20
 MAX_MODEL_BYTES: Final = 512 << 20

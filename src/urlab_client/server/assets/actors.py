@@ -63,15 +63,7 @@ class Mesh(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
 
 class ConversionSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a static mesh becomes a MuJoCo body.
-
-    Attributes:
-        static: No free joint: the body is fixed.
-        complex_mesh: Convex decomposition instead of one hull.
-        coacd_threshold: Concavity threshold of that decomposition.
-        driven_by_unreal: Mocap body that follows the actor.
-        friction: Sliding, torsional, rolling.
-    """
+    """How a static mesh becomes a MuJoCo body."""
 
     static: bool = False
     complex_mesh: bool = False

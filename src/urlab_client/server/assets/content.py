@@ -40,8 +40,7 @@ from urlab_client.server.assets.blueprint import (
     to_record,
 )
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
-from urlab_client.server.assets.importer import Compiled, compile_snapshot, one_line, write_snapshot
-from urlab_client.server.assets.sandbox import build_confined
+from urlab_client.server.assets.importer import Compiled, build_confined, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
@@ -67,7 +66,6 @@ class ContentRoot:
             saved_dir: Folder of the content root; made when something is first written.
             model_roots: Folders below which MJCF files may be imported. The models shipped with this package, and
                 those that a console hands over in `import_directory()`, may always be.
-            limits: For what clients name.
         """
         self.limits = limits
         self.root: Path = saved_dir.resolve()
@@ -113,10 +111,6 @@ class ContentRoot:
 
         Returns:
             The blueprint, and whether it was imported now.
-
-        Raises:
-            Refusal: `missing_field` without a path; `import_failed` if the file lies outside the model roots, does not
-                exist, or MuJoCo rejects it.
         """
         if not path:
             raise Refusal("missing_field", "path: name the MJCF file to import")
@@ -125,11 +119,7 @@ class ContentRoot:
         return self._import_file(file, source, roots, force_reimport=force_reimport)
 
     def import_uploaded(self, document: Path) -> Blueprint:
-        """Import a model that a client has sent. It is always imported anew, and reads only files of its own folder.
-
-        Raises:
-            Refusal: `import_failed`.
-        """
+        """Import a model that a client has sent. It is always imported anew, and reads only files of its own folder."""
         document = document.resolve()
         return self._import_file(document, UPLOADED, (document.parent,), force_reimport=True)[0]
 
@@ -168,7 +158,6 @@ class ContentRoot:
 
         Args:
             record: Its `blueprint.json`.
-            digest: The snapshot wanted.
 
         Returns:
             The blueprint; None if the other content root has another snapshot by now.

@@ -35,7 +35,6 @@ def convex_parts(file: Path, threshold: float) -> tuple[Part, ...]:
     """Return the parts of a mesh. Results are cached by content and threshold.
 
     Args:
-        file: STL, OBJ or MSH file.
         threshold: Concavity that a part may keep; CoACD takes 0.01 to 1.
 
     Raises:

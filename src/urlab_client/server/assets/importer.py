@@ -1,7 +1,6 @@
-"""Importing an MJCF: a self-contained copy in which all elements have names.
+"""Importing an MJCF: a self-contained copy in which all elements have names, made here or in a confined process.
 
-For `ContentRoot` and the sandbox, which determine the folders and limits. Names and keyframes are those of the plugin's
-importer.
+For `ContentRoot`, which determines the folders. Names and keyframes are those of the plugin's importer.
 """
 
 from __future__ import annotations
@@ -27,7 +26,10 @@ from urlab_client._mujoco import (
     compiled_file,
     write_model,
 )
+from urlab_client._sandbox.process import Failed, Job, ProcessLimits, Refused, is_out_of_memory, run_confined
+from urlab_client._sandbox.references import Outside, check_references
 from urlab_client.server.limits import Limits, options_problem
+from urlab_client.server.refusal import Refusal
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -87,16 +89,89 @@ class Written:
     messages: list[str]
 
 
-def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
-    """Call `write_snapshot` and `compile_snapshot`."""
-    return compile_snapshot(write_snapshot(file, snapshot), file, snapshot, limits)
+class _Order(msgspec.Struct):
+    """What a confined process is to import; the snapshot is a folder that does not exist yet."""
+
+    file: str
+    snapshot: str
+    roots: list[str]
+    limits: Limits
+
+
+def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: Limits) -> Compiled:
+    """Write and compile a snapshot in a confined process, for a file that may refer only to files below `roots`."""
+    folders = [str(root) for root in roots]
+    job = Job(
+        work=f"{__name__}:build_order",
+        argument=msgspec.msgpack.encode(_Order(str(file), str(snapshot), folders, limits)),
+        limits=ProcessLimits(
+            memory_bytes=limits.model_memory_bytes,
+            cpu_s=limits.model_cpu_s,
+            wall_s=limits.model_wall_s,
+            prefix="model_",
+        ),
+        folder=str(snapshot.parent),
+        readable=folders,
+    )
+    try:
+        return msgspec.msgpack.decode(run_confined(job, keep=True), type=Compiled)
+    except Refused as refused:
+        raise Refusal("import_failed", str(refused)) from None
+    except Failed as failed:
+        raise Refusal("import_failed", f"{file}: {failed}") from None
+
+
+def build_order(argument: bytes) -> bytes:
+    """Do the work of `build_confined` in the confined process."""
+    order = msgspec.msgpack.decode(argument, type=_Order)
+    file, snapshot, limits = Path(order.file), Path(order.snapshot), order.limits
+    most = limits.model_file_bytes, limits.model_files
+    stage = f"cannot read {file}"
+    try:
+        check_references(file, tuple(map(Path, order.roots)), *most)
+        stage = f"cannot store the snapshot of {file}"
+        compiled, model = compile_snapshot(write_snapshot(file, snapshot), file, snapshot, limits)
+        check_references(snapshot / MODEL_FILE, (snapshot,), *most)  # the server reads it without restrictions
+        exceeded = _exceeded(compiled, limits)
+        if not exceeded:
+            _simulate(model)
+    except Outside as outside:
+        raise ValueError(f"{file}: {outside}") from None
+    except OSError as error:
+        raise ValueError(f"{stage}: {error}") from None
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise ValueError(f"MuJoCo rejects {file}: {error}") from None
+    if exceeded:
+        raise ValueError(f"{file}: {exceeded}")
+    return msgspec.msgpack.encode(compiled)
+
+
+def _simulate(model: mujoco.MjModel) -> None:
+    """Step once, so that a crash or an endless step happens here and not in the server."""
+    with mujoco_messages(), contextlib.suppress(mujoco.FatalError):  # play has other options, and its own errors
+        mujoco.mj_step(model, mujoco.MjData(model))
+
+
+def _exceeded(compiled: Compiled, limits: Limits) -> str:
+    """Return which limit a compiled model exceeds, or nothing."""
+    n_data_bytes = max(compiled.n_data_bytes, compiled.n_arena_bytes)
+    for what, value, name, limit in (
+        ("compiled it takes {} bytes", compiled.n_bytes, "model_bytes", limits.model_bytes),
+        ("simulating it takes {} bytes", n_data_bytes, "data_bytes", limits.data_bytes),
+        ("its sensors give {} numbers", compiled.n_sensor_values, "sensor_values", limits.sensor_values),
+        ("it has a camera of {} pixels", compiled.largest_image, "camera_side", limits.camera_side),
+    ):
+        if value > limit:
+            return f"{what.format(value)}, more than the limit {name}, {limit}"
+    return compiled.options_problem
 
 
 def write_snapshot(file: Path, snapshot: Path) -> Written:
     """Write the snapshot of an MJCF file.
 
     Args:
-        file: The file.
         snapshot: Folder to write, which must not exist.
 
     Raises:
@@ -125,8 +200,6 @@ def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limit
 
     Args:
         written: Result of `write_snapshot`.
-        file: The file.
-        snapshot: Folder of the snapshot.
         limits: For the ranges of its options; nothing is refused here.
 
     Raises:

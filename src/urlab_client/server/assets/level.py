@@ -22,8 +22,8 @@ from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
-from urlab_client.server.controller_text import ControllerText
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, normalized
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -85,7 +85,6 @@ def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> No
     Args:
         path: The level file; missing folders are made.
         actors: The actors in spawn order.
-        content: Where their blueprints are registered.
 
     Raises:
         OSError: It cannot be written.
@@ -129,8 +128,6 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     """Read a level, importing the blueprints it names if the content root lacks them.
 
     Args:
-        path: The level file.
-        content: Where blueprints are registered.
         trusted: The server's operator named the level: its models may lie anywhere, and take
             precedence over different ones of the content root.
 
@@ -229,13 +226,7 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
     """Check an entry and return its actor.
 
     Args:
-        entry: The entry.
-        folder: Folder of the level.
-        blueprints: The blueprints of the level.
         confined_to: Determines the allowed folders; None for any.
-
-    Raises:
-        ValueError: What is wrong with it.
     """
     if not entry.name or entry.name != sanitized(entry.name):
         raise ValueError("a name has letters, digits and underscores only")
@@ -284,7 +275,7 @@ def _check_settings(entry: _Actor) -> None:
     if entry.controller:
         if entry.kind is not ActorKind.ARTICULATION:
             raise ValueError("only an articulation can have a 'controller'")
-        ControllerText.parse(entry.controller)
+        ControllerConfig.parse(entry.controller)
     if entry.kind is ActorKind.ARTICULATION and entry.scale != UNIT_SCALE:
         raise ValueError("an articulation cannot be scaled")
     if 0.0 in entry.scale:

@@ -114,9 +114,6 @@ class Uploads:
 
         Returns:
             Its id, whether the document is needed, and the names of the assets that are.
-
-        Raises:
-            Refusal: `bad_request`, `payload_too_large`; `internal_error` if nothing can be stored.
         """
         assets, total_bytes = manifest.assets, manifest.total_bytes
         _check_hash(manifest.xml_sha256, "xml_sha256")
@@ -208,9 +205,6 @@ class Uploads:
 
         Yields:
             The document, and the requested step mode.
-
-        Raises:
-            Refusal: `bad_request`, with the upload still open; `unknown_upload`.
         """
         if not upload_id:
             raise Refusal("bad_request", "upload_id is empty")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -19,30 +18,11 @@ from urlab_client._mujoco import (
 )
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.server.refusal import CompileFailed
+from urlab_client.simulation.cameras import DEFAULT_CAMERA_SIZE, SceneCamera
+from urlab_client.simulation.controller_config import CUSTOM_TEXT, ControllerConfig
 
 Ints = NDArray[np.int32]
-DEFAULT_CAMERA_SIZE: Final = (640, 480)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneCamera:
-    """A camera of an articulation.
-
-    Attributes:
-        name: Short name.
-        id: Camera id in the model.
-        mode: What its pixels mean: `real`, `depth`, `semantic` or `instance`.
-        resolution: Width and height, pixels.
-        fovy: Vertical field of view, degrees.
-    """
-
-    name: str
-    id: int
-    mode: str = "real"
-    resolution: tuple[int, int] = DEFAULT_CAMERA_SIZE
-    fovy: float = 45.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +74,7 @@ class ArticulationIndex:
     force_adr: Ints
     actuator_types: Mapping[str, str]
     cameras: tuple[SceneCamera, ...]
-    controller: ControllerText | None = None
+    controller: ControllerConfig | None = None
     original_names: Mapping[str, Mapping[str, str]] = field(
         default_factory=lambda: {kind: {} for kind in ("actuators", "joints", "sensors", "bodies")}
     )
@@ -167,12 +147,12 @@ def index_articulation(
     )
 
 
-def _controller(actor: Actor, blueprint: Blueprint) -> ControllerText | None:
+def _controller(actor: Actor, blueprint: Blueprint) -> ControllerConfig | None:
     """Return the controller of an articulation, from the level or else from its MJCF."""
     authored = [text.data for text in blueprint.spec.texts if text.name == CUSTOM_TEXT]
     text = actor.controller or next(iter(authored), "")
     try:
-        return ControllerText.parse(text) if text else None
+        return ControllerConfig.parse(text) if text else None
     except ValueError as error:
         raise CompileFailed(f"{blueprint.stem}: custom text '{CUSTOM_TEXT}': {error}") from None
 

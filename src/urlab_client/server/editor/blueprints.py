@@ -17,13 +17,7 @@ class Blueprints:
     """The imported blueprints, and the actors of the open level that use them."""
 
     def __init__(self, content: ContentRoot, actors: LevelActors, levels: Levels) -> None:
-        """Manage the assets of a content root.
-
-        Args:
-            content: The content root.
-            actors: The actors of the open level.
-            levels: The levels, which are assets, too.
-        """
+        """Manage the assets of a content root."""
         self._content = content
         self._actors = actors
         self._levels = levels
@@ -33,20 +27,13 @@ class Blueprints:
 
         Returns:
             The blueprint, and whether it was imported now.
-
-        Raises:
-            Refusal: `missing_field`, `import_failed`.
         """
         blueprint, imported_now = self._content.import_xml(path, force_reimport=force_reimport, trusted=trusted)
         self._actors.refresh(blueprint)
         return blueprint, imported_now
 
     def import_uploaded(self, document: Path) -> Blueprint:
-        """Import a model that a client has sent; see `ContentRoot.import_uploaded`.
-
-        Raises:
-            Refusal: `import_failed`.
-        """
+        """Import a model that a client has sent; see `ContentRoot.import_uploaded`."""
         blueprint = self._content.import_uploaded(document)
         self._actors.refresh(blueprint)
         return blueprint
@@ -68,10 +55,6 @@ class Blueprints:
 
         Args:
             asset_path: Object path (`/Game/Levels/lab.lab`) or package path.
-
-        Raises:
-            Refusal: `missing_field`; `destroy_asset_failed` if actors of the open level use the blueprint, or the asset
-                cannot be deleted.
         """
         checks.require(asset_path, "asset_path")
         package, dot, name = asset_path.rpartition(".")
@@ -89,11 +72,7 @@ class Blueprints:
             raise Refusal("destroy_asset_failed", f"cannot delete {asset_path}: {error}") from None
 
     def blueprint(self, path: str, code: str) -> Blueprint:
-        """Return the blueprint of a class path or package path.
-
-        Raises:
-            Refusal: `code`.
-        """
+        """Return the blueprint of a class path or package path."""
         found = self._content.find_blueprint(path)
         if found is None:
             known = ", ".join(item.package_path for item in self._content.blueprints.values()) or "none"

@@ -51,9 +51,6 @@ class EditorJobs:
 
         Args:
             work: Returns the reply or error as plain data; does not raise.
-
-        Raises:
-            Refusal: `bad_request` if too many jobs wait, `internal_error` if the thread died.
         """
         with self._lock:
             self._check_alive()
@@ -70,11 +67,7 @@ class EditorJobs:
         return job
 
     def take(self, job: str) -> dict[str, Any] | None:
-        """Return the result of a job and forget the job, or return None while it is not done.
-
-        Raises:
-            Refusal: `unknown_job` if there is no such job, or its result was already returned or has expired.
-        """
+        """Return the result of a job and forget the job, or return None while it is not done; refuse unknown jobs."""
         with self._lock:
             self._expire()
             if job not in self._results:
@@ -89,11 +82,7 @@ class EditorJobs:
 
     @contextmanager
     def alone(self) -> Generator[None]:
-        """Wait until no job is open, and keep new ones waiting meanwhile.
-
-        Raises:
-            Refusal: `internal_error` if the thread died.
-        """
+        """Wait until no job is open, and keep new ones waiting meanwhile."""
         with self._lock:
             self._idle.wait_for(lambda: self._open == 0 or self._death is not None)
             self._check_alive()

@@ -82,11 +82,7 @@ class LevelActors:
         return [actor for actor in self if actor.blueprint is not None and actor.blueprint.stem == blueprint.stem]
 
     def find(self, target: str, code: str) -> Actor:
-        """Return the actor with an id or name.
-
-        Raises:
-            Refusal: `missing_field`, or `code`.
-        """
+        """Return the actor with an id or name."""
         return match_actor(self, target, code)
 
     def of_class(self, actor_id: str, class_name: str, code: str) -> Actor | None:

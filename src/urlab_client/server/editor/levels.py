@@ -59,13 +59,7 @@ class Levels:
     """
 
     def __init__(self, content: ContentRoot, actors: LevelActors, playing: Callable[[], bool]) -> None:
-        """Open an empty, untitled level.
-
-        Args:
-            content: The content root.
-            actors: The actors of the open level.
-            playing: Whether a play session runs.
-        """
+        """Open an empty, untitled level."""
         self._content = content
         self._actors = actors
         self._playing = playing
@@ -73,12 +67,7 @@ class Levels:
         self.external: dict[str, Path] = {}
 
     def create(self, name: str, *, force_overwrite: bool = False) -> str:
-        """Create an empty level, save it, make it the open one and return its path. It has no manager yet.
-
-        Raises:
-            Refusal: `missing_field`; `create_level_failed` if play runs, the name is unusable, the level exists, or it
-                cannot be written.
-        """
+        """Create an empty level, save it, make it the open one and return its path. It has no manager yet."""
         checks.require(name, "name")
         code = "create_level_failed"
         self._refuse_during_play(code)
@@ -96,11 +85,7 @@ class Levels:
         return package
 
     def load(self, name: str) -> str:
-        """Open a level by name or path and return its path; unsaved edits of the open one are lost.
-
-        Raises:
-            Refusal: `missing_field`; `load_level_failed` if play runs, or the level is missing or unusable.
-        """
+        """Open a level by name or path and return its path; unsaved edits of the open one are lost."""
         checks.require(name, "level_path")
         code = "load_level_failed"
         self._refuse_during_play(code)
@@ -114,9 +99,6 @@ class Levels:
         """Open a level file named by the server's operator, and return the level's path.
 
         It may lie anywhere; `save_level` then writes to that file. Its models are imported from the paths in it.
-
-        Raises:
-            Refusal: `load_level_failed`.
         """
         code = "load_level_failed"
         self._refuse_during_play(code)
@@ -132,11 +114,7 @@ class Levels:
         return package
 
     def save(self) -> str:
-        """Save the open level and return its path.
-
-        Raises:
-            Refusal: `save_level_failed` if play runs, the level never had a path, or it cannot be written.
-        """
+        """Save the open level and return its path."""
         code = "save_level_failed"
         self._refuse_during_play(code)
         if self.package == UNTITLED:
@@ -159,7 +137,6 @@ class Levels:
         """Delete a level and return whether there was one; if it was open, an empty level takes its place.
 
         Raises:
-            Refusal: `destroy_asset_failed` for a file outside the content root.
             OSError: It cannot be deleted.
         """
         try:

@@ -135,9 +135,7 @@ class Drawings:
         """Draw.
 
         Args:
-            primitives: What to draw.
             ttl: Seconds to live; 0 for the next frame alone, negative until cleared.
-            in_play: In the play world, rather than the edited one.
         """
         now = self._clock()
         expires = math.inf if ttl < 0.0 else now + ttl if ttl > 0.0 else None

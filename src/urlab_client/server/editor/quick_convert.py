@@ -32,12 +32,8 @@ class QuickConvert:
         """Make a static mesh actor a MuJoCo body from the next play on. Repeating it replaces all settings.
 
         Args:
-            target: Actor id or name.
-            static: No free joint.
             complex_mesh: Several convex parts of a mesh file instead of one hull; needs CoACD.
             coacd_threshold: Concavity that a part may keep.
-            driven_by_unreal: Mocap body.
-            friction: Sliding, torsional, rolling.
 
         Raises:
             Refusal: `missing_field`; `add_quick_convert_failed` for an unknown actor, one without a mesh, a plane that
@@ -62,11 +58,7 @@ class QuickConvert:
         return self._actors.put(replace(actor, quick_convert=settings))
 
     def remove(self, target: str) -> Actor:
-        """Make a static mesh actor decoration again.
-
-        Raises:
-            Refusal: `missing_field`; `remove_quick_convert_failed` for an unknown actor or one without the settings.
-        """
+        """Make a static mesh actor decoration again."""
         code = "remove_quick_convert_failed"
         actor = self._actors.find(target, code)
         if actor.quick_convert is None:

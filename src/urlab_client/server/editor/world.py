@@ -68,7 +68,6 @@ class EditorWorld:
         """Open an empty, untitled level.
 
         Args:
-            content: The content root.
             actor_names: How articulations are named: `model` after the MJCF's model name (`robot`, `copy1_robot`, …),
                 `plugin` as the plugin does (`robot_C_0`, `robot_C_1`, …).
         """
@@ -113,16 +112,11 @@ class EditorWorld:
         """Place an instance of a blueprint, or move the actor that carries the id.
 
         Args:
-            blueprint: Class path or package path.
             actor_id: Stable id; empty for one more actor without id.
             location: Position, metres.
             rotation_quat: Rotation; wins over `rotation_euler`.
             rotation_euler: (roll, pitch, yaw), degrees: Rz(yaw) Ry(-pitch) Rx(-roll).
             scale: Must be 1.
-
-        Raises:
-            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, an invalid pose, or an id
-                that belongs to an actor of another class.
         """
         checks.require(blueprint, "blueprint")
         code = "spawn_failed"
@@ -150,18 +144,12 @@ class EditorWorld:
         """Place a grid of actors, x fastest. Everything is checked before the first is placed.
 
         Args:
-            blueprint: Class path or package path.
             base_actor_id: Cell (i, j) gets the id `<base>_<i>_<j>`; cells that exist are moved.
-            count_x: Cells along x.
-            count_y: Cells along y.
             spacing: Distance between cells, metres; z is ignored.
             origin: Position of cell (0, 0), metres.
             rotation_quat: Rotation of every actor; wins over `rotation_euler`.
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
             scale: Must be 1.
-
-        Raises:
-            Refusal: `missing_field`, `invalid_count`, `too_many_cells`, `spawn_failed`.
         """
         checks.require(blueprint, "blueprint")
         checks.require(base_actor_id, "base_actor_id")
@@ -205,10 +193,6 @@ class EditorWorld:
             location: Position, metres.
             rotation_euler: (roll, pitch, yaw), degrees, in Unreal's frame; the light shines along its +x.
             intensity: In Unreal's unit for that kind; brightness here is relative to 5000.
-            color: Red, green, blue.
-
-        Raises:
-            Refusal: `spawn_failed` for an unknown kind or a number that is not finite.
         """
         code = "spawn_failed"
         name = kind.casefold()
@@ -225,11 +209,7 @@ class EditorWorld:
         )
 
     def destroy_actor(self, target: str) -> None:
-        """Remove an actor from the level; actors attached to it stay where they are.
-
-        Raises:
-            Refusal: `missing_field`, `destroy_failed`.
-        """
+        """Remove an actor from the level; actors attached to it stay where they are."""
         self._actors.remove(self._actors.find(target, "destroy_failed"))
 
     def set_actor_transform(
@@ -243,13 +223,9 @@ class EditorWorld:
         """Move an actor; parts left out stay.
 
         Args:
-            target: Actor id or name.
             location: Position, metres.
             rotation_quat: Rotation; wins over `rotation_euler`.
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
-
-        Raises:
-            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or an invalid pose.
         """
         code = "set_actor_transform_failed"
         actor = self._actors.find(target, code)
@@ -267,12 +243,7 @@ class EditorWorld:
         """Place a copy of an actor, or move the actor of the same class that carries the new id.
 
         Args:
-            target: Actor id or name.
-            new_actor_id: Id of the copy.
             location: Position of the copy, metres; by default 1 m along x from the source.
-
-        Raises:
-            Refusal: `missing_field`; `duplicate_failed` for an unknown actor, a manager, or an id of another class.
         """
         code = "duplicate_failed"
         source = self._actors.find(target, code)
@@ -330,8 +301,6 @@ class EditorWorld:
 
         Args:
             class_filter: Class or parent class, with or without Unreal's leading A, U or F.
-            tag: A whole tag.
-            name_prefix: Beginning of the object name.
             in_pie: Look in the play world, if play runs.
 
         Returns:
@@ -350,24 +319,12 @@ class EditorWorld:
         return found, in_play
 
     def actor_hierarchy(self, target: str) -> ActorHierarchyNode:
-        """Return an actor and the actors attached to it, of the play world while play runs.
-
-        Raises:
-            Refusal: `missing_field`, `actor_hierarchy_failed`.
-        """
+        """Return an actor and the actors attached to it, of the play world while play runs."""
         shown = self._shown()
         return _node(match_actor(shown, target, "actor_hierarchy_failed"), shown)
 
     def get_actor_bounds(self, target: str, *, components_only: bool = False) -> ActorBounds:
-        """Return the box around an actor at its authored pose.
-
-        Args:
-            target: Actor id or name.
-            components_only: Count geoms that collide with nothing, too.
-
-        Raises:
-            Refusal: `missing_field`; `get_actor_bounds_failed` for an unknown actor or a model that does not compile.
-        """
+        """Return the box around an actor at its authored pose."""
         code = "get_actor_bounds_failed"
         actor = self._actors.find(target, code)
         try:
@@ -380,11 +337,7 @@ class EditorWorld:
         return ActorBounds(actor_name=actor.name, min=lower, max=upper, center=(cx, cy, cz), extents=(ex, ey, ez))
 
     def select_actor(self, target: str) -> Actor:
-        """Select one actor and return it.
-
-        Raises:
-            Refusal: `missing_field`, `select_failed`.
-        """
+        """Select one actor and return it."""
         actor = self._actors.find(target, "select_failed")
         self._actors.selected = actor.name
         return actor

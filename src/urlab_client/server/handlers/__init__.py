@@ -1,31 +1,6 @@
 """The op handlers. Importing this package registers all of them; ops without one answer `unsupported`."""
 
-from urlab_client.server.handlers import (
-    cameras,
-    control,
-    debug,
-    outliner,
-    recording,
-    runtime,
-    scene,
-    session,
-    sim,
-    uploads,
-    viewport,
-)
+from urlab_client.server.handlers import control, recording, runtime, scene, session, viewport
 from urlab_client.server.rpc.dispatch import HANDLERS
 
-__all__ = [
-    "HANDLERS",
-    "cameras",
-    "control",
-    "debug",
-    "outliner",
-    "recording",
-    "runtime",
-    "scene",
-    "session",
-    "sim",
-    "uploads",
-    "viewport",
-]
+__all__ = ["HANDLERS", "control", "recording", "runtime", "scene", "session", "viewport"]

@@ -8,34 +8,15 @@ from typing import Final
 
 from urlab_client._platform.files import write_whole
 from urlab_client.enums import StepMode
-from urlab_client.protocol.messages.recording import (
-    RecordingClear,
-    RecordingClearOk,
-    RecordingSave,
-    RecordingSaveOk,
-    RecordingStart,
-    RecordingStartOk,
-    RecordingStop,
-    RecordingStopOk,
-    ReplayListSessions,
-    ReplayListSessionsOk,
-    ReplayLoad,
-    ReplayLoadOk,
-    ReplaySetActive,
-    ReplaySetActiveOk,
-    ReplayStart,
-    ReplayStartOk,
-    ReplayStop,
-    ReplayStopOk,
-)
+from urlab_client.protocol.messages import recording
 from urlab_client.server.core import ServerCore
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.physics.play import Running
-from urlab_client.server.physics.recording import LIVE_SESSION, duration, encode_json
 from urlab_client.server.physics.replay import Player, ReplaySessions, replay_folder
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.simulation.controllers import float32
+from urlab_client.simulation.joint_recording import LIVE_SESSION, duration, encode_json
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""
@@ -48,11 +29,7 @@ def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
 
 
 def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
-    """Return the file that a request names, relative to the folder of recordings, and that folder; links are resolved.
-
-    Raises:
-        Refusal: `code`, if it is a folder or not a usable path.
-    """
+    """Return the resolved file that a request names relative to the folder of recordings, and that folder."""
     try:
         folder = replay_folder(server.world.content.root).resolve()
         file = Path(os.path.abspath(folder / path))
@@ -66,11 +43,7 @@ def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
 
 
 def _to_write(server: ServerCore, path: str) -> Path:
-    """Return the file to save a recording to, in the folder of recordings.
-
-    Raises:
-        Refusal: `path_not_writable`.
-    """
+    """Return the file to save a recording to, in the folder of recordings."""
     file, folder = _locate(server, path, "path_not_writable")
     if file.parent != folder:
         raise Refusal(
@@ -84,11 +57,7 @@ def _to_write(server: ServerCore, path: str) -> Path:
 
 
 def _to_read(server: ServerCore, path: str) -> Path:
-    """Return the file to load a recording from, in the folder of recordings or below a model root.
-
-    Raises:
-        Refusal: `path_not_readable`.
-    """
+    """Return the file to load a recording from, in the folder of recordings or below a model root."""
     file, folder = _locate(server, path, "path_not_readable")
     folders = (folder, *server.world.content.model_roots)
     if not any(file.is_relative_to(allowed) for allowed in folders):
@@ -97,8 +66,8 @@ def _to_read(server: ServerCore, path: str) -> Path:
     return file
 
 
-@handles(RecordingStart)
-def recording_start(server: ServerCore, request: RecordingStart) -> RecordingStartOk:
+@handles(recording.RecordingStart)
+def recording_start(server: ServerCore, request: recording.RecordingStart) -> recording.RecordingStartOk:
     running, sessions = _sessions(server)
     engine, live = running.engine, sessions.live
     limit = request.max_duration_s
@@ -110,23 +79,24 @@ def recording_start(server: ServerCore, request: RecordingStart) -> RecordingSta
         live.start(limit)
         sessions.active = LIVE_SESSION
         engine.on_substep.append(live.capture)
-    return RecordingStartOk(name=LIVE_SESSION, max_duration_s=limit)
+    return recording.RecordingStartOk(name=LIVE_SESSION, max_duration_s=limit)
 
 
-@handles(RecordingStop)
-def recording_stop(server: ServerCore, request: RecordingStop) -> RecordingStopOk:
-    del request
+@handles(recording.RecordingStop)
+def recording_stop(server: ServerCore, _: recording.RecordingStop) -> recording.RecordingStopOk:
     running, sessions = _sessions(server)
     live = sessions.live
     with running.engine.lock:
         if live.capture not in running.engine.on_substep:
             raise Refusal("recording_not_active", "no recording runs")
         running.engine.on_substep.remove(live.capture)
-        return RecordingStopOk(name=LIVE_SESSION, frame_count=len(live.frames), sim_duration_s=duration(live.frames))
+        return recording.RecordingStopOk(
+            name=LIVE_SESSION, frame_count=len(live.frames), sim_duration_s=duration(live.frames)
+        )
 
 
-@handles(RecordingSave)
-def recording_save(server: ServerCore, request: RecordingSave) -> RecordingSaveOk:
+@handles(recording.RecordingSave)
+def recording_save(server: ServerCore, request: recording.RecordingSave) -> recording.RecordingSaveOk:
     running, sessions = _sessions(server)
     file = _to_write(server, request.path or "recording.json")
     with running.engine.lock:
@@ -138,7 +108,7 @@ def recording_save(server: ServerCore, request: RecordingSave) -> RecordingSaveO
         write_whole(file, encode_json(frames))
     except OSError:
         raise Refusal("path_not_writable", "", absolute_path=str(file)) from None
-    return RecordingSaveOk(absolute_path=str(file))
+    return recording.RecordingSaveOk(absolute_path=str(file))
 
 
 def _is_recording(file: Path) -> bool:
@@ -152,46 +122,43 @@ def _is_recording(file: Path) -> bool:
     return text[:1] == b"{" and text[1:].lstrip()[:8].lower() == b'"frames"'
 
 
-@handles(RecordingClear)
-def recording_clear(server: ServerCore, request: RecordingClear) -> RecordingClearOk:
-    del request
+@handles(recording.RecordingClear)
+def recording_clear(server: ServerCore, _: recording.RecordingClear) -> recording.RecordingClearOk:
     running, sessions = _sessions(server)
     with running.engine.lock:
         sessions.live.clear()
-    return RecordingClearOk()
+    return recording.RecordingClearOk()
 
 
-@handles(ReplayLoad)
-def replay_load(server: ServerCore, request: ReplayLoad) -> ReplayLoadOk:
-    _, sessions = _sessions(server)
+@handles(recording.ReplayLoad)
+def replay_load(server: ServerCore, request: recording.ReplayLoad) -> recording.ReplayLoadOk:
+    sessions = _sessions(server)[1]
     path = need(request, request.path, "path")
     file = _to_read(server, path)
     try:
-        return ReplayLoadOk(name=sessions.load(file))
+        return recording.ReplayLoadOk(name=sessions.load(file))
     except FileNotFoundError:
         raise Refusal("path_not_readable", f"{path}: {file} does not exist") from None
     except (OSError, ValueError) as error:
         raise Refusal("path_not_readable", f"{path}: {error}") from None
 
 
-@handles(ReplayListSessions)
-def replay_list_sessions(server: ServerCore, request: ReplayListSessions) -> ReplayListSessionsOk:
-    del request
-    return ReplayListSessionsOk(sessions=_sessions(server)[1].names)
+@handles(recording.ReplayListSessions)
+def replay_list_sessions(server: ServerCore, _: recording.ReplayListSessions) -> recording.ReplayListSessionsOk:
+    return recording.ReplayListSessionsOk(sessions=_sessions(server)[1].names)
 
 
-@handles(ReplaySetActive)
-def replay_set_active(server: ServerCore, request: ReplaySetActive) -> ReplaySetActiveOk:
-    _, sessions = _sessions(server)
+@handles(recording.ReplaySetActive)
+def replay_set_active(server: ServerCore, request: recording.ReplaySetActive) -> recording.ReplaySetActiveOk:
+    sessions = _sessions(server)[1]
     name = need(request, request.name, "name")
     if not sessions.activate(name):
         raise Refusal("replay_session_not_found", name)
-    return ReplaySetActiveOk()
+    return recording.ReplaySetActiveOk()
 
 
-@handles(ReplayStart)
-def replay_start(server: ServerCore, request: ReplayStart) -> ReplayStartOk:
-    del request
+@handles(recording.ReplayStart)
+def replay_start(server: ServerCore, _: recording.ReplayStart) -> recording.ReplayStartOk:
     running, sessions = _sessions(server)
     engine = running.engine
     with engine.lock:
@@ -203,13 +170,12 @@ def replay_start(server: ServerCore, request: ReplayStart) -> ReplayStartOk:
         if frames:
             relative = sessions.active != LIVE_SESSION
             engine.begin_replay(lambda: Player(running.scene, frames, relative=relative))
-        return ReplayStartOk(active_session=sessions.active, total_frames=len(frames))
+        return recording.ReplayStartOk(active_session=sessions.active, total_frames=len(frames))
 
 
-@handles(ReplayStop)
-def replay_stop(server: ServerCore, request: ReplayStop) -> ReplayStopOk:
-    del request
-    running, _ = _sessions(server)
+@handles(recording.ReplayStop)
+def replay_stop(server: ServerCore, _: recording.ReplayStop) -> recording.ReplayStopOk:
+    running = _sessions(server)[0]
     with running.engine.lock:
         running.engine.end_replay()
-    return ReplayStopOk()
+    return recording.ReplayStopOk()

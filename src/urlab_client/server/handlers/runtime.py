@@ -1,47 +1,25 @@
-"""Handlers of the `runtime` ops: live changes to the running simulation."""
+"""Handlers of the `runtime` ops: live changes to the running simulation and its cameras."""
 
 from __future__ import annotations
 
 import math
-from typing import Final, cast
+import zlib
+from collections.abc import Mapping
+from typing import Any, Final, TypeVar, cast
 
 import mujoco
 import numpy as np
 from msgspec import field
 
 from urlab_client.enums import StepMode
-from urlab_client.protocol.messages.runtime import (
-    ConfigureController,
-    ConfigureControllerOk,
-    ContactFilter,
-    GetContacts,
-    GetContactsOk,
-    ListKeyframes,
-    ListKeyframesOk,
-    ReadMocapPose,
-    ReadMocapPoseOk,
-    SetControlSource,
-    SetControlSourceOk,
-    SetMocapPose,
-    SetMocapPoseOk,
-    SetMode,
-    SetModeOk,
-    SetPaused,
-    SetPausedOk,
-    SetQpos,
-    SetQposOk,
-    SetSimOptions,
-    SetSimOptionsOk,
-    SetSimSpeed,
-    SetSimSpeedOk,
-    SetTwist,
-    SetTwistOk,
-)
+from urlab_client.protocol.base import Request
+from urlab_client.protocol.messages import cameras, runtime
 from urlab_client.server.core import ServerCore
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.handlers.control import check_all_owners, check_owner
-from urlab_client.server.physics.controllers import ArticulationControl, ControlSource
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource, float32
 from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
@@ -51,46 +29,46 @@ from urlab_client.values.types import Contact, KeyframeInfo, SimOptions
 MAX_CONTACTS: Final = 64
 
 
-@handles(SetMode)
-def set_mode(server: ServerCore, request: SetMode) -> SetModeOk:
+@handles(runtime.SetMode)
+def set_mode(server: ServerCore, request: runtime.SetMode) -> runtime.SetModeOk:
     engine = server.play.running().engine
     if engine.pinned_mode is not None:
         engine.set_mode(StepMode.LIVE)  # refuses before the field is checked
     previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode"), server.dialect))
-    return SetModeOk(previous_mode=previous, current_mode=current)
+    return runtime.SetModeOk(previous_mode=previous, current_mode=current)
 
 
-@handles(SetPaused)
-def set_paused(server: ServerCore, request: SetPaused) -> SetPausedOk:
+@handles(runtime.SetPaused)
+def set_paused(server: ServerCore, request: runtime.SetPaused) -> runtime.SetPausedOk:
     engine = server.play.running().engine
-    return SetPausedOk(paused=engine.set_paused(need(request, request.paused, "paused")))
+    return runtime.SetPausedOk(paused=engine.set_paused(need(request, request.paused, "paused")))
 
 
-@handles(SetSimSpeed)
-def set_sim_speed(server: ServerCore, request: SetSimSpeed) -> SetSimSpeedOk:
+@handles(runtime.SetSimSpeed)
+def set_sim_speed(server: ServerCore, request: runtime.SetSimSpeed) -> runtime.SetSimSpeedOk:
     engine = server.play.running().engine
     percent = need(request, request.percent, "percent")
     if math.isnan(percent):
         raise Refusal("missing_field", "set_sim_speed: field 'percent' is not a number")
-    return SetSimSpeedOk(percent=engine.set_sim_speed(percent))
+    return runtime.SetSimSpeedOk(percent=engine.set_sim_speed(percent))
 
 
-@handles(SetControlSource)
-def set_control_source(server: ServerCore, request: SetControlSource) -> SetControlSourceOk:
+@handles(runtime.SetControlSource)
+def set_control_source(server: ServerCore, request: runtime.SetControlSource) -> runtime.SetControlSourceOk:
     engine = server.play.running().engine
     source = parse_control_source(need(request, request.source, "source"))
     if not request.articulation:
         check_all_owners(server, request)
         with engine.commanding() as articulations:
             articulations.set_source(source)
-        return SetControlSourceOk(source=source, scope="global")
+        return runtime.SetControlSourceOk(source=source, scope="global")
     check_owner(server, request, engine.articulations.control(request.articulation))
     with engine.commanding() as articulations:
         articulations.set_source(source, request.articulation)
-    return SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
+    return runtime.SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
 
 
-class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
+class AnyTwist(runtime.SetTwist, tag="set_twist", kw_only=True):
     """Reads vectors of any length; missing elements count as 0."""
 
     # Clients send three numbers, as declared; a server accepts any number of them.
@@ -99,26 +77,26 @@ class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
 
 
 @handles(AnyTwist)
-def set_twist(server: ServerCore, request: AnyTwist) -> SetTwistOk:
+def set_twist(server: ServerCore, request: AnyTwist) -> runtime.SetTwistOk:
     engine = server.play.running().engine
     key = need(request, request.articulation, "articulation")
     check_owner(server, request, engine.articulations.control(key))
     with engine.lock:
         twist = engine.articulations.set_twist(key, request.linear, request.angular)
-    return SetTwistOk(articulation=key, linear=twist.linear, angular=twist.angular)
+    return runtime.SetTwistOk(articulation=key, linear=twist.linear, angular=twist.angular)
 
 
-@handles(ConfigureController)
-def configure_controller(server: ServerCore, request: ConfigureController) -> ConfigureControllerOk:
+@handles(runtime.ConfigureController)
+def configure_controller(server: ServerCore, request: runtime.ConfigureController) -> runtime.ConfigureControllerOk:
     engine = server.play.running().engine
     key = need(request, request.articulation, "articulation")
     with engine.commanding() as articulations:
         params = articulations.configure_controller(key, request.params)
-    return ConfigureControllerOk(articulation=key, params=params)
+    return runtime.ConfigureControllerOk(articulation=key, params=params)
 
 
-@handles(SetQpos)
-def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
+@handles(runtime.SetQpos)
+def set_qpos(server: ServerCore, request: runtime.SetQpos) -> runtime.SetQposOk:
     running = server.play.running()
     engine, model, data = running.engine, running.scene.model, running.scene.data
     target = need(request, request.target, "target")
@@ -143,7 +121,7 @@ def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
         data.qpos[addresses] = qpos
         engine.forward()
         written = data.qpos[addresses]
-    return SetQposOk(
+    return runtime.SetQposOk(
         target=target, actor_name=index.key, actor_id=index.actor_id, qpos=written, free_base_shortcut=shortcut
     )
 
@@ -155,8 +133,8 @@ def _by_actor_id(engine: Engine, actor_id: str) -> ArticulationControl:
     raise Refusal("unknown_articulation", actor_id)
 
 
-@handles(SetMocapPose)
-def set_mocap_pose(server: ServerCore, request: SetMocapPose) -> SetMocapPoseOk:
+@handles(runtime.SetMocapPose)
+def set_mocap_pose(server: ServerCore, request: runtime.SetMocapPose) -> runtime.SetMocapPoseOk:
     running = server.play.running()
     body = need(request, request.body, "body")
     mocap = _mocap_id(running.scene.model, body)
@@ -169,17 +147,17 @@ def set_mocap_pose(server: ServerCore, request: SetMocapPose) -> SetMocapPoseOk:
         if request.quat is not None:
             data.mocap_quat[mocap] = request.quat
         pos, quat = _mocap_pose(data, mocap)
-    return SetMocapPoseOk(body=body, pos=pos, quat=quat)
+    return runtime.SetMocapPoseOk(body=body, pos=pos, quat=quat)
 
 
-@handles(ReadMocapPose)
-def read_mocap_pose(server: ServerCore, request: ReadMocapPose) -> ReadMocapPoseOk:
+@handles(runtime.ReadMocapPose)
+def read_mocap_pose(server: ServerCore, request: runtime.ReadMocapPose) -> runtime.ReadMocapPoseOk:
     running = server.play.running()
     body = need(request, request.body, "body")
     mocap = _mocap_id(running.scene.model, body)
     with running.engine.lock:
         pos, quat = _mocap_pose(running.scene.data, mocap)
-    return ReadMocapPoseOk(body=body, pos=pos, quat=quat)
+    return runtime.ReadMocapPoseOk(body=body, pos=pos, quat=quat)
 
 
 def _mocap_id(model: mujoco.MjModel, body: str) -> int:
@@ -198,12 +176,12 @@ def _mocap_pose(data: mujoco.MjData, mocap: int) -> tuple[Vec3, Quat]:
     return (x, y, z), (qw, qx, qy, qz)
 
 
-@handles(GetContacts)
-def get_contacts(server: ServerCore, request: GetContacts) -> GetContactsOk:
+@handles(runtime.GetContacts)
+def get_contacts(server: ServerCore, request: runtime.GetContacts) -> runtime.GetContactsOk:
     running = server.play.running()
     model, data = running.scene.model, running.scene.data
     limit = request.max_contacts if request.max_contacts > 0 else MAX_CONTACTS
-    wanted = request.filter or ContactFilter()
+    wanted = request.filter or runtime.ContactFilter()
     contacts: list[Contact] = []
     with running.engine.lock:
         for number in range(data.ncon):
@@ -211,12 +189,12 @@ def get_contacts(server: ServerCore, request: GetContacts) -> GetContactsOk:
             if contact is None:
                 continue
             if len(contacts) == limit:
-                return GetContactsOk(n_contacts=limit, truncated=True, contacts=contacts)
+                return runtime.GetContactsOk(n_contacts=limit, truncated=True, contacts=contacts)
             contacts.append(contact)
-    return GetContactsOk(n_contacts=len(contacts), truncated=False, contacts=contacts)
+    return runtime.GetContactsOk(n_contacts=len(contacts), truncated=False, contacts=contacts)
 
 
-def _contact(model: mujoco.MjModel, data: mujoco.MjData, number: int, wanted: ContactFilter) -> Contact | None:
+def _contact(model: mujoco.MjModel, data: mujoco.MjData, number: int, wanted: runtime.ContactFilter) -> Contact | None:
     """Return contact `number`, or None when the filter excludes it."""
     raw = data.contact[number]
     (geom1, body1), (geom2, body2) = (_side(model, int(geom)) for geom in raw.geom)
@@ -251,11 +229,10 @@ def _side(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
     )
 
 
-@handles(ListKeyframes)
-def list_keyframes(server: ServerCore, request: ListKeyframes) -> ListKeyframesOk:
-    del request
+@handles(runtime.ListKeyframes)
+def list_keyframes(server: ServerCore, _: runtime.ListKeyframes) -> runtime.ListKeyframesOk:
     model = server.play.running().scene.model
-    return ListKeyframesOk(keyframes=[_keyframe(model, number) for number in range(model.nkey)])
+    return runtime.ListKeyframesOk(keyframes=[_keyframe(model, number) for number in range(model.nkey)])
 
 
 def _keyframe(model: mujoco.MjModel, number: int) -> KeyframeInfo:
@@ -270,21 +247,17 @@ def _keyframe(model: mujoco.MjModel, number: int) -> KeyframeInfo:
     )
 
 
-@handles(SetSimOptions)
-def set_sim_options(server: ServerCore, request: SetSimOptions) -> SetSimOptionsOk:
+@handles(runtime.SetSimOptions)
+def set_sim_options(server: ServerCore, request: runtime.SetSimOptions) -> runtime.SetSimOptionsOk:
     running = server.play.running()
     options = need(request, request.options, "options")
     with running.engine.lock:
         echo = running.options.apply(running.scene.model, running.scene.data, options)
-    return SetSimOptionsOk(options=cast("SimOptions", echo))  # its fields, in the order of the wire
+    return runtime.SetSimOptionsOk(options=cast("SimOptions", echo))  # its fields, in the order of the wire
 
 
 def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
-    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
-
-    Raises:
-        Refusal: `bad_mode`.
-    """
+    """Return the step mode called `text`, in any case. `streaming` means live, and so does `auto` in newer dialects."""
     name = text.casefold()
     try:
         mode = StepMode.LIVE if name == "streaming" else StepMode(name)
@@ -294,12 +267,88 @@ def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
 
 
 def parse_control_source(text: str) -> ControlSource:
-    """Return the control source called `text`, in any case.
-
-    Raises:
-        Refusal: `bad_value`.
-    """
+    """Return the control source called `text`, in any case."""
     try:
         return ControlSource(text.casefold())
     except ValueError:
         raise Refusal("bad_value", f"unknown control source '{text}': use zmq or ui") from None
+
+
+T = TypeVar("T")
+
+
+@handles(cameras.SetCameraStreaming)
+def set_camera_streaming(server: ServerCore, request: cameras.SetCameraStreaming) -> cameras.SetCameraStreamingOk:
+    running = server.play.running()
+    streaming: dict[str, cameras.CameraStreaming] = {}
+    for key, wanted in _known(running, request, request.cameras).items():
+        zmq, shm = _places(wanted)
+        server.switch_camera(key, zmq=zmq, shm=shm)
+        robot, _, part = key.partition("/")
+        streaming[key] = cameras.CameraStreaming(
+            streaming=zmq or shm,
+            zmq=zmq,
+            shm=shm,
+            zmq_endpoint=server.camera_endpoint(robot, part) if zmq else None,
+            zmq_topic=server.dialect.camera_topic(robot, part) if zmq else None,
+        )
+    return cameras.SetCameraStreamingOk(cameras=streaming)
+
+
+@handles(cameras.SetCameraDelay)
+def set_camera_delay(server: ServerCore, request: cameras.SetCameraDelay) -> cameras.SetCameraDelayOk:
+    running = server.play.running()
+    wanted: dict[str, tuple[cameras.CameraDelayInForce, int]] = {}
+    for key, asked in _known(running, request, request.cameras).items():
+        delay = asked if isinstance(asked, cameras.CameraDelay) else cameras.CameraDelay(delay_s=asked)
+        wanted[key] = (_latency(key, delay, running.cameras.latency(key)), delay.seed or zlib.crc32(key.encode()))
+    running.delay_cameras(wanted)
+    return cameras.SetCameraDelayOk(cameras={key: _rounded(latency) for key, (latency, _) in wanted.items()})
+
+
+def _known(running: Running, request: Request[Any], wanted: Mapping[str, T]) -> dict[str, T]:
+    """Return a request's entries for existing cameras, by camera key, ignoring case."""
+    asked = need(request, wanted, "cameras")
+    if not asked:
+        raise Refusal("bad_request", f"{request.__struct_config__.tag}: field 'cameras' is empty")
+    keys = {key.casefold(): key for key in running.cameras.keys}
+    return {keys[name.casefold()]: settings for name, settings in asked.items() if name.casefold() in keys}
+
+
+def _places(wanted: bool | cameras.CameraTransports) -> tuple[bool, bool]:
+    if isinstance(wanted, bool):
+        return wanted, wanted
+    if wanted.zmq is None and wanted.shm is None:
+        return True, True
+    return bool(wanted.zmq), bool(wanted.shm)
+
+
+def _latency(
+    key: str, asked: cameras.CameraDelay, before: cameras.CameraDelayInForce | None
+) -> cameras.CameraDelayInForce:
+    """Return the requested latency."""
+    clock = asked.clock.lower()
+    if clock not in ("sim", "wall"):
+        raise Refusal("bad_request", f"set_camera_delay: clock of '{key}' is '{asked.clock}', not 'sim' or 'wall'")
+    numbers = {"delay_s": asked.delay_s, "jitter_s": asked.jitter_s, "max_fps": asked.max_fps or 0.0}
+    for name, number in numbers.items():
+        if not math.isfinite(float32(number)):
+            raise Refusal("bad_request", f"set_camera_delay: {name} of '{key}' is {number}, not a finite number")
+    keeps = before is not None and asked.on_state_change is None and asked.max_fps is None
+    return cameras.CameraDelayInForce(
+        delay_s=max(0.0, asked.delay_s),
+        jitter_s=max(0.0, asked.jitter_s),
+        clock=clock,
+        on_state_change=before.on_state_change if before is not None and keeps else asked.on_state_change is not False,
+        max_fps=before.max_fps if before is not None and keeps else max(0.0, numbers["max_fps"]),
+    )
+
+
+def _rounded(latency: cameras.CameraDelayInForce) -> cameras.CameraDelayInForce:
+    return cameras.CameraDelayInForce(
+        delay_s=float32(latency.delay_s),
+        jitter_s=float32(latency.jitter_s),
+        clock=latency.clock,
+        on_state_change=latency.on_state_change,
+        max_fps=float32(latency.max_fps),
+    )

@@ -1,4 +1,4 @@
-"""Handlers of the ops without a namespace, and the handshake that `begin_pie` also sends."""
+"""Handlers of the ops without a namespace and of `sim`, and the handshake that `hello` and `begin_pie` send."""
 
 from __future__ import annotations
 
@@ -10,37 +10,19 @@ from typing import Final
 import msgspec
 import mujoco
 
-from urlab_client.enums import ObservationLevel, StepMode
+from urlab_client.enums import ObservationLevel, PIEState, StepMode
+from urlab_client.protocol.messages import session, sim
 from urlab_client.protocol.messages.control import UNCLAIMED
-from urlab_client.protocol.messages.session import (
-    ArticulationInfo,
-    CameraInfo,
-    ControllerInfo,
-    EntityInfo,
-    Forward,
-    ForwardOk,
-    Hello,
-    HelloOk,
-    Meta,
-    MetaOk,
-    OpInfo,
-    OriginalNames,
-    ReplayProgress,
-    Reset,
-    ResetOk,
-    ShmRpcInfo,
-    Step,
-    StepOk,
-)
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RPC_STRIDE
 from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_owner
-from urlab_client.server.physics.controllers import ArticulationControl, float32
+from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import FRAMES_DEADLINE_S, Film
 from urlab_client.server.rpc.dispatch import handles
+from urlab_client.simulation.controllers import float32
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -48,8 +30,8 @@ _PICTURES_WAIT_S: Final = 0.2
 """Default wait of a step for its pictures, seconds."""
 
 
-@handles(Hello)
-def hello(server: ServerCore, request: Hello) -> HelloOk:
+@handles(session.Hello)
+def hello(server: ServerCore, request: session.Hello) -> session.HelloOk:
     reply = handshake(server, "", include_assets=request.include_assets)
     running = server.play.current
     if running is not None:
@@ -59,9 +41,9 @@ def hello(server: ServerCore, request: Hello) -> HelloOk:
     return reply
 
 
-def handshake(server: ServerCore, session_id: str, *, include_assets: bool = False) -> HelloOk:
+def handshake(server: ServerCore, session_id: str, *, include_assets: bool = False) -> session.HelloOk:
     """Describe the server for `hello` and the start of play, without affecting the session."""
-    reply = HelloOk(
+    reply = session.HelloOk(
         session_id=session_id,
         urlab_version=server.dialect.urlab_version,
         mujoco_version_int=mujoco.mj_version(),
@@ -95,8 +77,8 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     return reply
 
 
-def _request_regions(directory: Path) -> ShmRpcInfo:
-    return ShmRpcInfo(
+def _request_regions(directory: Path) -> session.ShmRpcInfo:
+    return session.ShmRpcInfo(
         session=directory.name,
         req_path=str(directory / REQUEST_FILE),
         rep_path=str(directory / REPLY_FILE),
@@ -107,26 +89,26 @@ def _request_regions(directory: Path) -> ShmRpcInfo:
     )
 
 
-def _articulation(server: ServerCore, name: str, control: ArticulationControl) -> ArticulationInfo:
+def _articulation(server: ServerCore, name: str, control: ArticulationControl) -> session.ArticulationInfo:
     index, controller, dialect = control.index, control.controller, server.dialect
     names = index.original_names
-    return ArticulationInfo(
+    return session.ArticulationInfo(
         prefix=name,
         actor_id=index.actor_id,
         actor_name=index.key if dialect.public_names else None,
         default_control_mode="raw" if controller is None else "ue_controller",
         controller=None
         if controller is None
-        else ControllerInfo(kind=controller.kind, params=controller.params(), schema=controller.schema()),
+        else session.ControllerInfo(kind=controller.kind, params=controller.params(), schema=controller.schema()),
         actuator_types=dict(index.actuator_types),
-        original_names=OriginalNames(
+        original_names=session.OriginalNames(
             actuators=dict(names["actuators"]),
             joints=dict(names["joints"]),
             sensors=dict(names["sensors"]),
             bodies=dict(names["bodies"]),
         ),
         camera_topics={
-            dialect.camera_key(name, camera.name): CameraInfo(
+            dialect.camera_key(name, camera.name): session.CameraInfo(
                 mode=server.config.camera_mode(index, camera.name),
                 resolution=camera.resolution,
                 fovy=float32(camera.fovy),
@@ -138,10 +120,10 @@ def _articulation(server: ServerCore, name: str, control: ArticulationControl) -
     )
 
 
-def _entity(entity: EntityIndex) -> EntityInfo:
+def _entity(entity: EntityIndex) -> session.EntityInfo:
     if entity.free_joint_id < 0:
-        return EntityInfo(id=entity.body, has_free_base=False)
-    return EntityInfo(
+        return session.EntityInfo(id=entity.body, has_free_base=False)
+    return session.EntityInfo(
         id=entity.body,
         has_free_base=True,
         free_joint=entity.free_joint,
@@ -151,7 +133,7 @@ def _entity(entity: EntityIndex) -> EntityInfo:
     )
 
 
-def _add_assets(reply: HelloOk, running: Running, *, attached: bool) -> None:
+def _add_assets(reply: session.HelloOk, running: Running, *, attached: bool) -> None:
     reply.vfs_assets = {}
     try:
         reply.mjcf_compiled, reply.vfs_assets = running.scene.export(attached=attached)
@@ -159,14 +141,13 @@ def _add_assets(reply: HelloOk, running: Running, *, attached: bool) -> None:
         logger.warning("the scene cannot be written as MJCF, so the handshake omits it: %s", error)
 
 
-@handles(Meta)
-def meta(server: ServerCore, request: Meta) -> MetaOk:
+@handles(session.Meta)
+def meta(server: ServerCore, _: session.Meta) -> session.MetaOk:
     # Includes ops that this server answers with `unsupported`: the catalogue describes the protocol, and a client must
     # not conclude from it that it talks to another version of the plugin.
-    del request
-    return MetaOk(
+    return session.MetaOk(
         ops=[
-            OpInfo(
+            session.OpInfo(
                 name=op.name,
                 category=op.needs,
                 namespace=op.ns,
@@ -179,8 +160,8 @@ def meta(server: ServerCore, request: Meta) -> MetaOk:
     )
 
 
-@handles(Step)
-def step(server: ServerCore, request: Step) -> StepOk | bytes:
+@handles(session.Step)
+def step(server: ServerCore, request: session.Step) -> session.StepOk | bytes:
     running = server.play.running()
     _check_owners(server, running, request)
     most = server.limits.n_steps
@@ -201,7 +182,7 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         engine, encode = running.engine, running.step_replies.encode
         return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.snapshots.number))
 
-    def observe(mode: StepMode) -> tuple[StepOk, Film | None]:
+    def observe(mode: StepMode) -> tuple[session.StepOk, Film | None]:
         film = None
         if shots and (forms or mode in (StepMode.DIRECT, StepMode.PUPPET)):
             draw = server.dialect.draws_for_steps
@@ -214,17 +195,13 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
     return reply
 
 
-def _pictures_wait_s(request: Step) -> float:
+def _pictures_wait_s(request: session.Step) -> float:
     wait_s = _PICTURES_WAIT_S if request.camera_timeout_ms is None else request.camera_timeout_ms / 1e3
     return min(wait_s, FRAMES_DEADLINE_S) if wait_s > 0 else 0.0  # NaN means no wait, too
 
 
-def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
-    """Refuse commands to robots that the sender does not own, if robots have owners.
-
-    Raises:
-        Refusal: `not_control_owner`; nothing was applied.
-    """
+def _check_owners(server: ServerCore, running: Running, request: session.Step) -> None:
+    """Refuse commands to robots that the sender does not own, if robots have owners."""
     if not server.dialect.claims:
         return
     for name, command in (request.per_articulation or {}).items():
@@ -236,34 +213,80 @@ def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
         check_owner(server, request, control)
 
 
-def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
+def _observe_step(running: Running, level: ObservationLevel) -> session.StepOk:
     engine, observer = running.engine, running.observer
-    return StepOk(
+    return session.StepOk(
         **observer.state(level, engine.time, engine.step_count),
         entities=observer.entities(),
         frame_id=engine.snapshots.number if engine.dialect.frame_ids else None,
         replay=None
         if engine.replay is None
-        else ReplayProgress(current_frame=engine.replay.current_frame, total_frames=engine.replay.total_frames),
+        else session.ReplayProgress(current_frame=engine.replay.current_frame, total_frames=engine.replay.total_frames),
     )
 
 
-@handles(Reset)
-def reset(server: ServerCore, request: Reset) -> ResetOk:
+@handles(session.Reset)
+def reset(server: ServerCore, request: session.Reset) -> session.ResetOk:
     running = server.play.running()
     engine = running.engine
     with engine.lock:
         engine.reset(
             keyframe_name=request.keyframe_name, seed=request.seed, per_articulation_qpos=request.per_articulation_qpos
         )
-        return ResetOk(**running.observer.state(server.session.level, engine.time, engine.step_count))
+        return session.ResetOk(**running.observer.state(server.session.level, engine.time, engine.step_count))
 
 
-@handles(Forward)
-def forward(server: ServerCore, request: Forward) -> ForwardOk:
-    del request
+@handles(session.Forward)
+def forward(server: ServerCore, _: session.Forward) -> session.ForwardOk:
     running = server.play.running()
     engine = running.engine
     with engine.lock:
         engine.forward()
-        return ForwardOk(**running.observer.state(server.session.level, engine.time, engine.step_count))
+        return session.ForwardOk(**running.observer.state(server.session.level, engine.time, engine.step_count))
+
+
+@handles(sim.BeginPie)
+def begin_pie(server: ServerCore, request: sim.BeginPie) -> sim.BeginPieOk:
+    play = server.play
+    if request.level_path:
+        _open_level(server, request.level_path)
+    if play.state not in (PIEState.READY, PIEState.COMPILING):
+        if not server.world.has_manager:
+            return sim.BeginPieOk(
+                state=PIEState.TIMEOUT,
+                compile_error=f"level {server.world.levels.package} has no manager actor: call ensure_manager first",
+            )
+        server.begin_play()
+    state = play.wait(request.timeout_s)
+    reply = sim.BeginPieOk(state=state, compile_error=play.compile_error)
+    if state is PIEState.READY:
+        reply.handshake_payload = payload = handshake(server, request.session_id)
+        payload.urlab_version = server.dialect.urlab_version_at_start
+    return reply
+
+
+def _open_level(server: ServerCore, path: str) -> None:
+    """Open a level and end the current play session; if the level cannot be opened, nothing changes."""
+    world = server.world
+    was_running, world.pie_running = world.pie_running, False
+    try:
+        world.levels.load(path)
+    except BaseException:
+        world.pie_running = was_running
+        raise
+    server.stop_play()
+
+
+@handles(sim.StopPie)
+def stop_pie(server: ServerCore, _: sim.StopPie) -> sim.StopPieOk:
+    server.stop_play()
+    return sim.StopPieOk()
+
+
+@handles(sim.PieStatus)
+def pie_status(server: ServerCore, _: sim.PieStatus) -> sim.PieStatusOk:
+    play = server.play
+    running = play.current
+    return sim.PieStatusOk(
+        state=play.state, compile_error=play.compile_error, sim_time=None if running is None else running.engine.time
+    )

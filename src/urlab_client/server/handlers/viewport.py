@@ -1,56 +1,42 @@
-"""Handlers of the `viewport` ops: the camera of the editor's perspective view."""
+"""Handlers of the `viewport` and `debug` ops: the camera of the perspective view, and drawing into the world."""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
-from urlab_client.protocol.base import Request
-from urlab_client.protocol.messages.viewport import (
-    FrameActor,
-    FrameActorOk,
-    GetCamera,
-    GetCameraOk,
-    SetCamera,
-    SetCameraOk,
-    SetViewportMode,
-    SetViewportModeOk,
-    TrackActor,
-    TrackActorOk,
-    Untrack,
-    UntrackOk,
-)
+from urlab_client.protocol.base import EulerDeg, Request
+from urlab_client.protocol.messages import debug, viewport
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.compile.bounds import actor_bounds
 from urlab_client.server.core import ServerCore
+from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.rpc.dispatch import handles
-from urlab_client.server.rpc.requests import need
-from urlab_client.values.rotation import Quat, Vec3, xyzw
+from urlab_client.server.rpc.requests import need, usable
+from urlab_client.simulation.controllers import float32
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, rotate, swap_frame, xyzw
 
 
-@handles(SetCamera)
-def set_camera(server: ServerCore, request: SetCamera) -> SetCameraOk:
+@handles(viewport.SetCamera)
+def set_camera(server: ServerCore, request: viewport.SetCamera) -> viewport.SetCameraOk:
     location = need_point(request, request.location, "location")
     euler = need_rotator(request, request.rotation_quat, request.rotation_euler)
     fov = request.fov
     server.viewport.place(location, euler=euler, fov=float32(fov) if fov is not None and 0.0 < fov < math.inf else None)
-    view = server.viewport.view
-    return SetCameraOk(location=view.location, rotation_quat=view.rotation, rotation_euler=view.euler, fov=view.fov)
+    return viewport.SetCameraOk(**_seen(server.viewport.view))
 
 
-@handles(GetCamera)
-def get_camera(server: ServerCore, request: GetCamera) -> GetCameraOk:
-    del request
-    view = look(server)
-    return GetCameraOk(location=view.location, rotation_quat=view.rotation, rotation_euler=view.euler, fov=view.fov)
+@handles(viewport.GetCamera)
+def get_camera(server: ServerCore, _: viewport.GetCamera) -> viewport.GetCameraOk:
+    return viewport.GetCameraOk(**_seen(look(server)))
 
 
-@handles(FrameActor)
-def frame_actor(server: ServerCore, request: FrameActor) -> FrameActorOk:
+@handles(viewport.FrameActor)
+def frame_actor(server: ServerCore, request: viewport.FrameActor) -> viewport.FrameActorOk:
     actor = _actor(server, request, request.target, request.target_by)
     try:
         corners = actor_bounds(actor, every_geom=True)
@@ -59,11 +45,11 @@ def frame_actor(server: ServerCore, request: FrameActor) -> FrameActorOk:
     if corners is None:
         raise Refusal("no_bounds", f"'{actor.name}' has no geometry with bounds; planes are endless and do not count")
     server.viewport.view = view = look(server).framing(*corners)
-    return FrameActorOk(location=view.location, rotation_quat=view.rotation, rotation_euler=view.euler, fov=view.fov)
+    return viewport.FrameActorOk(**_seen(view))
 
 
-@handles(SetViewportMode)
-def set_viewport_mode(server: ServerCore, request: SetViewportMode) -> SetViewportModeOk:
+@handles(viewport.SetViewportMode)
+def set_viewport_mode(server: ServerCore, request: viewport.SetViewportMode) -> viewport.SetViewportModeOk:
     name = need(request, request.mode, "mode")
     try:
         mode = ViewMode(name.casefold())
@@ -72,11 +58,11 @@ def set_viewport_mode(server: ServerCore, request: SetViewportMode) -> SetViewpo
     if mode is ViewMode.REFLECTIONS:
         raise Refusal("unsupported", "MuJoCo has no view mode 'reflections'")
     server.viewport.mode = mode
-    return SetViewportModeOk(mode=name)
+    return viewport.SetViewportModeOk(mode=name)
 
 
-@handles(TrackActor)
-def track_actor(server: ServerCore, request: TrackActor) -> TrackActorOk:
+@handles(viewport.TrackActor)
+def track_actor(server: ServerCore, request: viewport.TrackActor) -> viewport.TrackActorOk:
     actor = _actor(server, request, request.target, request.target_by)
     offset = request.offset
     server.viewport.start_tracking(
@@ -86,22 +72,21 @@ def track_actor(server: ServerCore, request: TrackActor) -> TrackActorOk:
             smoothing=request.smoothing,
         )
     )
-    return TrackActorOk(tracked_actor_path=server.world.actor_path(actor))
+    return viewport.TrackActorOk(tracked_actor_path=server.world.actor_path(actor))
 
 
-@handles(Untrack)
-def untrack(server: ServerCore, request: Untrack) -> UntrackOk:
-    del request
+@handles(viewport.Untrack)
+def untrack(server: ServerCore, _: viewport.Untrack) -> viewport.UntrackOk:
     _tracked(server)
-    return UntrackOk(was_tracking=server.viewport.stop_tracking())
+    return viewport.UntrackOk(was_tracking=server.viewport.stop_tracking())
+
+
+def _seen(view: ViewportCamera) -> dict[str, Any]:
+    return {"location": view.location, "rotation_quat": view.rotation, "rotation_euler": view.euler, "fov": view.fov}
 
 
 def need_point(request: Request[Any], value: Vec3, field: str) -> Vec3:
-    """Return the value of a required vector field.
-
-    Raises:
-        Refusal: `missing_field` if it is absent, malformed or not finite.
-    """
+    """Return the value of a required vector field."""
     point = need(request, value, field)
     if not all(map(math.isfinite, point)):
         raise Refusal("missing_field", f"{request.__struct_config__.tag}: '{field}' needs finite numbers")
@@ -109,11 +94,7 @@ def need_point(request: Request[Any], value: Vec3, field: str) -> Vec3:
 
 
 def need_rotator(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -> Vec3 | None:
-    """Return the rotator (roll, pitch, yaw), degrees, of a request's rotation in Unreal's frame; None without one.
-
-    Raises:
-        Refusal: `missing_field` for numbers that do not form a rotation.
-    """
+    """Return the rotator (roll, pitch, yaw), degrees, of a request's rotation in Unreal's frame; None without one."""
     try:
         return rotator(quat, euler)
     except ValueError as error:
@@ -158,3 +139,121 @@ def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
         x, y, z = data.xpos[body].tolist()
         quat = data.xquat[body].tolist()
     return (x, y, z), xyzw((quat[0], quat[1], quat[2], quat[3]))
+
+
+YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
+"""Replaces an invalid colour."""
+
+_RED: Final[Vec3] = (1.0, 0.0, 0.0)
+_GREEN: Final[Vec3] = (0.0, 1.0, 0.0)
+_BLUE: Final[Vec3] = (0.0, 0.0, 1.0)
+
+_HEAD: Final = 0.2
+"""Length of an arrow's head as a fraction of the arrow."""
+
+
+class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True, omit_defaults=True):
+    """A box request with the angles that the plugin also reads, although its clients do not send them."""
+
+    rotation_euler: EulerDeg | None = None
+
+
+@handles(debug.DrawMarker)
+def draw_marker(server: ServerCore, request: debug.DrawMarker) -> debug.DrawMarkerOk:
+    at, color = need_point(request, request.location, "location"), _color(request.color)
+    _draw(server, [Sphere(center=at, color=color)], request.ttl)
+    if request.label:
+        # As in the plugin, text without a time to live is permanent.
+        _draw(server, [Text(at=at, text=request.label, color=color)], request.ttl if request.ttl > 0.0 else -1.0)
+    return debug.DrawMarkerOk()
+
+
+@handles(debug.DrawLine)
+def draw_line(server: ServerCore, request: debug.DrawLine) -> debug.DrawLineOk:
+    line = DebugLine(
+        start=need_point(request, request.from_, "from"),
+        end=need_point(request, request.to, "to"),
+        color=_color(request.color),
+        thickness=_size(request.thickness, 1.0),
+    )
+    _draw(server, [line], request.ttl)
+    return debug.DrawLineOk()
+
+
+@handles(RotatedBox)
+def draw_box(server: ServerCore, request: RotatedBox) -> debug.DrawBoxOk:
+    center = need_point(request, request.center, "center")
+    x, y, z = need_point(request, request.half_extents, "half_extents")
+    box = Box(
+        center=center,
+        half_extents=(abs(x), abs(y), abs(z)),
+        rotation=_rotation(request, request.rotation_quat, request.rotation_euler),
+        color=_color(request.color),
+    )
+    _draw(server, [box], request.ttl)
+    return debug.DrawBoxOk()
+
+
+@handles(debug.DrawArrow)
+def draw_arrow(server: ServerCore, request: debug.DrawArrow) -> debug.DrawArrowOk:
+    start = need_point(request, request.from_, "from")
+    end = need_point(request, request.to, "to")
+    arrow = Arrow(
+        start=start,
+        end=end,
+        color=_color(request.color),
+        head=_size(request.arrow_size, _HEAD * math.dist(start, end)),
+        thickness=_size(request.thickness, 1.0),
+    )
+    _draw(server, [arrow], request.ttl)
+    return debug.DrawArrowOk()
+
+
+@handles(debug.DrawAxes)
+def draw_axes(server: ServerCore, request: debug.DrawAxes) -> debug.DrawAxesOk:
+    origin = need_point(request, request.location, "location")
+    rotation = _rotation(request, request.rotation_quat, request.rotation_euler)
+    length = abs(request.scale) if math.isfinite(request.scale) else 0.2
+    arrows: list[Primitive] = []
+    # Unreal's axes: y is opposite to MuJoCo's.
+    for axis, color in (((length, 0.0, 0.0), _RED), ((0.0, -length, 0.0), _GREEN), ((0.0, 0.0, length), _BLUE)):
+        dx, dy, dz = rotate(rotation, axis)
+        x, y, z = origin
+        arrows.append(Arrow(start=origin, end=(x + dx, y + dy, z + dz), color=color, head=_HEAD * length))
+    _draw(server, arrows, request.ttl)
+    return debug.DrawAxesOk()
+
+
+@handles(debug.ClearMarkers)
+def clear_markers(server: ServerCore, _: debug.ClearMarkers) -> debug.ClearMarkersOk:
+    server.drawings.clear(in_play=server.world.pie_running)
+    return debug.ClearMarkersOk()
+
+
+@handles(debug.SetOverlayText)
+def set_overlay_text(server: ServerCore, request: debug.SetOverlayText) -> debug.SetOverlayTextOk:
+    server.drawings.set_overlay(usable(request.text, ""))
+    return debug.SetOverlayTextOk()
+
+
+def _draw(server: ServerCore, primitives: Sequence[Primitive], ttl: float) -> None:
+    server.drawings.add(primitives, ttl=ttl, in_play=server.world.pie_running)
+
+
+def _color(color: Vec3) -> Vec3:
+    """Return a colour in steps of a byte; yellow by default."""
+    red, green, blue = (_channel(value) for value in usable(color, YELLOW))
+    return red, green, blue
+
+
+def _channel(value: float) -> float:
+    return 0.0 if math.isnan(value) else math.trunc(min(max(value, 0.0), 1.0) * 255.0) / 255.0
+
+
+def _size(value: float | None, otherwise: float) -> float:
+    return value if value is not None and 0.0 < value < math.inf else otherwise
+
+
+def _rotation(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -> Quat:
+    angles = need_rotator(request, quat, euler)
+    return IDENTITY if angles is None else swap_frame(euler_to_quat(angles))

@@ -15,8 +15,9 @@ from urlab_client.protocol.messages.session import ArticulationCommand
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.dialects import Dialect
-from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource, Twist
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controller_config import ControllerConfig
 
 
 class Articulations:
@@ -31,7 +32,6 @@ class Articulations:
         """Give each articulation of a scene neutral set-points and its controller.
 
         Args:
-            scene: The scene.
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             dialect: Decides what articulations are called.
         """
@@ -73,11 +73,7 @@ class Articulations:
         return self._folded.get(key.casefold()) if control is None else control
 
     def control(self, key: str) -> ArticulationControl:
-        """Return the articulation with this key, in any case.
-
-        Raises:
-            Refusal: `unknown_articulation`.
-        """
+        """Return the articulation with this key, in any case."""
         control = self.find(key)
         if control is None:
             raise Refusal("unknown_articulation", key)
@@ -88,20 +84,12 @@ class Articulations:
         return self._names[control]
 
     def set_source(self, source: ControlSource, key: str | None = None) -> None:
-        """Choose which set-points drive the articulation `key`, or all when None.
-
-        Raises:
-            Refusal: `unknown_articulation`.
-        """
+        """Choose which set-points drive the articulation `key`, or all when None."""
         for control in self.controls.values() if key is None else [self.control(key)]:
             control.set_points.source = source
 
     def set_twist(self, key: str, linear: Sequence[float], angular: Sequence[float]) -> Twist:
-        """Store a commanded twist (m/s, rad/s, base frame) and return it as stored.
-
-        Raises:
-            Refusal: `unknown_articulation`.
-        """
+        """Store a commanded twist (m/s, rad/s, base frame) and return it as stored."""
         twist = self.control(key).twist
         twist.set(linear, angular)
         return twist
@@ -110,11 +98,7 @@ class Articulations:
         """Change controller parameters, switch the controller on and return all parameters.
 
         Args:
-            key: Articulation key.
             params: Parameter names to values; anything but a mapping changes nothing.
-
-        Raises:
-            Refusal: `unknown_articulation`, `no_controller`.
         """
         controller = self.control(key).controller
         if controller is None:

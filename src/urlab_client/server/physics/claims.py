@@ -37,31 +37,19 @@ class ControlClaims:
         return UNCLAIMED if claim is None else claim.owner
 
     def claim(self, key: str, owner: str, ttl_s: float, *, force: bool) -> None:
-        """Make `owner` the owner.
-
-        Raises:
-            Refusal: `control_claimed` if another client owns the robot.
-        """
+        """Make `owner` the owner, unless another client is."""
         holder = self.owner(key)
         if holder not in (UNCLAIMED, owner) and not force:
             raise Refusal("control_claimed", f"'{key}' belongs to '{holder}'", owner=holder)
         self._claims[key] = _Claim(owner, ttl_s, self._clock())
 
     def release(self, key: str, owner: str) -> None:
-        """Release the claim on a robot.
-
-        Raises:
-            Refusal: `not_control_owner` if `owner` does not own it.
-        """
+        """Release the claim on a robot."""
         self.check(key, owner)
         del self._claims[key]
 
     def check(self, key: str, owner: str) -> None:
-        """Check that a client may write to a robot, and renew its claim.
-
-        Raises:
-            Refusal: `not_control_owner` if `owner` does not own it.
-        """
+        """Refuse a write to a robot by anybody but its owner, and renew the claim."""
         holder = self.owner(key)
         if holder != owner:
             status = "is unclaimed: claim it first" if holder == UNCLAIMED else f"belongs to '{holder}'"
@@ -69,11 +57,7 @@ class ControlClaims:
         self._claims[key].touched = self._clock()
 
     def check_all(self, keys: Iterable[str], owner: str) -> None:
-        """Check that no other client owns any of these robots.
-
-        Raises:
-            Refusal: `not_control_owner` if another client owns one.
-        """
+        """Refuse a write to robots of which another client owns one."""
         for key in keys:
             holder = self.owner(key)
             if holder not in (UNCLAIMED, owner):

@@ -81,11 +81,7 @@ class DataLock:
         self._call = call
 
     def acquire(self) -> bool:
-        """Acquire the lock; return False if it does not become free in time.
-
-        Raises:
-            Refusal: `not_ready`, immediately, while a MuJoCo call is overdue.
-        """
+        """Acquire the lock, or return False if it does not become free in time. Refuses while a call is overdue."""
         if self.inner.acquire(blocking=False):
             return True
         overdue = self._call.overdue
@@ -99,11 +95,7 @@ class DataLock:
 
     @contextmanager
     def look(self) -> Generator[None]:
-        """Hold the lock, or proceed without it while a MuJoCo call is overdue. For data that no step changes.
-
-        Raises:
-            Refusal: `not_ready` if physics is busy, but no call is overdue.
-        """
+        """Hold the lock, or proceed without it while a MuJoCo call is overdue. For data that no step changes."""
         with ExitStack() as held:
             try:
                 held.enter_context(self)

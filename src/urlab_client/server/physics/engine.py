@@ -23,7 +23,7 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
-from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig
+from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
 from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks, shutting_down
 from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
@@ -33,6 +33,7 @@ from urlab_client.server.physics.replay import Player
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
+from urlab_client.simulation.controller_config import ControllerConfig
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -83,12 +84,9 @@ class Engine:
         Args:
             scene: Compiled scene; the engine steps its `data` in place.
             pinned_mode: Start in this mode and refuse `set_mode`; None or `auto` starts live and leaves it free.
-            paused: Whether physics starts paused.
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
             health: Receives a report if the physics thread dies.
-            dialect: Determines the names of articulations, and side effects of steps.
-            randomise: Variations to apply at each reset.
 
         Raises:
             ValueError: A name in `randomise` matches no element.
@@ -210,9 +208,6 @@ class Engine:
 
         Args:
             make: Makes the player once the data are reset.
-
-        Raises:
-            Refusal: `not_ready` with MuJoCo's text.
         """
         with self.lock:
             self.reset()
@@ -302,9 +297,6 @@ class Engine:
             seed: Remembered, also when the keyframe turns out to be unknown; decides what varies, if anything does.
             per_articulation_qpos: First coordinate of a joint (m or rad) by articulation key and joint name, with or
                 without prefix; unknown keys and joints are ignored.
-
-        Raises:
-            Refusal: `unknown_keyframe`, or `not_ready` with MuJoCo's text.
         """
         with self.lock:
             if seed is not None:
@@ -327,11 +319,7 @@ class Engine:
             self._kick()
 
     def forward(self) -> None:
-        """Run `mj_forward`; time and step counter stay.
-
-        Raises:
-            Refusal: `not_ready` with MuJoCo's text.
-        """
+        """Run `mj_forward`; time and step counter stay."""
         with self.lock:
             self._tick_if_due()
             try:
@@ -344,9 +332,6 @@ class Engine:
 
         The active mode again changes nothing. A real change drops queued steps, whose callers get `step_timeout`, and
         unpauses unless the new mode is live. `auto` behaves as live.
-
-        Raises:
-            Refusal: `mode_locked_by_server`.
         """
         with self.lock:
             if self._pinned is not None:

@@ -142,7 +142,6 @@ class Observer:
         """Prepare for a scene.
 
         Args:
-            scene: The scene.
             controls: `Articulations.controls` of the engine that steps it; holds the twists.
             channels: The user channels; None for none.
         """
@@ -159,9 +158,7 @@ class Observer:
         """Return the fields that all replies and messages with a state share.
 
         Args:
-            level: Which fields the articulations have.
             time: `mjData.time`, seconds.
-            step: Step counter of the session.
         """
         return StateFields(
             time=time,

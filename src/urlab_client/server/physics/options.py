@@ -17,8 +17,8 @@ from msgspec import Struct, defstruct
 from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.limits import Limits, option_problem
-from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.types import SimOptions
 
 CHOICES: Final[Mapping[str, Mapping[str, Any]]] = {
@@ -74,13 +74,7 @@ class OptionOverrides:
     """
 
     def __init__(self, model: mujoco.MjModel, limits: Limits, dialect: Dialect = ALPHA) -> None:
-        """Start with the integrator the scene was compiled with.
-
-        Args:
-            model: The model of the play session.
-            limits: For the iterations.
-            dialect: Decides the precision of numbers and the spelling of keywords.
-        """
+        """Start with the integrator the scene was compiled with."""
         self._limits = limits
         self._dialect = dialect
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}

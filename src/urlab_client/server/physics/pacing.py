@@ -8,7 +8,7 @@ from typing import Final
 
 import mujoco
 
-from urlab_client.server.physics.controllers import float32
+from urlab_client.simulation.controllers import float32
 
 MIN_SPEED: Final = 5.0
 MAX_SPEED: Final = 100.0
@@ -53,9 +53,6 @@ class LivePacing:
 
     def take_slot(self, *, idle: bool) -> float:
         """Take the next slot if it is due.
-
-        Args:
-            idle: Whether an iteration would change nothing and no hook observes it.
 
         Returns:
             0 if the slot was taken, otherwise the seconds to wait before the next call.

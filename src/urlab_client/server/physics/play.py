@@ -38,17 +38,7 @@ _DEFAULT_LIMITS: Final = Limits()
 
 @dataclass(frozen=True)
 class Running:
-    """A simulation that is ready.
-
-    Attributes:
-        scene: The compiled scene.
-        engine: The engine that steps it, started.
-        observer: Reads its state.
-        cameras: Renders its cameras.
-        recordings: Files in the folder of recordings at the start.
-        limits: Limits on client requests.
-        channels: The user channels.
-    """
+    """A simulation that is ready."""
 
     scene: CompiledScene
     engine: Engine
@@ -162,11 +152,7 @@ class Play:
         return None if attempt is None else attempt.running
 
     def running(self) -> Running:
-        """Return the simulation.
-
-        Raises:
-            Refusal: `not_ready` if no simulation is running; the message gives the reason.
-        """
+        """Return the simulation; refuse with `not_ready` and the reason if none is running."""
         running = self.current
         if running is None:
             error = self.compile_error
@@ -197,9 +183,6 @@ class Play:
 
         Args:
             timeout_s: Seconds to wait; afterwards the state is `TIMEOUT`, and compilation continues.
-
-        Raises:
-            Refusal: `shutting_down` if the server is stopping.
         """
         # NaN compares false, so it does not wait.
         wait_s = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0

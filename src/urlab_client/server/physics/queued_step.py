@@ -57,7 +57,6 @@ class QueuedStep(Generic[T]):
         Args:
             remaining: Seconds until `step_timeout` is raised.
             timeout: The whole step timeout, seconds, for the message.
-            runs_late: Whether a step that has not begun by then stays queued.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True

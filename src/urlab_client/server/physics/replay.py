@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
-from urlab_client.server.physics.recording import (
+from urlab_client.simulation.joint_recording import (
     LIVE_SESSION,
     Frame,
     JointLayout,
@@ -35,17 +35,12 @@ Floats = NDArray[np.float64]
 
 
 class Player:
-    """A session that plays in place of physics, in a loop. `advance` is a function of the time played alone.
-
-    Attributes:
-        total_frames: Frames of the session.
-    """
+    """A session that plays in place of physics, in a loop. `advance` is a function of the time played alone."""
 
     def __init__(self, scene: CompiledScene, frames: Sequence[Frame], *, relative: bool) -> None:
         """Prepare to play from the first frame.
 
         Args:
-            scene: The scene, in the state in which the replay starts.
             frames: At least one frame.
             relative: Shift free joints so that the first recorded position is where the joint is now.
         """
@@ -183,22 +178,15 @@ def _slerp(value: Floats, target: Floats, share: float) -> Floats:
 
 
 class ReplaySessions:
-    """The sessions of a play session: the live recording and what was loaded.
-
-    Attributes:
-        live: What recording writes to.
-        active: Name of the session that is saved and played.
-    """
+    """The sessions of a play session: the live recording and what was loaded."""
 
     def __init__(self, scene: CompiledScene, files: Sequence[Path] = (), limits: Limits = _DEFAULT_LIMITS) -> None:
         """Start with an empty recording.
 
         Args:
-            scene: What is recorded.
             files: The recordings that were there when play started; `scan` loads them.
-            limits: Sizes of recordings.
         """
-        self.live: LiveRecording = LiveRecording(scene, limits.recording_bytes)
+        self.live: LiveRecording = LiveRecording(scene.model, scene.data, limits.recording_bytes)
         self._most = limits.recording_file_bytes
         self.active: str = LIVE_SESSION
         self._loaded: dict[str, list[Frame]] = {}

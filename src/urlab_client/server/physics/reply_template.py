@@ -46,9 +46,7 @@ class StepReplies:
         """Prepare for a scene.
 
         Args:
-            scene: The scene.
             controls: `Articulations.controls` of the engine that steps it; holds the twists.
-            dialect: What the replies look like.
         """
         self._scene = scene
         self._dialect = dialect
@@ -62,10 +60,7 @@ class StepReplies:
         """Return the msgpack frame of a `StepOk` without cameras and replay. The caller holds the engine's lock.
 
         Args:
-            level: Which fields it has.
             time: `mjData.time`, seconds.
-            step: Step counter.
-            frame_id: Number of the snapshot, in dialects that tell it.
         """
         scalars = [time, step, *sim_seconds(time), *wall_seconds(), frame_id]
         for twist in self._twists:

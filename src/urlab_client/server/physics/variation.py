@@ -16,7 +16,7 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
 from urlab_client.server.compile.scene import CompiledScene, saved_model
 from urlab_client.server.physics.articulations import Articulations
-from urlab_client.server.physics.controllers import PDController
+from urlab_client.simulation.controllers import PDController
 
 
 class SceneVariation:

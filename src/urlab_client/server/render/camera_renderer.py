@@ -26,15 +26,13 @@ from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
-from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.dialects import ALPHA, Dialect
-from urlab_client.server.render.appearance import Appearance, RenderQuality
-from urlab_client.server.render.drawing import Stage
-from urlab_client.server.render.latency import Instant, Latency, Past
-from urlab_client.server.render.opengl import RenderingUnavailable, need_backend, search_backend
-from urlab_client.server.render.tints import Tints
-from urlab_client.server.render.viewport_picture import ViewportPicture
+from urlab_client.server.render.viewport_picture import ViewportPicture, ViewportStage
 from urlab_client.server.system.health import Health, ended
+from urlab_client.simulation.appearance import Appearance, RenderQuality
+from urlab_client.simulation.cameras import Instant, Latency, Past, SceneCamera
+from urlab_client.simulation.opengl import RenderingUnavailable, need_backend, search_backend
+from urlab_client.simulation.tints import Tints
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -463,7 +461,7 @@ class CameraRenderer:
             with self._lock:
                 self._drawing = not self._closed
             if self._drawing and self._model is not None:
-                with Stage(self._model, backend, self._tints, self._quality) as stage:
+                with ViewportStage(self._model, backend, self._tints, self._quality) as stage:
                     atexit.register(self.close)  # after the driver's own hook, so before it at the end
                     self._ready.set()
                     self._draw(stage)
@@ -475,7 +473,7 @@ class CameraRenderer:
                 self._ready.set()
                 self._release()
 
-    def _draw(self, stage: Stage) -> None:
+    def _draw(self, stage: ViewportStage) -> None:
         failed = 0
         while (job := self._queue.get()) is not None:
             try:
@@ -496,7 +494,7 @@ class CameraRenderer:
                 self._pending.discard(job)
             job.done.set()
 
-    def _draw_job(self, stage: Stage, job: Exposure | Painting) -> None:
+    def _draw_job(self, stage: ViewportStage, job: Exposure | Painting) -> None:
         if isinstance(job, Painting):
             job.pixels = stage.paint(job.data, job.picture)
             return

@@ -1,6 +1,6 @@
 """The viewport's picture: where MuJoCo's camera goes, what the view modes mean, and debug drawing as geoms.
 
-For `drawing`. Nothing here needs OpenGL.
+Only `ViewportStage` needs OpenGL.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from urlab_client.server.compile.bounds import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
+from urlab_client.simulation.drawing import Bytes, Stage
+from urlab_client.simulation.sunlight import follow_subject
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, rotate
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -221,3 +223,41 @@ def _arrow(arrow: Arrow) -> list[_Stroke]:
 def _point(values: NDArray[np.float64]) -> Vec3:
     x, y, z = values.tolist()
     return x, y, z
+
+
+class ViewportStage(Stage):
+    """Draws pictures of cameras and of the viewport."""
+
+    def paint(self, data: mujoco.MjData, picture: ViewportPicture) -> Bytes:
+        """Draw the viewport; return red, green, blue and alpha from the top, shape (height, width, 4)."""
+        width, height = picture.size
+        view, mode, renderer = picture.view, picture.mode, self._renderer
+        if width > renderer.offWidth or height > renderer.offHeight:
+            mujoco.mjr_resizeOffscreen(max(width, renderer.offWidth), max(height, renderer.offHeight), renderer)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
+        if picture.fit and (bounds := bounds_of(self._model, data, self._model.geom_rgba[:, 3] > 0.0)):
+            view = view.framing(*bounds)
+        self._model.vis.global_.fovy = view.fovy(width / height)
+        aim(self._view, view)
+        kinds_of_geoms = mujoco.mjtCatBit.mjCAT_ALL.value
+        with showing(mode, self._model, self._option):
+            mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, kinds_of_geoms, self._scene)
+        for side in self._scene.camera:
+            side.forward[:], side.up[:] = view.forward, view.up
+        if not self._fast:
+            follow_subject(self._scene, self._model, data, self._subjects)
+        if mode is ViewMode.UNLIT:
+            light_evenly(self._scene)
+        add_primitives(self._scene, picture.primitives)
+        if picture.selected and (bounds := bounds_of(self._model, data, self._tints.owned_by(picture.selected))):
+            add_primitives(self._scene, [outline(bounds)])
+        flags, kinds = self._scene.flags, mujoco.mjtRndFlag
+        flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast and mode is ViewMode.LIT
+        flags[kinds.mjRND_SEGMENT] = flags[kinds.mjRND_IDCOLOR] = False
+        flags[kinds.mjRND_WIREFRAME] = mode is ViewMode.WIREFRAME
+        area = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(area, self._scene, renderer)
+        if picture.overlay:
+            font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
+            mujoco.mjr_overlay(font, corner, area, ascii_text(picture.overlay), "", renderer)
+        return self._read_colors(area, "RGBA")

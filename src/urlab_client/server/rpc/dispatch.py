@@ -124,12 +124,7 @@ class Dispatcher:
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Create the dispatcher of a server.
-
-        Args:
-            core: State that the handlers share.
-            table: The handlers.
-        """
+        """Create the dispatcher of a server."""
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)

@@ -52,15 +52,7 @@ def bad_request(why: str) -> Refusal:
 
 
 def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
-    """Return the map of a frame, in msgpack or JSON.
-
-    Args:
-        frame: The frame.
-        depth: Maximum nesting depth.
-
-    Raises:
-        Refusal: `bad_request`.
-    """
+    """Return the map of a frame, in msgpack or JSON."""
     data: Plain = None
     if frame[:1] and frame[0] not in _JSON_FIRST:
         data = _decoded(frame, msgspec.msgpack.decode)

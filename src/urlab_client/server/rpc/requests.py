@@ -60,16 +60,7 @@ def usable(value: T, otherwise: T) -> T:
 
 
 def need(request: Request[Any], value: T, field: str) -> T:
-    """Return the value of a required field.
-
-    Args:
-        request: The request, named in the refusal.
-        value: The field's value.
-        field: Name of the field on the wire.
-
-    Raises:
-        Refusal: `missing_field` if the value is absent, of an unusable type, or an empty string.
-    """
+    """Return the value of a required field; refuse it with `missing_field` if it is absent, unusable or empty."""
     if value is UNSET or (isinstance(value, str) and not value):
         op = request.__struct_config__.tag
         raise Refusal("missing_field", f"{op}: field '{field}' is missing, empty or of the wrong type")
@@ -89,9 +80,7 @@ class RequestReader:
         """Create the reader of a server.
 
         Args:
-            ops: All ops by name.
             structs: Struct with more fields than the declared one, from which it must derive, by op name.
-            limits: Limits on requests.
         """
         for name, struct in structs.items():
             if not issubclass(struct, OPS[name].request):
@@ -103,11 +92,7 @@ class RequestReader:
         self._hot: dict[type, Op] = {op.request: op for op in ops.values() if op.hot}
 
     def read(self, frame: bytes) -> Incoming:
-        """Decode one frame.
-
-        Raises:
-            Refusal: `bad_request` if the frame is neither a msgpack map nor a JSON object, or exceeds a limit.
-        """
+        """Decode one frame."""
         most = self._limits.request_bytes
         if len(frame) > most:
             raise bad_request(f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")

@@ -81,12 +81,7 @@ class Tick:
 
 
 class Broadcast:
-    """Turns the ticks of one play session into messages.
-
-    Attributes:
-        running: The simulation.
-        full_wanted: Whether the snapshot is subscribed to.
-    """
+    """Turns the ticks of one play session into messages."""
 
     def __init__(
         self,
@@ -97,9 +92,7 @@ class Broadcast:
         """Prepare the messages of a scene; `want` selects which are encoded.
 
         Args:
-            running: The simulation.
             hand_over: Passes a tick to the sending thread; called under the engine's lock.
-            memory: Shared memory that also gets snapshots, when it wants them.
         """
         self.running = running
         self._hand_over = hand_over

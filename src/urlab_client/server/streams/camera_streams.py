@@ -28,7 +28,7 @@ from urlab_client.server.system.health import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
-from urlab_client.values.pixels import camera_header
+from urlab_client.values.pictures import camera_header
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -103,11 +103,8 @@ class CameraStreams:
 
         Args:
             health: Notified when the thread dies.
-            host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
             curve_keys: Who may connect; None for anyone who can reach the interface.
-            memory: Shared memory that also gets the images, in every mode.
-            dialect: Determines when images are sent, their topic and their header.
 
         Raises:
             PortInUse: The port is in use.

@@ -81,14 +81,9 @@ class StreamServer:
         """Bind the sockets; `start` begins to serve.
 
         Args:
-            cameras: Returns the endpoints of a scene's cameras, for the info stream.
             health: Notified when the thread dies.
-            host: IP address of the interface.
             state_port: TCP port; 0 selects a free port, as for the other ports.
-            ctrl_port: TCP port.
-            info_port: TCP port.
             curve_keys: Who may connect; None for anyone who can reach the interface.
-            memory: Shared memory that also gets the snapshots.
 
         Raises:
             PortInUse: A port is in use.

@@ -24,8 +24,6 @@ class Registration:
         """Configure the registration; `start` writes the file.
 
         Args:
-            directory: The registry.
-            describe: Returns the contents of the file.
             health: Notified when the thread dies.
         """
         self._directory = directory

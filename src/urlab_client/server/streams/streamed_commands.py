@@ -40,7 +40,6 @@ class Actuators:
         """Store set-points. Unknown ids are ignored; an actuator with several inputs gets its first.
 
         Args:
-            command: The set-points.
             owned: Returns whether an articulation is owned by a client that drives it by requests; its set-points are
                 ignored, too.
         """

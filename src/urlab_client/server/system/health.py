@@ -82,8 +82,6 @@ class Health:
         """Return a daemon thread, not started, whose death by an exception is reported.
 
         Args:
-            name: Its name.
-            run: Its body.
             arguments: Arguments of `run`.
             on_death: Called with the message after the report, on that thread, to fail what waits for it.
         """

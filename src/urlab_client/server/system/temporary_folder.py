@@ -29,25 +29,29 @@ class TemporaryFolder:
     """A temporary folder of this process.
 
     Not a `tempfile.TemporaryDirectory`, which a forked child would remove.
-
-    Attributes:
-        path: The folder.
     """
 
     path: Path
 
-    def __init__(self) -> None:
-        """Create the folder, and remove those of killed processes."""
-        root = Path(tempfile.gettempdir())
+    def __init__(self, root: Path | None = None) -> None:
+        """Create the folder, and remove those of killed processes.
+
+        Args:
+            root: Where to create it; None for the system's folder of temporary files.
+        """
+        root = Path(tempfile.gettempdir()) if root is None else root
         for folder in root.glob(f"{_PREFIX}*"):
             with contextlib.suppress(OSError):
                 _remove_if_left(folder)
         self._pid = os.getpid()
         self._lock: int | None = None
         while self._lock is None:
-            self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
-            # Between creating and locking the file, another process may have removed it as a leftover.
+            self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=root))
             self._lock = _hold(self.path / _LOCK, os.O_RDWR | os.O_CREAT)
+            # Between creating and locking the file, another process may have removed it as a leftover.
+            if self._lock is not None and not (self.path / _LOCK).exists():
+                os.close(self._lock)
+                self._lock = None
 
     def close(self) -> None:
         """Remove the folder. Idempotent; a forked child leaves it to its parent."""
@@ -141,11 +145,7 @@ def sweep(folder: Path, *patterns: str) -> None:
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Generator[None]:
-    """Lock a folder that no process is using.
-
-    Raises:
-        OSError: A process is using it, or it does not exist.
-    """
+    """Lock a folder; raises `OSError` while a process is using it, or if it does not exist."""
     if sys.platform == "win32":
         sweeps = NamedLock(_name("sweeps", folder))
         try:

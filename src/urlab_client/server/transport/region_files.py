@@ -1,4 +1,4 @@
-"""The shared-memory regions of a server as files: location, permissions, and removal of leftovers.
+"""The shared-memory regions of a server as files.
 
 For `SharedMemoryServer`. Programs of the same user can damage the files at any moment, and accessing a mapping beyond
 the end of its file kills the process. The server therefore maps nothing; it reads and writes file descriptors, which
@@ -12,26 +12,14 @@ import errno
 import logging
 import os
 import sys
-import tempfile
 from pathlib import Path
 from struct import Struct as Layout
 from typing import Final
 
-from urlab_client.protocol import doorbell
-from urlab_client.protocol.fence import processor_fence
-from urlab_client.protocol.shm import HEADER_SIZE, LIVE_DIRECTORY, MAGIC, SIZE_PREFIX, VERSION, region_size
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
+from urlab_client._platform.processors import processor_fence
+from urlab_client.protocol.shm import HEADER_SIZE, MAGIC, SIZE_PREFIX, VERSION, region_size
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-PREFIX: Final = "urlab-"
-LOCK_FILE: Final = "lock"
-
-LOCK_TEXT: Final = b"directory of a URLab server's shared memory\n"
 
 _SLOTS: Final = 2
 _FIXED: Final = Layout("<IIII")
@@ -41,102 +29,7 @@ _LATEST_AT: Final = 24
 _COUNTERS: Final = Layout("<QI")
 _SIZE: Final = Layout("<I")
 _LOOKS: Final = 100
-_LOCKED_AT: Final = 1024  # beyond the text: on Windows, locked bytes cannot be read
 _RAW: Final = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
-
-
-class InstanceDirectory:
-    """The directory of one server's regions, accessible only to its user.
-
-    It is `BASE/urlab-…/live`. Clients look for most regions in a sibling `live` of the directory that the handshake
-    names; this way that is the directory itself, whatever other servers share the base. A lock that ends with the
-    server distinguishes a directory in use from a leftover.
-
-    Attributes:
-        path: The directory.
-    """
-
-    def __init__(self, base: Path) -> None:
-        """Create the directory, and remove those of killed servers.
-
-        Raises:
-            OSError: The base cannot be created or written to.
-        """
-        base.mkdir(mode=0o700, parents=True, exist_ok=True)
-        _remove_left_behind(base)
-        self._instance = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base.resolve()))
-        self.path: Path = self._instance / LIVE_DIRECTORY
-        with contextlib.ExitStack() as made:
-            made.callback(_remove, self._instance)
-            self._lock = os.open(self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | _RAW, 0o600)
-            made.callback(os.close, self._lock)
-            # Lock before writing the text: a server that starts now ignores directories without the text.
-            _lock(self._lock)
-            os.write(self._lock, LOCK_TEXT)
-            self.path.mkdir(mode=0o700)
-            made.pop_all()
-
-    def remove(self) -> None:
-        """Remove the directory with everything in it."""
-        os.close(self._lock)  # first: Windows removes no file that is open
-        _remove(self._instance)
-
-
-def _length(descriptor: int) -> int:
-    """Return the length of a file. Called many times a second; seeking takes a quarter of the time of `fstat`."""
-    # Without `pread`, reading depends on the position.
-    return os.lseek(descriptor, 0, os.SEEK_END) if hasattr(os, "pread") else os.fstat(descriptor).st_size
-
-
-def _lock(descriptor: int) -> bool:
-    """Acquire a lock that ends with the process; return False if another process holds it."""
-    if sys.platform == "win32":
-        os.lseek(descriptor, _LOCKED_AT, os.SEEK_SET)
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        finally:
-            os.lseek(descriptor, 0, os.SEEK_SET)
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _remove_left_behind(base: Path) -> None:
-    """Remove the directories whose servers are dead."""
-    for directory in base.glob(f"{PREFIX}*"):
-        try:
-            mine = sys.platform == "win32" or directory.lstat().st_uid == os.getuid()
-            if directory.is_symlink() or not mine:
-                continue
-            descriptor = os.open(directory / LOCK_FILE, os.O_RDWR | _RAW | getattr(os, "O_NOFOLLOW", 0))
-        except OSError:  # not created by a server
-            continue
-        try:
-            abandoned = _pread(descriptor, len(LOCK_TEXT) + 1, 0) == LOCK_TEXT and _lock(descriptor)
-        finally:
-            os.close(descriptor)
-        if abandoned:
-            _remove(directory)
-            logger.info("removed %s, which a killed server left behind", directory)
-
-
-def _remove(instance: Path) -> None:
-    """Remove the files of servers; a directory that contains anything else is kept."""
-    live = instance / LIVE_DIRECTORY
-    files = [live / doorbell.FILE, instance / LOCK_FILE]
-    with contextlib.suppress(OSError):  # servers that start concurrently may remove the same one
-        files += [file for file in live.iterdir() if file.name.endswith(".shm")]
-    for file in files:
-        with contextlib.suppress(OSError):
-            file.unlink()
-    for directory in (live, instance):
-        with contextlib.suppress(OSError):
-            directory.rmdir()
 
 
 class RegionFile:
@@ -280,6 +173,12 @@ class RequestFile(RegionFile):
             if slot == sequence % _SLOTS:
                 break
         return sequence, slot
+
+
+def _length(descriptor: int) -> int:
+    """Return the length of a file. Called many times a second; seeking takes a quarter of the time of `fstat`."""
+    # Without `pread`, reading depends on the position.
+    return os.lseek(descriptor, 0, os.SEEK_END) if hasattr(os, "pread") else os.fstat(descriptor).st_size
 
 
 def _pread(descriptor: int, size: int, offset: int) -> bytes:

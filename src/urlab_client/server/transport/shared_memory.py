@@ -21,20 +21,24 @@ from typing import Final, cast
 from urlab_client._platform.processors import crowded
 from urlab_client._platform.windows import NamedEvent
 from urlab_client.errors import ProtocolError
-from urlab_client.protocol import doorbell
 from urlab_client.protocol.shm import (
+    DOORBELL_FILE,
+    LIVE_DIRECTORY,
+    MAX_DOORBELL_PATH_BYTES,
     REPLY_FILE,
     REQUEST_FILE,
     RPC_STRIDE,
     SIZE_PREFIX,
     STATE_FILE,
+    Ring,
     camera_file,
     camera_stride,
     state_stride,
 )
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.serving_thread import ServingThread
-from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile, RequestFile
+from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -93,15 +97,18 @@ class SharedMemoryServer:
         Raises:
             OSError: The disk is full, or `base` cannot be used.
         """
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
         with contextlib.ExitStack() as made:
-            self._instance = InstanceDirectory(base)
-            made.callback(self._instance.remove)
-            self.directory: Path = self._instance.path
+            self._folder = made.enter_context(TemporaryFolder(base.resolve()))
+            # Clients look for most regions in a sibling `live` of the directory that the handshake names; this way that
+            # is the directory itself, whatever other servers share the base.
+            self.directory: Path = self._folder.path / LIVE_DIRECTORY
+            self.directory.mkdir(mode=0o700)
             self._requests = RequestFile(self.directory / REQUEST_FILE, RPC_STRIDE)
             made.callback(self._requests.close)
             self._replies = RegionFile(self.directory / REPLY_FILE, RPC_STRIDE)
             made.callback(self._replies.close)
-            self._bell = _Bell(self.directory)
+            self._doorbell = _Doorbell(self.directory)
             made.pop_all()
         self._active_at = -ACTIVE_S
         self._unannounced = False
@@ -138,7 +145,7 @@ class SharedMemoryServer:
     def stop(self) -> None:
         """Ask the thread to end after the current request, without waiting."""
         self._stopping = True
-        self._bell.wake()
+        self._doorbell.wake()
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`, and remove the regions.
@@ -161,7 +168,7 @@ class SharedMemoryServer:
         """Whether to publish the snapshot of this tick. Cheap, because physics calls it."""
         if self._released:
             return False
-        if self._bell.wanted(doorbell.STATE) or not self._bell.listeners:
+        if self._doorbell.wanted(Ring.STATE) or not self._doorbell.listeners:
             return True
         now = time.monotonic()
         return self._active(now) or now - self._state_at >= STATE_PERIOD_S
@@ -180,7 +187,7 @@ class SharedMemoryServer:
             self._too_large = True
             return
         self._too_large = False
-        self._bell.ring(doorbell.STATE)
+        self._doorbell.ring(Ring.STATE)
 
     def end_state(self) -> None:
         """Remove the state region: the play session is over."""
@@ -226,8 +233,8 @@ class SharedMemoryServer:
     def wanted_cameras(self) -> list[str]:
         """Return the cameras whose pictures to publish now."""
         now = time.monotonic()
-        period = PICTURE_PERIOD_S if self._bell.listeners else BLIND_PICTURE_PERIOD_S
-        if self._bell.wanted(doorbell.CAMERA) or self._active(now) or now - self._pictures_at >= period:
+        period = PICTURE_PERIOD_S if self._doorbell.listeners else BLIND_PICTURE_PERIOD_S
+        if self._doorbell.wanted(Ring.CAMERA) or self._active(now) or now - self._pictures_at >= period:
             return list(self._cameras)
         return []
 
@@ -243,7 +250,7 @@ class SharedMemoryServer:
             except (OSError, ValueError) as error:
                 logger.warning("a picture of '%s' is not in shared memory: %s", key, error)
                 return
-        self._bell.ring(doorbell.CAMERA)
+        self._doorbell.ring(Ring.CAMERA)
 
     def _active(self, now: float) -> bool:
         """Whether a client without a doorbell has sent a request recently."""
@@ -257,7 +264,7 @@ class SharedMemoryServer:
                 self._reply(owed)
             while not self._stopping:
                 if self._requests.sequence() == self._seen and not (self._spinning and self._spin(self._seen)):
-                    rung = self._bell.wait(self._pause())
+                    rung = self._doorbell.wait(self._pause())
                     self._note_wait(rung=rung)
                     if self._requests.sequence() == self._seen:
                         continue
@@ -301,7 +308,7 @@ class SharedMemoryServer:
     def _pause(self) -> float:
         if self._unannounced or self._active(time.monotonic()):
             return ACTIVE_POLL_S
-        return DOORBELL_POLL_S if self._bell.listeners else IDLE_POLL_S
+        return DOORBELL_POLL_S if self._doorbell.listeners else IDLE_POLL_S
 
     def _serve(self) -> bool:
         """Answer the pending request; return False if another thread has done so and serves now."""
@@ -319,7 +326,7 @@ class SharedMemoryServer:
 
     def _reply(self, reply: bytes) -> None:
         self._replies.publish(reply)
-        self._bell.ring(doorbell.REPLY)
+        self._doorbell.ring(Ring.REPLY)
 
     def _release(self) -> None:
         with self._lock:
@@ -328,25 +335,25 @@ class SharedMemoryServer:
             return
         self.show_cameras({})
         self.end_state()
-        self._bell.close()
+        self._doorbell.close()
         self._requests.close()
         self._replies.close()
-        self._instance.remove()
+        self._folder.close()
 
 
-class _Bell:
-    """The server's end of the doorbell; see `urlab_client.protocol.doorbell`.
+class _Doorbell:
+    """The server's end of the doorbell; see `urlab_client.protocol.shm`.
 
     Python has no Unix sockets on Windows. There the plugin's named events signal requests and replies.
     """
 
     def __init__(self, directory: Path) -> None:
-        self._asked = NamedEvent(f"Local\\URLab_{directory.name}_req_ready", create=True)
-        self._answered = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready", create=True)
+        self._request_event = NamedEvent(f"Local\\URLab_{directory.name}_req_ready", create=True)
+        self._reply_event = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready", create=True)
         self._subscriptions: dict[socket.socket, set[bytes]] = {}
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
-        self._listener = self._listen(directory / doorbell.FILE)
+        self._listener = self._listen(directory / DOORBELL_FILE)
         self._accept_after = 0.0
         self._wake_reader, self._wake_writer = socket.socketpair()
         for end in (self._wake_reader, self._wake_writer):
@@ -365,24 +372,24 @@ class _Bell:
 
     def ring(self, ring: bytes) -> None:
         """Notify the clients without blocking. Thread-safe."""
-        if ring == doorbell.REPLY:
-            self._answered.set()
+        if ring == Ring.REPLY:
+            self._reply_event.set()
         with self._lock:
             for client, wants in self._subscriptions.items():
-                if ring == doorbell.REPLY or ring in wants:
+                if ring == Ring.REPLY or ring in wants:
                     with contextlib.suppress(OSError):  # its buffer is full, or it is gone
                         client.send(ring)
 
     def wake(self) -> None:
         """End `wait`. Thread-safe."""
-        self._asked.set()
+        self._request_event.set()
         with contextlib.suppress(OSError):
             self._wake_writer.send(b"\0")
 
     def wait(self, seconds: float) -> bool:
         """Wait until a client rings, or for some seconds; return whether one announced a request."""
-        if self._asked.exists:
-            return self._asked.wait(seconds)
+        if self._request_event.exists:
+            return self._request_event.wait(seconds)
         if self._accept_after and time.monotonic() >= self._accept_after:
             self._start_accepting()
         if seconds < _SELECTOR_STEP_S:
@@ -393,8 +400,8 @@ class _Bell:
 
     def close(self) -> None:
         """Disconnect all clients and remove the socket."""
-        self._asked.close()
-        self._answered.close()
+        self._request_event.close()
+        self._reply_event.close()
         with self._lock:
             for client in self._subscriptions:
                 client.close()
@@ -415,7 +422,7 @@ class _Bell:
     def _listen(self, path: Path) -> socket.socket | None:
         if not hasattr(socket, "AF_UNIX"):
             return None
-        if len(os.fsencode(path)) > doorbell.MAX_PATH_BYTES:
+        if len(os.fsencode(path)) > MAX_DOORBELL_PATH_BYTES:
             logger.info("no doorbell: the path %s is too long for a socket; clients poll", path)
             return None
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -449,11 +456,11 @@ class _Bell:
                 self._subscriptions.pop(source, None)
                 source.close()
             return False
-        if doorbell.WANT_STATE in data:
-            self._subscriptions[source].add(doorbell.STATE)
-        if doorbell.WANT_CAMERAS in data:
-            self._subscriptions[source].add(doorbell.CAMERA)
-        return doorbell.REQUEST in data
+        if Ring.WANT_STATE in data:
+            self._subscriptions[source].add(Ring.STATE)
+        if Ring.WANT_CAMERAS in data:
+            self._subscriptions[source].add(Ring.CAMERA)
+        return Ring.REQUEST in data
 
     def _accept(self, listener: socket.socket) -> None:
         try:
@@ -473,4 +480,4 @@ class _Bell:
         with self._lock:
             self._subscriptions[client] = set()
         with contextlib.suppress(OSError):
-            client.send(doorbell.REPLY)  # its first request may have been answered before it was accepted
+            client.send(Ring.REPLY)  # its first request may have been answered before it was accepted

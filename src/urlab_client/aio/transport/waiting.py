@@ -1,0 +1,415 @@
+"""How the event loop learns that a reply or a publication has arrived.
+
+A loop with `add_reader` watches sockets itself. A thread, one per loop, watches what the loop cannot: sockets of other
+loops, above all Windows' default Proactor loop, and regions of shared memory whose server has no doorbell. And because
+waking up an idle processor takes as long as a fast reply, the loop may poll for a reply before it sleeps (`BusyPoll`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Collection
+from typing import Any, ClassVar, Final, Protocol, cast
+from weakref import WeakSet
+
+import zmq
+
+from urlab_client._platform.processors import crowded
+from urlab_client.aio.background import Tell, background_thread
+from urlab_client.events import ClientEvent
+
+# Interval of the thread's checks whether the loop was closed while clients were open.
+_CHECK_S: Final = 1.0
+_JOIN_S: Final = 1.0
+_AGAIN_S: Final = 1.0
+
+_SLOWEST_S: Final = 5e-3  # between two looks at a region
+_POLL_STEP_S: Final = 1e-3  # the resolution of ZeroMQ's poll
+
+_DRAIN_BYTES: Final = 4096
+_POLLIN: Final = int(zmq.POLLIN)
+
+
+class Watchable(Protocol):
+    """A ZeroMQ socket or a socket of the system."""
+
+    def fileno(self) -> int:
+        """Return the descriptor to watch."""
+        ...
+
+
+def watch_socket(
+    loop: asyncio.AbstractEventLoop,
+    watched: Watchable,
+    on_readable: Callable[[], object],
+    *,
+    on_demand: bool = False,
+    tell: Tell | None = None,
+) -> Watch:
+    """Call `on_readable` on the event loop whenever a socket is readable. It may find nothing to read.
+
+    Args:
+        loop: The running event loop.
+        watched: The socket.
+        on_readable: Callback to invoke.
+        on_demand: Whether a watching thread is active only from `expect` until the socket is readable, because waking
+            it would delay a reply that the loop polls for itself.
+        tell: Publishes the event that a watching thread died. Another one follows after a pause.
+    """
+    return Watch(loop, on_readable, fd=watched.fileno(), on_demand=on_demand, tell=tell)
+
+
+def watch_memory(
+    loop: asyncio.AbstractEventLoop,
+    has_news: Callable[[], bool],
+    on_news: Callable[[], object],
+    *,
+    fastest_s: float,
+    block: Callable[[float], object] | None = None,
+    tell: Tell | None = None,
+) -> Watch:
+    """Call `on_news` on the event loop once after each `expect`, as soon as a region has news.
+
+    The pauses between two looks are a quarter of the time that it has waited, at most five milliseconds. The thread
+    looks because the loop's timers round up to a millisecond.
+
+    Args:
+        loop: The running event loop.
+        has_news: Returns whether there is news. Called on the thread until `close`; must not block or raise.
+        on_news: Callback to invoke.
+        fastest_s: Shortest pause, seconds.
+        block: Sleeps until the server signals, for at most the given seconds; None without signals.
+        tell: See `watch_socket`.
+    """
+    return Watch(loop, on_news, has_news=has_news, block=block, fastest_s=fastest_s, on_demand=True, tell=tell)
+
+
+class Watch:
+    """The watch on one socket or region. Made by `watch_socket` and `watch_memory`.
+
+    Where the thread watches, it reports news once and then waits for `expect`.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        on_news: Callable[[], object],
+        *,
+        fd: int | None = None,
+        has_news: Callable[[], bool] | None = None,
+        block: Callable[[float], object] | None = None,
+        fastest_s: float = 0.0,
+        on_demand: bool,
+        tell: Tell | None,
+    ) -> None:
+        self.fd = fd
+        self.has_news = has_news
+        self.block = block
+        self.tell = tell
+        self._loop = loop
+        self._on_news = on_news
+        self._fastest_s = fastest_s
+        self._on_demand = on_demand
+        self._since = 0.0
+        self._armed = False
+        self._closed = False
+        self._watcher: _Watcher | None = None  # None if the loop watches
+        if fd is not None:
+            with contextlib.suppress(NotImplementedError):
+                loop.add_reader(fd, on_news)
+                return
+        self._watcher = _Watcher.of(loop)
+        if not on_demand:
+            self.expect()
+
+    def expect(self) -> None:
+        """Watch until the next news, if that was left to this call."""
+        if self._watcher is None:
+            return
+        self._since = time.monotonic()
+        if not self._armed and not self._closed:
+            self._armed = True
+            self._watcher.arm(self)
+
+    def close(self) -> None:
+        """Stop watching. Call before the socket or region is closed. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._watcher is not None:
+            self._watcher.release(self)
+        elif self.fd is not None and not self._loop.is_closed():  # an abandoned client may outlive its loop
+            self._loop.remove_reader(self.fd)
+
+    def pause(self, now: float) -> float:
+        """Return the seconds to sleep before the next look at the region."""
+        return min(max((now - self._since) / 4, self._fastest_s), _SLOWEST_S)
+
+    def notify(self) -> None:
+        """Handle news. Called on the event loop."""
+        self._armed = False
+        try:
+            if not self._closed:
+                self._on_news()
+        finally:
+            if not self._on_demand:
+                self.expect()
+
+
+class _Watcher:
+    """The watching thread of one event loop.
+
+    It uses ZeroMQ's poll, which is not limited to the 512 sockets of `select.select` on Windows.
+    """
+
+    _of_loops: ClassVar[dict[asyncio.AbstractEventLoop, _Watcher]] = {}
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        # Weak: an unclosed client is collected with its loop before this thread sees that the loop is closed.
+        self._armed = WeakSet[Watch]()
+        self._users = 0
+        self._ended = False
+        self._woken = False
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._start()
+
+    @classmethod
+    def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
+        """Return the watcher of `loop` and count the caller as a user."""
+        watcher = cls._of_loops.get(loop)
+        if watcher is None:
+            watcher = cls._of_loops[loop] = cls(loop)
+        watcher._users += 1
+        return watcher
+
+    def arm(self, watch: Watch) -> None:
+        """Watch until there is news."""
+        with self._lock:
+            self._armed.add(watch)
+            self._wake()
+
+    def release(self, watch: Watch) -> None:
+        """Stop watching: `has_news` is not running and is not called again. The last user ends the thread."""
+        with self._lock:
+            self._armed.discard(watch)
+            self._users -= 1
+            last = not self._users
+            self._ended = self._ended or last
+            if last or watch.fd is not None:  # its socket is about to be closed
+                self._wake()
+        if last:
+            self._forget()
+            self._thread.join(_JOIN_S)
+            if not self._thread.is_alive():
+                self._finish()  # as it has done itself, unless it died
+
+    def _wake(self) -> None:
+        if not self._woken:
+            self._woken = True
+            self._wake_writer.send(b"\0")
+
+    def _forget(self) -> None:
+        if self._of_loops.get(self._loop) is self:
+            del self._of_loops[self._loop]
+
+    def _start(self) -> None:
+        self._thread = background_thread("urlab-waiter", self._run, tell=self._on_death)
+        self._thread.start()
+
+    def _on_death(self, event: ClientEvent) -> None:
+        for watch in tuple(self._armed):
+            if watch.tell is not None:
+                watch.tell(event)
+        self._loop.call_later(_AGAIN_S, self._begin_again)
+
+    def _begin_again(self) -> None:
+        if not self._ended:
+            self._woken = False  # the thread may have died between reading and noting it
+            self._start()
+
+    def _run(self) -> None:
+        while self._look():
+            pass
+        self._finish()
+
+    def _finish(self) -> None:
+        with self._lock:
+            self._woken = True  # suppresses any further wake-up
+            self._armed.clear()
+        self._forget()
+        self._wake_reader.close()
+        self._wake_writer.close()
+
+    def _look(self) -> bool:
+        """Wait for news and notify the loop. Return whether to continue."""
+        try:
+            with self._lock:
+                if self._ended:
+                    return False
+                pause, block = self._look_at_regions()
+                fds = [self._wake_reader.fileno(), *(watch.fd for watch in self._armed if watch.fd is not None)]
+            if block is not None:
+                block(pause)
+                pause = 0.0
+            elif pause < _POLL_STEP_S:
+                time.sleep(pause)
+                pause = 0.0
+            ready = _poll(fds, pause)
+            with self._lock:
+                if self._wake_reader.fileno() in ready:
+                    self._wake_reader.recv(_DRAIN_BYTES)
+                    self._woken = False
+                self._notify([watch for watch in self._armed if watch.fd in ready])
+        except zmq.ZMQError:  # on Windows, if a socket was closed meanwhile
+            self._drop_closed()
+        except _LoopClosed:
+            return False
+        return not self._loop.is_closed()
+
+    def _look_at_regions(self) -> tuple[float, Callable[[float], object] | None]:
+        """Report news in regions. Return how long to sleep, and how."""
+        pause, block, now, news = _CHECK_S, None, time.monotonic(), list[Watch]()
+        for watch in self._armed:
+            if watch.has_news is None:
+                continue
+            if watch.has_news():
+                news.append(watch)
+            else:
+                pause = min(pause, watch.pause(now))
+                block = block or watch.block
+        self._notify(news)
+        return pause, block
+
+    def _notify(self, watches: Collection[Watch]) -> None:
+        for watch in watches:
+            self._armed.discard(watch)
+            try:
+                self._loop.call_soon_threadsafe(watch.notify)
+            except RuntimeError as error:
+                raise _LoopClosed from error
+
+    def _drop_closed(self) -> None:
+        with self._lock:
+            for watch in tuple(self._armed):
+                try:
+                    if watch.fd is not None:
+                        _poll([watch.fd], 0.0)
+                except zmq.ZMQError:
+                    self._armed.discard(watch)
+
+
+class _LoopClosed(Exception):
+    """The loop was closed while clients were open."""
+
+
+def _poll(fds: Collection[int], seconds: float) -> list[int]:
+    """Return the descriptors that are readable or broken."""
+    poll: Callable[[list[tuple[int, int]], int], list[tuple[int, int]]] = cast("Any", zmq.zmq_poll)
+    return [fd for fd, _ in poll([(fd, _POLLIN) for fd in fds], int(seconds * 1000))]
+
+
+_MISSES: Final = 4
+_FIRST: Final = 8  # requests of an op before the first one that sleeps
+_TRIAL: Final = 256  # of so many requests, one tries what has proved slower: too few to show in the 99th percentile
+_MARGIN: Final = 0.85  # polling occupies a processor, so it must be faster by this factor
+_WEIGHT: Final = 0.2  # of a new time in the average
+_TRIAL_WEIGHT: Final = 0.5  # of a rare one
+# One poller keeps the loop awake for all requests; several would only delay each other.
+_polling = False
+
+
+class _ReplyTimes:
+    """Reply times of one op in seconds, with a polling loop and with a sleeping loop."""
+
+    __slots__ = ("asked", "asleep", "awake", "missed")
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.missed = 0
+        self.awake = 0.0
+        self.asleep = 0.0
+
+    @property
+    def awake_is_better(self) -> bool:
+        """Whether polling has proved faster."""
+        return self.awake < _MARGIN * self.asleep
+
+
+class BusyPoll:
+    """Polls for replies while that has proved faster than sleeping; learns that for each op.
+
+    An idle processor takes tens of microseconds to wake up, as long as a fast server takes for a whole reply. One that
+    other work keeps busy responds immediately, and polling would only waste its time.
+
+    Args:
+        shortest: Minimum polling time, seconds.
+        longest: Maximum polling time, seconds. Ops whose replies repeatedly take longer are not polled.
+    """
+
+    def __init__(self, shortest: float, longest: float) -> None:
+        self._shortest = shortest
+        self._longest = longest
+        self._ops: dict[str, _ReplyTimes] = {}
+
+    def pays(self, op: str) -> bool:
+        """Return whether to poll for the reply to this op."""
+        if _polling or crowded():
+            return False
+        times = self._ops.get(op)
+        if times is None:
+            times = self._ops[op] = _ReplyTimes()
+        times.asked += 1
+        if times.missed >= _MISSES:
+            return False
+        if times.asleep == 0.0:
+            return times.asked <= _FIRST
+        return times.awake_is_better != (times.asked % _TRIAL == 0)
+
+    async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
+        """Call `look` until it completes `reply` or the time limit is reached. Other tasks run between two calls."""
+        global _polling  # noqa: PLW0603  # shared by all loops of the process, which share one interpreter
+        now = time.perf_counter  # the loop's clock may tick 64 times a second
+        give_up = now() + self._limit(op)
+        _polling = True
+        try:
+            while True:  # at least once: otherwise nothing would wake a task that is late for its first poll
+                await asyncio.sleep(0)
+                if reply.done():  # another task may have completed it and closed the socket
+                    break
+                look()
+                if reply.done() or now() >= give_up:
+                    break
+        finally:
+            _polling = False
+
+    def _limit(self, op: str) -> float:
+        """Return the seconds to poll; a trial is no longer than sleeping takes."""
+        times = self._ops.get(op)
+        if times is None:
+            return self._shortest
+        usual = min(max(2 * times.awake, self._shortest), self._longest)
+        return usual if times.awake_is_better or times.asleep == 0.0 else min(usual, times.asleep)
+
+    def note(self, op: str, seconds: float, *, awake: bool) -> None:
+        """Record the time of a reply, with a polling or a sleeping loop."""
+        times = self._ops.get(op)
+        if times is None:
+            return  # `pays` was never called for it
+        if seconds > self._longest:
+            times.missed += 1
+            return
+        times.missed = 0
+        before = times.awake if awake else times.asleep
+        weight = _WEIGHT if awake == times.awake_is_better else _TRIAL_WEIGHT
+        # An unusually long time reflects the machine's other load rather than the way of waiting.
+        after = before + weight * (min(seconds, 2 * before) - before) if before else seconds
+        if awake:
+            times.awake = after
+        else:
+            times.asleep = after

@@ -1,0 +1,345 @@
+"""Recordings of the console: MCAP files in one folder, made by `record()`, listed, converted, taken in and removed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import re
+import secrets
+import tempfile
+import time
+from collections.abc import AsyncGenerator, AsyncIterator
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import anyio.to_thread
+from msgspec import Struct
+
+from urlab_client._installation import MissingExtra, need
+from urlab_client.console.stoppable import Progress, stoppable
+from urlab_client.errors import URLabError
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations._feed.messages import EpisodeOutcome
+    from urlab_client.integrations.record.reader import Run
+    from urlab_client.integrations.record.recorder import AsyncRecorder
+
+KINDS = ("csv", "mp4", "npz")
+"""What a recording is converted to for download, besides what it is."""
+
+_NAME = re.compile(r"[\w][\w .()+-]{0,100}\.(mcap|json)", re.ASCII)
+_LARGEST_FILE = 4 << 30
+
+_CAMERA_HZ = 30.0
+
+
+class RunningRecording(Struct):
+    """The recording that is under way: its file's name, seconds of real time, states and pictures so far, bytes.
+
+    `failed` says that it can no longer be written.
+    """
+
+    name: str
+    seconds: float
+    states: int
+    pictures: int
+    bytes: int
+    failed: bool
+
+
+class RecordingView(Struct):
+    """One recording of the folder; `at` is Unix time in seconds."""
+
+    name: str
+    bytes: int
+    at: float
+
+
+class Conversion(Struct):
+    """A recording that is being converted for download, and how much of it has been read, 0 to 1."""
+
+    name: str
+    kind: str
+    camera: str
+    share: float = 0.0
+
+
+class Recordings:
+    """The recordings of one console.
+
+    Args:
+        client: The client.
+        folder: Folder of the files; created with the first one.
+    """
+
+    def __init__(self, client: URLabClient, folder: Path) -> None:
+        self.folder = folder
+        self.conversions: list[Conversion] = []
+        self._client = client
+        self._recorder: AsyncRecorder | None = None
+        self._began = 0.0
+        self._task: asyncio.Task[None] | None = None
+        self._stop = asyncio.Event()
+        self._described: dict[str, tuple[float, dict[str, Any]]] = {}
+
+    @property
+    def running(self) -> RunningRecording | None:
+        """The running recording, or None."""
+        if self._recorder is None:
+            return None
+        stats = self._recorder.stats
+        seconds = time.monotonic() - self._began
+        return RunningRecording(
+            self._recorder.path.name,
+            round(seconds, 1),
+            stats.states,
+            stats.frames,
+            stats.file_bytes,
+            self._recorder.failed,
+        )
+
+    async def start(self, *, cameras: bool) -> str:
+        """Start a recording and return its file's name.
+
+        Raises:
+            ValueError: A recording is running.
+            URLabError: The client has no session, or no play session is running.
+            OSError: The file cannot be created.
+        """
+        if self._task is not None:
+            raise ValueError("a recording runs already: stop it first")
+        from urlab_client.integrations.record import record
+
+        if not self._client.manager_present:
+            raise URLabError("There is nothing to record.", hint="Begin play first.")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        now = f"{datetime.now().astimezone():%Y-%m-%d_%H.%M.%S}"
+        names = (f"{now}.mcap", *(f"{now}-{number}.mcap" for number in range(2, 100)))  # several in a second
+        path = next(one for one in (self.folder / name for name in names) if not one.exists())
+        recorder = record(
+            self._client,
+            path,
+            cameras="all" if cameras else (),
+            camera_hz=_CAMERA_HZ,
+            pose_hz=0.0 if self._client.model is None else 50.0,
+        )
+        self._stop.clear()
+        begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._task = asyncio.create_task(self._write(recorder, begun), name="urlab-web-recording")
+        try:
+            await begun
+        except BaseException:
+            self._task = None
+            raise
+        return path.name
+
+    async def _write(self, recorder: AsyncRecorder, begun: asyncio.Future[None]) -> None:
+        try:
+            async with recorder:
+                self._recorder, self._began = recorder, time.monotonic()
+                begun.set_result(None)
+                await self._stop.wait()
+        except BaseException as error:
+            if begun.done():
+                raise
+            begun.set_exception(error)
+        finally:
+            self._recorder = None
+
+    async def mark(self, outcome: EpisodeOutcome) -> None:
+        """Record the outcome of the current episode.
+
+        Raises:
+            ValueError: No recording is running.
+        """
+        if self._recorder is None:
+            raise ValueError("no recording runs, so the outcome of an episode cannot be recorded: start one first")
+        await self._recorder.mark(outcome)
+
+    async def stop(self) -> dict[str, Any]:
+        """End the recording and describe it.
+
+        Raises:
+            ValueError: No recording is running.
+            URLabError: The recording could not be written.
+        """
+        recorder = self._recorder
+        if recorder is None:
+            raise ValueError("no recording runs")
+        await self._finish()
+        return await self.describe(recorder.path.name)
+
+    async def _finish(self) -> None:
+        task = self._task
+        self._stop.set()
+        if task is not None:
+            try:
+                await asyncio.shield(task)
+            finally:
+                self._task = None
+
+    async def end(self) -> None:
+        """End a running recording, so that its file is complete."""
+        if self._task is not None:
+            with contextlib.suppress(URLabError):  # the recorder has logged it
+                await self._finish()
+
+    def list(self) -> list[RecordingView]:
+        """Return the recordings of the folder, newest first."""
+        if not self.folder.is_dir():
+            return []
+        running = self._recorder.path.name if self._recorder is not None else ""
+        found = [file for file in self.folder.iterdir() if _NAME.fullmatch(file.name) and file.name != running]
+        views = [RecordingView(file.name, file.stat().st_size, file.stat().st_mtime) for file in found]
+        return sorted(views, key=lambda view: view.at, reverse=True)
+
+    def path(self, name: str) -> Path:
+        """Return the file of a recording.
+
+        Raises:
+            KeyError: There is none of that name.
+        """
+        file = self.folder / name
+        if not _NAME.fullmatch(name) or not file.is_file():
+            raise KeyError(f"no recording is called {name!r}")
+        return file
+
+    async def describe(self, name: str) -> dict[str, Any]:
+        """Return name, size, length in seconds, robots, cameras, and why the file is incomplete, if it is.
+
+        `unavailable` holds the formats that it cannot be converted to here, each with what is missing.
+
+        Raises:
+            KeyError: There is none of that name.
+            URLabError: The file is not a recording.
+        """
+        file = self.path(name)
+        changed = file.stat().st_mtime
+        known = self._described.get(name)
+        if known is None or known[0] != changed:
+            known = self._described[name] = changed, await anyio.to_thread.run_sync(_described, file)
+        return known[1]
+
+    @contextlib.asynccontextmanager
+    async def converted(self, name: str, kind: str, camera: str = "") -> AsyncGenerator[Path]:
+        """Yield a recording as a file of another format, which is deleted afterwards.
+
+        Raises:
+            KeyError: There is no such recording, or no such camera in it.
+            ValueError: There is no such format.
+            URLabError: The file is not a recording, or a library for that format is not installed.
+        """
+        file = self.path(name)
+        if kind not in KINDS:
+            raise ValueError(f"a recording is converted to {', '.join(KINDS)}, not {kind!r}")
+        # Beside the recordings: where the system keeps temporary files there may be no room for those of a night.
+        beside = self.folder if os.access(self.folder, os.W_OK) else None
+        with tempfile.TemporaryDirectory(prefix=".urlab-", dir=beside, ignore_cleanup_errors=True) as folder:
+            target = Path(folder) / f"{file.stem}.{kind}"
+            size, conversion = max(1, file.stat().st_size), Conversion(name, kind, camera)
+
+            def progress(count: int) -> None:
+                conversion.share = round(count / size, 2)
+
+            self.conversions.append(conversion)
+            try:
+                await stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
+            finally:
+                self.conversions.remove(conversion)
+            yield target
+
+    async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> dict[str, Any]:
+        """Add a recording that was made elsewhere, and describe it.
+
+        Raises:
+            ValueError: The name is not that of a recording or is taken, or the file is too large.
+            URLabError: The file is not a recording; it is not kept.
+        """
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is not a valid name of a recording: it must end in .mcap or .json")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        target = self.folder / name
+        if target.exists():
+            raise ValueError(f"there is a recording {name!r} already")
+        partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # concurrent uploads may have the same name
+        try:
+            size = 0
+            with partial.open("xb") as file:
+                async for chunk in chunks:
+                    size += len(chunk)
+                    if size > _LARGEST_FILE:
+                        raise ValueError(f"a recording is at most {_LARGEST_FILE} bytes")
+                    await anyio.to_thread.run_sync(file.write, chunk)
+            await stoppable(lambda told: _described(partial, told))
+            if target.exists():  # by now
+                raise ValueError(f"there is a recording {name!r} already")
+            partial.rename(target)
+        finally:
+            partial.unlink(missing_ok=True)
+        return await self.describe(name)
+
+    def remove(self, name: str) -> None:
+        """Delete a recording.
+
+        Raises:
+            KeyError: There is none of that name.
+            ValueError: It is being recorded.
+        """
+        if self._recorder is not None and self._recorder.path.name == name:
+            raise ValueError(f"{name} is being recorded: stop that first")
+        self.path(name).unlink()
+        self._described.pop(name, None)
+
+
+def open_run(file: Path) -> Run:
+    """Open a recording.
+
+    Raises:
+        URLabError: The file is not a recording.
+    """
+    from urlab_client.integrations.record import read_run
+
+    return read_run(file)
+
+
+def _described(file: Path, progress: Progress | None = None) -> dict[str, Any]:
+    summary = open_run(file).summary(progress)
+    cameras = [name.removeprefix("/camera/") for name in summary.topics if name.startswith("/camera/")]
+    return {
+        "name": file.name,
+        "bytes": file.stat().st_size,
+        "at": file.stat().st_mtime,
+        "seconds": round(summary.duration_s, 3),
+        "robots": [name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
+        "cameras": [name for name in cameras if not name.endswith("/calibration")],
+        "damage": summary.damage,
+        "lost": summary.dropped_states + summary.dropped_frames,
+        "unavailable": _unavailable(),
+    }
+
+
+def _unavailable() -> dict[str, str]:
+    try:
+        need("av", extra="video")
+    except MissingExtra as error:
+        return {"mp4": str(error)}
+    return {}
+
+
+def _convert(file: Path, target: Path, kind: str, camera: str, progress: Progress) -> None:
+    from urlab_client.integrations.record import export
+
+    run = open_run(file)
+    try:
+        match kind:
+            case "csv":
+                export.write_csv(run, target, progress)
+            case "npz":
+                export.write_npz(run, target, progress=progress)
+            case _:
+                export.write_mp4(run, target, camera, progress)
+    except MissingExtra as error:
+        raise URLabError(str(error)) from None

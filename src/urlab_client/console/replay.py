@@ -1,0 +1,396 @@
+"""A recording replayed for all viewers: its states replace the server's, at the pace of its clock.
+
+The replay sends no requests to the server, so it works with any server and any recording, seeks immediately, and has a
+position in seconds. Only the current moment is in memory, however long the recording is. On request, it also places the
+robots of the simulation, in puppet mode.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+
+import anyio
+import anyio.to_thread
+import numpy as np
+from msgspec import Struct
+
+from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.console.recordings import open_run
+from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
+from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.messages.streams import StateSnapshot
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabArticulation, URLabClient
+    from urlab_client.integrations.record.contents import RecordedArticulation, RecordedPicture, RecordedState
+    from urlab_client.integrations.record.reader import Run
+
+_T = TypeVar("_T")
+
+_PERIOD_S = 1 / 60
+_PLACED_S = 1 / 25
+_OF_SCENE = "-/"
+_PAST_STATES = 200
+_ROUNDING_S = 1e-6  # of slider values in browsers; and a picture may be a nanosecond later than its state
+
+
+class ReplayView(Struct):
+    """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
+
+    `cameras` lists the cameras whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+    """
+
+    name: str
+    time: float
+    seconds: float
+    playing: bool
+    rate: float
+    placing: bool
+    cameras: list[str]
+
+
+class Publisher(Protocol):
+    """The part of the console session that a replay uses."""
+
+    client: URLabClient
+
+    def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
+        """Show a state to all viewers in place of the server's."""
+        ...
+
+    async def renew_pictures(self) -> None:
+        """Switch the source of pictures between the recording and the simulation."""
+        ...
+
+    def watched_cameras(self) -> list[str]:
+        """Return the cameras that viewers watch, by the names that `step` takes."""
+        ...
+
+    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
+        """Add a line to the log."""
+        ...
+
+    def tell(self) -> None:
+        """Notify all viewers of a change."""
+        ...
+
+
+class _Before(Struct):
+    """The simulation's state and mode before a replay, to be restored."""
+
+    mode: StepMode
+    qpos: Any
+    qvel: Any
+
+
+class _Robot(Struct):
+    """The location of a robot's joint positions: all or part of an articulation of the recording."""
+
+    source: str
+    size: int
+    places: list[int] | None = None
+
+
+class Replay:
+    """The replay of one console, at most one at a time.
+
+    Args:
+        console: What shows it.
+    """
+
+    def __init__(self, console: Publisher) -> None:
+        self._console = console
+        self._client = console.client
+        self._run: Run | None = None
+        self._robots: dict[str, _Robot] = {}
+        self._cameras: frozenset[str] = frozenset()
+        self._start = self._seconds = 0.0
+        self._at = 0.0
+        self._playing = False
+        self._rate = 1.0
+        self._before: _Before | None = None
+        self._placed_at = 0.0
+        self._state: RecordedState | None = None
+        self._wake = asyncio.Event()
+        self._showing = asyncio.Lock()
+
+    @property
+    def view(self) -> ReplayView | None:
+        """The replay's position and options, or None if nothing is replayed."""
+        if self._run is None:
+            return None
+        return ReplayView(
+            self._run.path.name,
+            round(self._at, 3),
+            round(self._seconds, 6),
+            self._playing,
+            self._rate,
+            self._before is not None,
+            [] if self._before is not None else sorted(self._cameras),
+        )
+
+    @property
+    def open(self) -> bool:
+        """Whether a recording is shown."""
+        return self._run is not None
+
+    @property
+    def rate(self) -> float:
+        """Seconds of the recording per second; 0 while paused."""
+        return self._rate if self._playing else 0.0
+
+    @property
+    def at(self) -> float:
+        """The position, seconds from the recording's start."""
+        return self._at
+
+    @property
+    def _moment(self) -> float:
+        """Position on the recording's clock, seconds, late enough for times that were rounded."""
+        return self._start + self._at + _ROUNDING_S
+
+    def has_pictures(self, camera: str) -> bool:
+        """Return whether the pictures of a camera, `ARTICULATION/CAMERA` or `-/CAMERA`, come from the recording."""
+        return self._run is not None and self._before is None and camera in self._cameras
+
+    async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
+        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start.
+
+        Raises:
+            URLabError: The file is damaged at this position.
+            OSError: The file cannot be read.
+        """
+        run, at = self._run, self._moment
+        if run is None or not self.has_pictures(camera):
+            return None
+        found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(_OF_SCENE), at))
+        return found.time - self._start, found
+
+    async def past(self, seconds: float) -> list[StateSnapshot]:
+        """Return states of the last seconds before the replay's position, evenly spaced, oldest first.
+
+        Raises:
+            ValueError: No recording is replayed.
+            URLabError: The file is damaged at this position.
+        """
+        run, robots, start, at = self._run, self._robots, self._start, self._at
+        if run is None:
+            raise ValueError("no recording is replayed")
+
+        def read() -> list[StateSnapshot]:
+            found: dict[float, StateSnapshot] = {}
+            for moment in np.linspace(max(0.0, at - seconds), at, _PAST_STATES).tolist():
+                state = run.state_at(start + moment)
+                if state is not None and state.time not in found:
+                    found[state.time] = _snapshot(state, _present(state, robots), state.time - start)
+            return [*found.values()]
+
+        return await _read(read)
+
+    async def begin(self, file: Path, *, placing: bool = False) -> None:
+        """Show a recording from its start.
+
+        Args:
+            file: The recording.
+            placing: Whether to place the simulation's robots, too; its mode is puppet meanwhile.
+
+        Raises:
+            URLabError: The file is not a recording, or not one of the current robots; or as the client raises.
+        """
+        run, (start, end), names, cameras = await _read(lambda: _opened(file))
+        if not names:
+            raise URLabError(f"{file.name} holds no states of robots.")
+        robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
+        if not robots:
+            there = ", ".join(self._client.articulations) or "none"
+            raise URLabError(f"{file.name} is a recording of other robots than the current ones ({there}).")
+        await self.end()
+        self._run, self._robots, self._cameras = run, robots, cameras
+        self._start, self._seconds = start, end - start
+        self._at, self._rate, self._state = 0.0, 1.0, None
+        if placing:
+            await self._take_over()
+        self._playing = True
+        await self._console.renew_pictures()
+        self._wake.set()
+        self._console.tell()
+
+    async def change(
+        self, *, at: float | None = None, playing: bool | None = None, rate: float | None = None
+    ) -> ReplayView:
+        """Seek, play or pause, and set the pace; None leaves a value unchanged.
+
+        Raises:
+            ValueError: No recording is replayed, or a number is out of range.
+        """
+        if self._run is None:
+            raise ValueError("no recording is replayed")
+        if rate is not None:
+            if not 0.05 <= rate <= 20:
+                raise ValueError(f"the pace must be from 0.05 to 20, not {rate}")
+            self._rate = rate
+        if at is not None:
+            self._at = self._seconds if at > self._seconds - _ROUNDING_S else max(at, 0.0)
+        if playing is not None:
+            if playing and at is None and self._at >= self._seconds:
+                self._at = 0.0
+            self._playing = playing
+        await self._show()
+        await self._place()
+        self._wake.set()
+        self._console.tell()
+        return cast("ReplayView", self.view)
+
+    async def end(self) -> None:
+        """Show the server's state again, and restore the simulation's state and mode."""
+        if self._run is None:
+            return
+        self._run, self._playing = None, False
+        before, self._before = self._before, None
+        await self._console.renew_pictures()
+        self._console.tell()
+        data = self._client.data
+        if before is not None and data is not None and data.qpos.shape == before.qpos.shape:
+            data.qpos[:], data.qvel[:] = before.qpos, before.qvel
+            await self._client.step(0)
+            await self._client.runtime.set_mode(before.mode)
+
+    async def keep_playing(self) -> None:
+        """Advance the replay while it plays."""
+        while True:
+            if not self._playing:
+                self._wake.clear()
+                await self._wake.wait()
+                continue
+            began = time.monotonic()
+            await anyio.sleep(_PERIOD_S)
+            if not self._playing:
+                continue
+            self._at = min(self._at + self._rate * (time.monotonic() - began), self._seconds)
+            self._playing = self._at < self._seconds
+            shown = False
+            try:
+                await self._show()
+                shown = True
+            except (URLabError, OSError) as error:
+                self._console.note("error", "console", "replay", str(error))
+            finally:
+                self._playing = self._playing and shown
+            try:
+                await self._place()
+            except (URLabError, ValueError) as error:
+                self._before = None
+                await self._console.renew_pictures()
+                self._console.note("error", "console", "replay", str(error))
+
+    async def _show(self) -> None:
+        async with self._showing:  # one at a time, each of the present moment: none comes after a later one
+            run, at = self._run, self._moment
+            if run is None:
+                return
+            state = await _read(lambda: run.state_at(at))
+            if state is None or self._run is not run:
+                return
+            self._state = state
+            robots = _present(state, self._robots)
+            targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
+            self._console.show(_snapshot(state, robots, state.time - self._start), targets)
+
+    # The simulation
+
+    async def _take_over(self) -> None:
+        data = self._client.data
+        if data is None:
+            raise URLabError("Robots cannot be placed without a local model.")
+        mode = self._client.step_mode
+        await self._client.runtime.set_mode(StepMode.PUPPET)
+        self._before = _Before(mode, data.qpos.copy(), data.qvel.copy())
+
+    async def _place(self) -> None:
+        """Place the simulation's robots as recorded."""
+        model, data = self._client.model, self._client.data
+        if self._before is None or model is None or data is None or time.monotonic() - self._placed_at < _PLACED_S:
+            return
+        self._placed_at = time.monotonic()
+        prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
+        for key, layout in articulation_layouts(model, prefixes).items():
+            robot = self._robots.get(key)
+            values = None if robot is None or self._state is None else _values(self._state, robot)
+            if values is not None and len(values.qpos) == len(layout.qpos_adr):
+                data.qpos[layout.qpos_adr] = values.qpos
+        data.qvel[:] = 0.0
+        # In mode puppet pictures come with replies alone.
+        await self._client.step(0, include_cameras=dict.fromkeys(self._console.watched_cameras(), "latest") or False)
+
+
+async def _read(job: Callable[[], _T]) -> _T:
+    return await anyio.to_thread.run_sync(job)
+
+
+def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
+    run = open_run(file)
+    cameras = (name if "/" in name else _OF_SCENE + name for name in run.cameras())
+    return run, run.time_range(), run.positions(), frozenset(cameras)
+
+
+def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> _Robot | None:
+    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not."""
+    size = len(art.qpos_array)
+    if key in names:
+        return _Robot(key, size) if len(names[key]) == size else None
+    together = names.get("joints")  # as a server saves them, by compiled joints
+    places: list[int] = []
+    for joint in sorted(art.joints.values(), key=lambda one: one.qpos_local_offset):
+        name = f"{art.compiled_prefix}_{joint.name}"
+        own = [i for i, given in enumerate(together or ()) if given == name or given.rpartition(".")[0] == name]
+        if not own:
+            return None
+        places += own
+    return _Robot("joints", size, places) if len(places) == size else None
+
+
+def _present(state: RecordedState, robots: Mapping[str, _Robot]) -> dict[str, RecordedArticulation]:
+    return {key: found for key, robot in robots.items() if (found := _values(state, robot))}
+
+
+def _values(state: RecordedState, robot: _Robot) -> RecordedArticulation | None:
+    """Return a robot's values, None if it is not in the scene then, or another of its name is."""
+    found = state.articulations.get(robot.source)
+    if found is not None and robot.places is not None:
+        # Of velocities it is not known where they are among those of all joints.
+        found = replace(found, qpos=found.qpos[robot.places], qvel=np.zeros(0))
+    return found if found is not None and len(found.qpos) == robot.size else None
+
+
+def _snapshot(state: RecordedState, robots: Mapping[str, RecordedArticulation], at: float) -> StateSnapshot:
+    clock = Clock(sec=int(at), nsec=int(at % 1.0 * 1e9))
+    return StateSnapshot(
+        time=at,
+        step=state.step,
+        sim_time=clock,
+        wall_time=Clock(sec=0, nsec=0),
+        recv_wall_time_ns=time.time_ns(),
+        per_articulation={
+            key: ArticulationState(
+                qpos=values.qpos,
+                qvel=values.qvel,
+                ctrl=values.ctrl if len(values.ctrl) else None,
+                sensors={name: reading.tolist() for name, reading in values.sensors.items()} or None,
+            )
+            for key, values in robots.items()
+        },
+        entities={
+            name: EntityState(
+                xpos=tuple(entity.position.tolist()),
+                xquat=tuple(entity.orientation.tolist()),
+                qpos=np.concatenate((entity.position, entity.orientation)),
+            )
+            for name, entity in state.entities.items()
+        },
+    )
