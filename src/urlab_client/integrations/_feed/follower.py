@@ -16,7 +16,7 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State

@@ -15,8 +15,8 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import ArrayLike
 
+from urlab_client.aio.arguments import finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.model.numbers import finite_array
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
