@@ -15,13 +15,13 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import ArrayLike
 
+from urlab_client.aio.arguments import finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.model.numbers import finite_array
 from urlab_client.errors import URLabError
-from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
+from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
@@ -286,7 +286,7 @@ def _about(client: AsyncClient) -> dict[str, str]:
         "timestep": "" if model is None else repr(float(model.opt.timestep)),
     }
     declared = None if model is None else declared_in(model)
-    if declared is None and (varied := varied_by_ops(client)) is not None:
+    if declared is None and (varied := wire_variation(client)) is not None:
         declared = varied.declaration
     return about if declared is None else {**about, "randomise": declared.to_json()}
 
