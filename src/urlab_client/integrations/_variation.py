@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.observer import ClientObserver
 from urlab_client.enums import ControllerKind
 from urlab_client.randomise.declaration import Randomisation, UnsupportedRandomisation, Vary
 

@@ -16,7 +16,7 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
@@ -188,7 +188,7 @@ class Follower(ClientObserver):
             return None
 
     def _unknown_cameras(self) -> str:
-        """Raise if cameras are missing."""
+        """Return which requested cameras are missing; empty if none."""
         wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
         missing = [name for name in wanted if self._camera(name) is None]
         there = ", ".join(self._every_camera()) or "none"
