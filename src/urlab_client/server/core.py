@@ -152,20 +152,11 @@ class ServerCore:
     """A server without its sockets.
 
     Attributes:
-        world: The level being edited.
-        config: Configuration of the server.
         camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
         switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
         shm_directory: Directory of the shared-memory regions; None without shared memory.
-        session: The client's session.
-        play: The play session.
-        viewport: The viewport's camera.
-        drawings: Debug drawings.
         health: Whether the server's threads run.
         compiled: The level that the last play session was started with.
-        jobs: Editor ops that run in the background.
-        lease: The driver lease.
-        uploads: Models that clients upload in chunks.
         instance: Returns the identity of this server among several; None in dialects without one.
     """
 

@@ -73,19 +73,9 @@ class OpenServer:
     """The parts of an open server. Does not refer to its `SimulatedServer`, so that it can be collected.
 
     Attributes:
-        config: Its configuration.
-        host: Address of the interface, in numbers.
-        curve_keys: Keys, if the traffic is encrypted.
-        core: The state that handlers share.
-        dispatcher: Answers requests.
-        endpoint: The request socket.
-        streams: The sockets of state, controls and info.
-        cameras: The sockets of camera images.
-        memory: The shared memory, if any.
         served: All parts with a thread.
         authored: Result of `_mark` after the start.
         resources: Everything that `close` releases.
-        pid: The process that opened it.
     """
 
     config: ServerConfig

@@ -125,13 +125,9 @@ class CompiledScene:
     """A compiled scene.
 
     Attributes:
-        model: The model.
         data: Its data, reset and with derived quantities computed.
         spec: The compiled `mujoco.MjSpec`; options of `model.opt` that changed since are not in it.
-        articulations: In spawn order.
         actors: What it was compiled from, in spawn order.
-        entities: In spawn order.
-        warnings: What the user should know about the scene.
     """
 
     model: mujoco.MjModel

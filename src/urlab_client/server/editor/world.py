@@ -50,7 +50,6 @@ class Placed(NamedTuple):
     """An actor that was placed or moved.
 
     Attributes:
-        actor: The actor in its new state.
         rotation_quat: Rotation from the request; not normalised.
         was_existing: True if an existing actor was moved.
     """
@@ -64,12 +63,8 @@ class EditorWorld:
     """The open level and the imported assets.
 
     Attributes:
-        content: The content root.
         pie_running: Whether a play session runs; set by the code that starts and stops it. While it is true, the ops
             that look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
-        levels: The level files, and which one is open.
-        blueprints: The imported blueprints.
-        quick_convert: Static meshes that become bodies.
     """
 
     def __init__(self, content: ContentRoot, *, actor_names: ActorNames = "model") -> None:

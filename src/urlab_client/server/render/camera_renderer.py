@@ -78,7 +78,6 @@ class Shot:
 
     Attributes:
         key: The camera as the request names it, the frame's key in the reply.
-        camera: The camera.
         sync: Draw the state after the step, rather than hand over the latest frame.
         late: The camera's latency, if it has one.
         least: Number of the oldest acceptable snapshot.
@@ -98,8 +97,6 @@ class Exposure:
     """A state to be drawn, and the cameras to draw.
 
     Attributes:
-        cameras: The cameras.
-        data: The state.
         taken_at: Time of the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not carry it.
         past: Receiver of the delayed frame, if the camera has a latency.
@@ -124,7 +121,6 @@ class Film:
         taken_at: When it was captured, monotonic seconds.
         captured: The same time as Unix seconds.
         number: Number of the state's snapshot.
-        jobs: The states to draw.
         past: What delayed cameras show; cameras without a state to show yet are missing.
     """
 
@@ -162,8 +158,6 @@ class Painting:
     """A state to be drawn as a picture of the viewport.
 
     Attributes:
-        picture: What it shows.
-        data: The state.
         look: Values of the model fields that vary.
         pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
         done: Set when it is drawn, or never will be.
