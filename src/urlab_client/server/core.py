@@ -97,11 +97,7 @@ def _level(name: str) -> ObservationLevel | None:
 
 
 class DriverLease:
-    """One lease at a time, which expires after some time without requests.
-
-    Args:
-        clock: Returns the time, seconds.
-    """
+    """One lease at a time, which expires after some time without requests."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -232,9 +228,6 @@ class ServerCore:
 
     def begin_play_again(self, timeout: float) -> bool:
         """Restart play with the scene that was compiled last, and return when it is ready.
-
-        Args:
-            timeout: Longest time for stopping the current session, seconds.
 
         Returns:
             False if stopping took longer, or the level has changed since it was compiled.

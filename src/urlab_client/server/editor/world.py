@@ -144,9 +144,6 @@ class EditorWorld:
             base_actor_id: Cell (i, j) gets the id `<base>_<i>_<j>`; cells that exist are moved.
             spacing: Distance between cells, metres; z is ignored.
             origin: Position of cell (0, 0), metres.
-            rotation_quat: Rotation of every actor; wins over `rotation_euler`.
-            rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
-            scale: Must be 1.
         """
         require(blueprint, "blueprint")
         require(base_actor_id, "base_actor_id")
@@ -177,8 +174,6 @@ class EditorWorld:
 
         Args:
             kind: `directional`, `point` or `spot`, in any letter case.
-            actor_id: Kept as a tag.
-            location: Position, metres.
             rotation_euler: (roll, pitch, yaw), degrees, in Unreal's frame; the light shines along its +x.
             intensity: In Unreal's unit for that kind; brightness here is relative to 5000.
         """
@@ -208,13 +203,7 @@ class EditorWorld:
         rotation_quat: Quat | None = None,
         rotation_euler: Vec3 | None = None,
     ) -> Actor:
-        """Move an actor; parts left out stay.
-
-        Args:
-            location: Position, metres.
-            rotation_quat: Rotation; wins over `rotation_euler`.
-            rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
-        """
+        """Move an actor; parts left out stay."""
         code = "set_actor_transform_failed"
         actor = self.actors.find(target, code)
         rotation = checked_rotation(rotation_quat, rotation_euler, code)
@@ -380,7 +369,6 @@ class QuickConvert:
     """The Quick Convert settings of the actors of the open level."""
 
     def __init__(self, actors: LevelActors) -> None:
-        """Change the settings of these actors."""
         self._actors = actors
 
     def add(self, target: str, settings: ConversionSettings) -> Actor:

@@ -92,11 +92,9 @@ class Engine:
         """Prepare a scene for stepping; `start` starts the physics thread.
 
         Args:
-            scene: Compiled scene; the engine steps its `data` in place.
             pinned_mode: Start in this mode and refuse `set_mode`; None or `auto` starts live and leaves it free.
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
-            health: Receives a report if the physics thread dies.
         """
         self.scene = scene
         self.dialect = dialect
@@ -145,9 +143,6 @@ class Engine:
 
         A request under way ends between two sub-steps. Safe to call twice.
 
-        Args:
-            timeout: Seconds to wait.
-
         Returns:
             False when physics was still busy after `timeout`, for example inside one very long `mj_step`.
         """
@@ -177,11 +172,7 @@ class Engine:
         return self._call.overdue
 
     def begin_replay(self, make: Callable[[], Player]) -> None:
-        """Reset data and set-points, unpause, and from now on let steps play instead of integrating.
-
-        Args:
-            make: Makes the player once the data are reset.
-        """
+        """Reset data and set-points, unpause, and from now on let steps play instead of integrating."""
         with self.lock:
             self.reset()
             self.articulations.zero_set_points()

@@ -188,8 +188,6 @@ class CameraRenderer:
 
         Args:
             modes: Meaning of the pixels by articulation key and camera name; `real` by default.
-            appearance: See `Appearance`.
-            health: Receives a report if the drawing thread dies.
             names: Names of articulations in requests and replies, by key; the key itself by default.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
         """
@@ -336,7 +334,6 @@ class CameraRenderer:
         Without OpenGL, or if drawing fails or takes too long, cameras are left out; the log gives the reason.
 
         Args:
-            film: The result of `capture`.
             wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
                 is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
@@ -357,9 +354,6 @@ class CameraRenderer:
     def paint(self, job: Painting) -> Bytes:
         """Draw a picture of the viewport.
 
-        Args:
-            job: The result of `capture_viewport`.
-
         Returns:
             Red, green, blue and alpha from the top, shape (height, width, 4).
 
@@ -379,9 +373,6 @@ class CameraRenderer:
 
     def close(self, timeout: float = 1.0) -> bool:
         """Stop drawing and release waiting callers. Idempotent.
-
-        Args:
-            timeout: Seconds to wait for the thread.
 
         Returns:
             False if it was still drawing then.
