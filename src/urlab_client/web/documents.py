@@ -61,7 +61,7 @@ def openapi(endpoints: tuple[Endpoint, ...], root: str) -> bytes:
         root: Path under which the application is mounted or a proxy serves it.
     """
     ops = [*SERVED.values()]
-    kinds = [kind for one in endpoints for kind in (one.reply, one.parameters.get("body", (None, None))[0])]
+    kinds = [kind for one in endpoints for kind in (one.result, one.parameters.get("body", (None, None))[0])]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
     components = schemas([*_structs(kinds), Error, *(op.request for op in ops), *replies], _SCHEMA)
     for op in ops:  # a request on the wire also says which op it is, and of which session
@@ -95,7 +95,7 @@ def _plain_path(endpoint: Endpoint) -> str:
 
 def _described_endpoint(endpoint: Endpoint) -> dict[str, Any]:
     doc = inspect.cleandoc(endpoint.function.__doc__ or "")
-    reply = _schema(endpoint.reply) if endpoint.media == JSON else {"type": "string"}
+    reply = _schema(endpoint.result) if endpoint.media == JSON else {"type": "string"}
     found: dict[str, Any] = {
         "operationId": endpoint.function.__name__,
         "tags": ["console"],

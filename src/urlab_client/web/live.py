@@ -159,7 +159,7 @@ async def pictures(console: ConsoleSession, socket: WebSocket) -> None:
             picture = await feed.after(seq)
             seq = picture.seq
             flow.sent()
-            await socket.send_bytes(picture.frame())
+            await socket.send_bytes(picture.frame)
 
     async def listen() -> None:
         while True:
