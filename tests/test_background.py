@@ -51,7 +51,7 @@ AWAITED = {
     "console/session.py:_keep": "waits for both tasks, and raises the error of the first",
     "web/live.py:_converse": "the task group of one connection, which ends with the error",
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
-    "integrations/gym/threaded_batch.py:__init__": "a pool, whose results the caller reads",
+    "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
     "cli/mcp.py:_serve_stdio_and_console": "waits for the task and raises its error",
 }
 """Functions that make tasks or threads without the helpers, and who sees their end."""

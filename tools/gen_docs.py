@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -329,15 +330,16 @@ def exports(module: str) -> dict[str, str]:
     places = {name: imported.get(name, f"{module}.{name}") for name in names}
     for name, place in places.items():
         package, _, own = place.rpartition(".")
-        if package != module and source(package).name == "__init__.py":
-            places[name] = exports(package)[own]
+        if package != module and re.search(r"^__all__ = ", source(package).read_text(encoding="utf-8"), re.MULTILINE):
+            places[name] = exports(package).get(own, place)
     return places
 
 
 def around() -> list[str]:
     """Return the public modules beside clients and server."""
-    packages = sorted(path.parent.name for path in (SRC / "urlab_client" / "integrations").glob("[!_]*/__init__.py"))
-    integrations = [f"urlab_client.integrations.{name}" for name in packages]
+    folder = SRC / "urlab_client" / "integrations"
+    public = [path for path in folder.iterdir() if not path.name.startswith("_")]
+    integrations = [f"urlab_client.integrations.{name}" for name in sorted(path.stem for path in public)]
     for package, module in (("gym", "envhub"), ("record", "export")):
         at = integrations.index(f"urlab_client.integrations.{package}") + 1
         integrations.insert(at, f"urlab_client.integrations.{package}.{module}")

@@ -22,6 +22,7 @@ from urlab_client._installation import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError
+from urlab_client.values.names import UnknownName
 
 __all__ = ["main"]
 
@@ -92,7 +93,7 @@ def _run(argv: Sequence[str]) -> int:
             return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except (CommandError, MissingExtra, URLabError, OSError) as error:
+    except (CommandError, MissingExtra, UnknownName, URLabError, OSError) as error:
         if _is_broken_pipe(error):
             raise
         sys.stderr.write(f"{name}: {one_line(error)}\n")

@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> int:
     import_mujoco()
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    check_recording(arguments.output, overwrite=arguments.overwrite)
+    check_recording(arguments.output, arguments)
     if arguments.camera and arguments.address.startswith("sim://"):
         from urlab_client.simulation.opengl import need_backend
 

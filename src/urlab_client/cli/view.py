@@ -86,7 +86,7 @@ def run(arguments: Namespace) -> int:
     if arguments.where == "web":
         return _show_console(arguments)
     if arguments.where == "viewer":
-        from urlab_client.integrations.view.window import missing_for_window
+        from urlab_client.integrations.view.view import missing_for_window
 
         missing = missing_for_window()
         if missing:

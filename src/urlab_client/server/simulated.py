@@ -23,12 +23,10 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.config import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
-from urlab_client.server.initial_level import is_level
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import OpenServer, open_server
+from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, open_server
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
-from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
 from urlab_client.simulation.appearance import RenderQuality

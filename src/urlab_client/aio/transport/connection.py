@@ -22,7 +22,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._platform.signals import uninterrupted
 from urlab_client.aio.background import Tell
-from urlab_client.aio.transport.waiting import Watch, watch_socket
+from urlab_client.aio.transport.waiting import Socket, Watch, watch_socket
 from urlab_client.keys import KeyPair, public_key, read_pair
 
 HEARTBEAT_MS = 1000
@@ -75,7 +75,6 @@ SERVER_KEY_HINT = "If the server requires CURVE keys, pass server_key=…, and c
 _SERVER_VARIABLE = "URLAB_SERVER_KEY"
 _CLIENT_VARIABLE = "URLAB_CLIENT_KEY"
 
-Socket: TypeAlias = zmq.Socket[bytes]
 Context: TypeAlias = zmq.Context[Socket]
 Note: TypeAlias = Callable[[zmq.Event, int, str | None], None]
 """Handles an event of a connection: the event, its value, and the obstacle that it shows, if any."""
@@ -140,13 +139,7 @@ def client_keys(address: str, server_key: str | None, client_key: str | None) ->
 class Connection:
     """A ZeroMQ socket that connects to one address, and the monitor that shows what becomes of it.
 
-    Args:
-        loop: The running event loop.
-        socket: The socket, not yet connected; the connection owns it.
-        endpoint: The address.
-        keys: Keys for a server that requires them.
-        note: Called on the event loop for each event.
-        tell: Publishes the event that a watching thread died.
+    Takes over the socket, which is not yet connected. `note` is called on the event loop for each event.
 
     Raises:
         ValueError: The address is not valid; the socket is closed.
@@ -239,11 +232,7 @@ class Connection:
 
 
 class Attempts:
-    """Tracks the attempts of a connection to distinguish a refusing host from a silent one, as ZeroMQ does not.
-
-    Args:
-        now: Start time of the first attempt, seconds.
-    """
+    """Tracks the attempts of a connection to distinguish a refusing host from a silent one, as ZeroMQ does not."""
 
     def __init__(self, now: float) -> None:
         self._began = now
@@ -252,10 +241,7 @@ class Attempts:
     def obstacle(self, event: zmq.Event, value: int, now: float) -> str | None:
         """Return the obstacle that a monitor's event shows, or None if it shows none.
 
-        Args:
-            event: The event.
-            value: Value of the event; for `CONNECT_RETRIED`, the milliseconds until the next attempt.
-            now: Current time, seconds.
+        The value of `CONNECT_RETRIED` is the milliseconds until the next attempt.
         """
         took, self._began = now - self._began, now
         ended, self._ended = self._ended, event is zmq.Event.DISCONNECTED

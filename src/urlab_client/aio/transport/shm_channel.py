@@ -71,11 +71,6 @@ def answers(reply: bytes, op: Op) -> bool:
 class RegionChannel:
     """The pair of request and reply regions, for the client that holds the lock.
 
-    Args:
-        requests: File of the request region.
-        replies: File of the reply region.
-        events: Names of their events on Windows.
-
     Attributes:
         limit: Size of the largest payload that fits in both directions, bytes.
         dirty: Whether an old reply may still be to come.

@@ -128,14 +128,7 @@ class Subscription(Struct, frozen=True):
 
 
 class ConnectionStatus(Struct, frozen=True):
-    """Status of the connection to a publisher.
-
-    Attributes:
-        endpoint: Address of the publisher.
-        connected: Whether the publisher is connected.
-        connects: Number of connections opened so far.
-        obstacle: Most recent reason for a missing connection.
-    """
+    """Status of the connection to a publisher. The obstacle is the latest reason for a missing connection."""
 
     endpoint: str
     connected: bool
@@ -282,11 +275,7 @@ class _Subscriber:
 
 
 class Subscriptions:
-    """All subscriptions of one client. Sockets are opened on first use and closed when no handler remains.
-
-    Attributes:
-        closed: Whether `close` was called.
-    """
+    """All subscriptions of one client. Sockets are opened on first use and closed when no handler remains."""
 
     def __init__(self, keys: ClientKeys | None = None) -> None:
         self._keys = keys

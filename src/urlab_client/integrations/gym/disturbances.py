@@ -32,9 +32,6 @@ class Disturbances:
         declaration: The declaration.
         mapping: The articulations as spaces.
         n_task: Length of what a task adds to an observation.
-
-    Raises:
-        ValueError: Noise is declared on a field that is not observed.
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
@@ -52,11 +49,7 @@ class Disturbances:
         self._late_actions = 0
 
     def begin(self, rng: np.random.Generator) -> int:
-        """Draw the disturbances of an episode and return its seed.
-
-        Args:
-            rng: The environment's generator, which draws the seed.
-        """
+        """Draw the disturbances of an episode and return its seed, which the environment's generator draws."""
         self.seed: int = int(rng.integers(_SEED_END))
         seed = self.seed
         declared = self._declaration
@@ -96,8 +89,7 @@ class Disturbances:
     def seen(self, truth: Observation) -> Observation:
         """Return an observation with noise, delay and lost samples. Pictures have their own latency and are unchanged.
 
-        Args:
-            truth: The next observation of the episode, of this environment only. It is not modified.
+        `truth`, the next observation of the episode, is not modified.
         """
         sample = _copied(truth)
         for noise, targets, (generator, biases) in zip(

@@ -24,15 +24,23 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
-from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks, shutting_down
-from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
-from urlab_client.server.physics.physics_thread import PhysicsThread
-from urlab_client.server.physics.queued_step import QueuedStep
+from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
+from urlab_client.server.physics.scheduling import (
+    GIVE_WAY_S,
+    IDLE_S,
+    DataLock,
+    LivePacing,
+    MujocoCall,
+    Overdue,
+    PhysicsThread,
+    QueuedStep,
+    busy,
+    shutting_down,
+)
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.simulation.controller_config import ControllerConfig
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")

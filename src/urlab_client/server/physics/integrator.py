@@ -15,9 +15,8 @@ from urlab_client.protocol.messages.session import Step
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.data_lock import MujocoCall
+from urlab_client.server.physics.scheduling import MujocoCall, shutting_down
 from urlab_client.server.physics.variation import SceneVariation
-from urlab_client.server.refusal import Refusal
 
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
@@ -85,11 +84,7 @@ class Integrator:
         """Prepare to step a scene's data in place.
 
         Args:
-            scene: The scene.
-            articulations: Their set-points and controllers make the controls.
-            variation: What varies from reset to reset.
             call: Entered while MuJoCo works.
-            stopping: Whether a request under way is to be broken off.
         """
         self._model = scene.model
         self._data = scene.data
@@ -104,11 +99,7 @@ class Integrator:
         """Integrate a direct step.
 
         Args:
-            n_steps: Sub-steps.
             raw: Articulations whose controller has no say.
-
-        Raises:
-            Refusal: `shutting_down`, between two slices.
         """
         mj_step, model, data = mujoco.mj_step, self._model, self._data
         apply_controls = self._articulations.apply_controls
@@ -162,8 +153,3 @@ class Integrator:
         """Compute what follows from the state."""
         with self._call:
             mujoco.mj_forward(self._model, self._data)
-
-
-def shutting_down() -> Refusal:
-    """Return the refusal of a step that the end of the simulation breaks off."""
-    return Refusal("shutting_down", "the simulation is stopping")

@@ -111,8 +111,6 @@ def bounds_of(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool
     """Return the box around the chosen geoms; None if none of them has bounds, as planes have not.
 
     Args:
-        model: The model.
-        data: Its data with positions computed.
         geoms: Mask, shape (ngeom,).
     """
     bounded = geoms & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))
