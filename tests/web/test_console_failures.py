@@ -16,7 +16,6 @@ from starlette.routing import Mount
 from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient, background
-from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.console.controls import Controls
 from urlab_client.console.hand_driving import HandDriving
 from urlab_client.console.lease import DrivingLease, Viewer
@@ -145,8 +144,8 @@ async def test_a_mode_that_changes_meanwhile_makes_no_step_of_set_points(tmp_pat
         session = client._session
         async with session.turn(SetMode) as turn:
             console.controls.set_points(ME, {"arm": {actuator: 0.1}})
-            await until(lambda: session.turns._waiting or session.line._waiting)
-            await ask_mode(client._state, turn, StepMode.DIRECT)
+            await until(lambda: session.state_lock._waiting or session.request_lock._waiting)
+            await client._state.mode.ask(turn, StepMode.DIRECT)
         assert (await client.step()).step == 1
         assert errors(console) == {}
 

@@ -1,8 +1,9 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has a module with its `DESCRIPTION`, its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`. Only the
-module of the command that is run is imported, because every `sim://` server is an `urlab serve`, and none for
-`urlab --help`. An expected failure prints one line on standard error and exits with code 2.
+Each command has a module with its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`; its docstring, without the
+first line, describes the command to users. Only the module of the command that is run is imported, because every
+`sim://` server is an `urlab serve`, and none for `urlab --help`. An expected failure prints one line on standard error
+and exits with code 2.
 """
 
 from __future__ import annotations
@@ -138,7 +139,8 @@ def _parser(command: str | None = None) -> Parser:
             subparsers.add_parser(name, help=brief)
             continue
         module = import_module(f"{__name__}.{name.replace('-', '_')}")
-        own = subparsers.add_parser(name, help=brief, description=module.DESCRIPTION, examples=module.EXAMPLES)
+        description = (module.__doc__ or "").partition("\n\n")[2]  # none with python -OO
+        own = subparsers.add_parser(name, help=brief, description=description, examples=module.EXAMPLES)
         module.add_arguments(own)
         own.set_defaults(run=module.run)
     return parser

@@ -1,4 +1,11 @@
-"""`urlab mcp`: tools for agents, over the Model Context Protocol."""
+"""`urlab mcp`: tools for agents, over the Model Context Protocol.
+
+Serve tools for agents over the Model Context Protocol, on standard input and output or, with --http, at an address on
+this machine. Without --allow-drive and --allow-edit, an agent can only look, and does not take a running server over
+from another client. The console shows what the agent does; a person who acts there takes the controls from the agent.
+Messages for you, such as the console's link, go to standard error. Exits with code 0 when its input ends, on SIGINT
+(Ctrl-C) and on SIGTERM.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +47,6 @@ AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
 
-DESCRIPTION = (
-    "Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
-    "--http, at an address on this machine. Without --allow-drive and --allow-edit, an agent can only look, and "
-    "does not take a running server over from another client. The console shows what the agent does; a person who "
-    "acts there takes the controls from the agent. Messages for you, such as the console's link, go to standard "
-    "error. Exits with code 0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM."
-)
 EXAMPLES = (
     ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
     ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),

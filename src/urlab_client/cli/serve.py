@@ -1,4 +1,8 @@
-"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it."""
+"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it.
+
+Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT (Ctrl-C) and SIGTERM, and with
+code 2 if it fails.
+"""
 
 from __future__ import annotations
 
@@ -49,10 +53,6 @@ _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
-DESCRIPTION = (
-    "Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
-    "(Ctrl-C) and SIGTERM, and with code 2 if it fails."
-)
 EXAMPLES = (
     ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
     (

@@ -39,11 +39,16 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
+from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.threads import Health
 from urlab_client.simulation.appearance import Appearance
+
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 
 class ServerSession:
@@ -136,11 +141,6 @@ class DriverLease:
 
     def _holds(self) -> bool:
         return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
-
-
-logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
@@ -274,19 +274,21 @@ class ServerCore:
             if names_fit:
                 raise CompileFailed(problem)
             logger.warning("%s", problem)
-        try:
-            engine = Engine(
-                scene,
-                pinned_mode=config.step_mode,
-                paused=not config.unpaused,
-                controllers=controllers,
-                health=self.health,
-                dialect=self.dialect,
-                randomise=config.randomise,
-            )
-        except ValueError as error:
-            raise CompileFailed(f"what is to vary: {error}") from None
-        varied = () if engine.variation is None else engine.variation.visible_fields
+        engine = Engine(
+            scene,
+            pinned_mode=config.step_mode,
+            paused=not config.unpaused,
+            controllers=controllers,
+            health=self.health,
+            dialect=self.dialect,
+        )
+        varied: Sequence[str] = ()
+        if config.randomise is not None:
+            try:
+                engine.variation = SceneVariation(scene, config.randomise, engine.articulations)
+            except ValueError as error:
+                raise CompileFailed(f"what is to vary: {error}") from None
+            varied = engine.variation.visible_fields
         channels = UserChannels(config.user_channels)
         modes = {
             (index.key, camera.name): config.camera_mode(index, camera.name)

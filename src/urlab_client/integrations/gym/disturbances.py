@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
 from urlab_client.randomise.variation import draw_range, stream
@@ -75,7 +75,7 @@ class Disturbances:
         if not self._late_actions:
             return action
         self._actions.append(_copied(action))
-        return self._actions.popleft() if len(self._actions) > self._late_actions else _zero(action)
+        return self._actions.popleft() if len(self._actions) > self._late_actions else mapped(np.zeros_like, action)
 
     def forces(self) -> dict[str, Floats]:
         """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""
@@ -175,9 +175,3 @@ def _copied(tree: Any) -> Any:
         entries = cast("Mapping[str, Any]", tree)
         return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}
     return np.array(tree)
-
-
-def _zero(action: Any) -> Any:
-    if isinstance(action, Mapping):
-        return {key: np.zeros_like(values) for key, values in cast("Mapping[str, Any]", action).items()}
-    return np.zeros_like(action)

@@ -70,7 +70,7 @@ class _Session:
         """Apply set-points and forces for one action."""
         if self.episode is None:
             raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
-        return await self.episode.act(set_points, forces)
+        return await self.episode.step(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
-from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
 from urlab_client.integrations.gym.task import States, Task
 from urlab_client.randomise.declaration import Randomisation
 
@@ -287,17 +287,17 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _true_observations(self) -> Observation:
         """Return the true observations, from which rewards and terminations are computed."""
-        return _map(np.copy, self._observations)
+        return mapped(np.copy, self._observations)
 
     def _disturbed_observations(self) -> Observation:
         """Return the observations with all disturbances."""
-        return _map(np.copy, self._sensed if self._observations_disturbed else self._observations)
+        return mapped(np.copy, self._sensed if self._observations_disturbed else self._observations)
 
     def _delayed(self, indices: Indices, actions: Any) -> Any:
         """Return the actions that take effect now; those of other environments are unchanged."""
         if self.randomise is None or not self.randomise.delays_actions:
             return actions
-        delayed = _map(np.array, actions)
+        delayed = mapped(np.array, actions)
         for i, disturbances in self._disturbed(indices):
             _put(delayed, i, disturbances.delayed(_pick(delayed, i)))
         return delayed
@@ -318,13 +318,6 @@ def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:
     return {int(i): infos["error"][i] for i in np.flatnonzero(infos["_error"])} if "error" in infos else {}
 
 
-def _map(function: Any, observations: Observation) -> Observation:
-    if isinstance(observations, dict):
-        entries = cast("dict[str, Observation]", observations)
-        return {key: _map(function, entry) for key, entry in entries.items()}
-    return function(observations)
-
-
 def _put(observations: Observation, indices: Indices | int, found: Observation) -> None:
     if isinstance(observations, dict):
         entries = cast("dict[str, Observation]", observations)
@@ -335,7 +328,4 @@ def _put(observations: Observation, indices: Indices | int, found: Observation) 
 
 
 def _pick(observations: Observation, index: int) -> Observation:
-    def row(array: Floats) -> Floats:
-        return array[index].copy()
-
-    return _map(row, observations)
+    return mapped(lambda array: array[index].copy(), observations)

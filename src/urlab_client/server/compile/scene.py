@@ -41,6 +41,15 @@ from urlab_client.values.rotation import wxyz
 _FILE: Final = re.compile(r'\b(file\w*)="([^"]*)"')
 
 
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_DEFAULT_LIMITS: Final = Limits()
+
+Floats = NDArray[np.float64]
+
+_SAME: Final = 1e-6
+
+
 def attached_scene(spec: mujoco.MjSpec, actors: Sequence[Actor]) -> tuple[str, dict[str, bytes]] | None:
     """Return a scene as a document with attached robots, and all files it needs by their bare names.
 
@@ -109,11 +118,6 @@ def _with_robots(text: str, actors: Sequence[Actor]) -> str:
 
 def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
-
-
-logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-_DEFAULT_LIMITS: Final = Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,10 +280,6 @@ def _fit_offscreen_buffer(model: mujoco.MjModel, sizes: Iterable[tuple[int, int]
     for width, height in sizes:
         screen.offwidth = max(screen.offwidth, width)
         screen.offheight = max(screen.offheight, height)
-
-
-Floats = NDArray[np.float64]
-_SAME: Final = 1e-6
 
 
 def coinciding_planes(model: mujoco.MjModel) -> list[list[int]]:

@@ -29,10 +29,9 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.render.viewport_picture import ViewportPicture, ViewportStage
 from urlab_client.server.system.threads import Health, ended
-from urlab_client.simulation.appearance import Appearance, RenderQuality
+from urlab_client.simulation.appearance import Appearance, RenderQuality, Tints
 from urlab_client.simulation.cameras import Instant, Latency, Past, SceneCamera
 from urlab_client.simulation.opengl import RenderingUnavailable, need_backend, search_backend
-from urlab_client.simulation.tints import Tints
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -42,6 +42,12 @@ BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up case-insensitively but recognise only their exact name."""
 
 
+RENEWED_S: Final = 0.25
+"""How often a waiting request checks whether the lock has been replaced."""
+
+INTERVAL_S: Final = 0.25
+
+
 class ServedRequest(Struct, frozen=True, kw_only=True):
     """An answered request; see `SimulatedServer.add_request_callback`.
 
@@ -106,10 +112,6 @@ HANDLERS: Final = HandlerTable()
 """The handlers of this package; filled when `urlab_client.server.handlers` is imported."""
 
 handles = HANDLERS.handles
-
-
-RENEWED_S: Final = 0.25
-"""How often a waiting request checks whether the lock has been replaced."""
 
 
 class Dispatcher:
@@ -299,9 +301,6 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
     if incoming.op is not None and incoming.op.effect is not Effect.READ:
         executed = " It was executed: do not send it again."
     raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")
-
-
-INTERVAL_S: Final = 0.25
 
 
 class Watchdog:

@@ -42,6 +42,16 @@ _DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)", re.ASCII)
 _INTEGER: Final = re.compile(r"[+-]?\d+", re.ASCII)
 
 
+_DEFAULT_LIMITS: Final = Limits()
+
+_EXACT_NAMES: Final = frozenset({"hello", "meta"})
+"""Ops that are recognised in lower case only."""
+
+_NUMBERS: Final = frozenset({float, int})
+
+T = TypeVar("T")
+
+
 class _Absent(Enum):
     ABSENT = "absent"
 
@@ -246,16 +256,6 @@ _SIMPLE: Final[Mapping[type[inspect.Type], Callable[[Plain], Any]]] = {
     inspect.NoneType: lambda value: None if value is None else ABSENT,
     inspect.AnyType: lambda value: value,
 }
-
-
-_DEFAULT_LIMITS: Final = Limits()
-
-_EXACT_NAMES: Final = frozenset({"hello", "meta"})
-"""Ops that are recognised in lower case only."""
-
-_NUMBERS: Final = frozenset({float, int})
-
-T = TypeVar("T")
 
 
 class Incoming(Struct, frozen=True):
