@@ -248,6 +248,33 @@ def test_tasks_give_the_same_episodes_and_are_run_again_by_ray(expected: dict[in
     assert gone(tmp_path / "killed")
 
 
+def ends_its_server_once(notes: Path) -> Any:
+    """Return a policy that kills its server in the first attempt and notes the process id of each attempt's worker."""
+    name = str(notes)
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        seen = Path(name).read_text().split() if Path(name).exists() else []
+        if not seen:
+            children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
+            for pid in "".join(children).split():
+                os.kill(int(pid), 9)
+        if len(seen) < 2:
+            Path(name).write_text(" ".join([*seen, str(os.getpid())]))
+        return np.zeros(7)
+
+    return policy
+
+
+def test_an_episode_whose_server_died_runs_again_on_a_new_one(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import rollouts
+
+    policy = ends_its_server_once(tmp_path / "workers")
+    (episode,) = rollouts(policy, "sim://arm", 1, n_workers=1, retries=1, **OPTIONS)
+    assert episode.attempt == 2
+    first, second = (tmp_path / "workers").read_text().split()
+    assert first == second, "the worker itself stays"
+
+
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
 def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path, dialect: Any) -> None:
     from urlab_client.cluster import LeaseLost, LeasePool, rollouts
