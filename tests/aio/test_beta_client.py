@@ -431,14 +431,18 @@ async def test_pictures_of_a_step(served: SimulatedServer) -> None:
         assert set(everything.cameras) == {"arm/wrist", "copy1_arm/wrist"}
 
 
-async def test_an_older_picture_is_not_handed_out_as_that_of_the_step(client: URLabClient, beta: ScriptedBeta) -> None:
+async def test_an_older_picture_is_not_handed_out_as_that_of_the_step(
+    client: URLabClient, beta: ScriptedBeta, caplog: pytest.LogCaptureFixture
+) -> None:
     """Generation 2 statement 54."""
+    caplog.set_level("INFO", "urlab_client.client")
     frame = {"width": 4.0, "height": 2.0, "frame_id": 0.0, "sim_time": 0.0, "dtype": "bgra8", "data": bytes(32)}
     answer = beta.answers["step"]
     beta.on("step", lambda request: {**answer(request), "cameras": {"arm_a/wrist": frame}})
     camera = client.articulations["arm_a"].cameras["wrist"]
     reply = await client.step(include_cameras={"arm a/wrist": "sync"})
     assert reply.cameras == {}
+    assert "camera arm_a/wrist: its picture shows snapshot 0, but the step is snapshot 1" in caplog.messages
     assert (camera.delivered, camera.latest_frame) == (False, None)
     asked = beta.of("step")[0]
     assert (asked["include_cameras"], asked["render"]) == ({"arm_a/wrist": "sync"}, "sync")
