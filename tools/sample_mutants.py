@@ -259,7 +259,7 @@ def places(code: str) -> dict[int, list[list[Callable[[], str]]]]:
         | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger"))))
         | m.If(test=m.Name("TYPE_CHECKING") | m.Comparison(left=m.Attribute(value=m.Name("sys"))))
         | m.Assign(targets=[m.AssignTarget(target=m.Name("__all__"))])
-        | m.Assign(value=m.Call(func=m.Name("TypeVar")))
+        | m.Assign(value=m.Call(func=m.Name("TypeVar") | m.Name("TypeVarTuple") | m.Name("ParamSpec")))
         | m.AnnAssign(annotation=m.Annotation(annotation=m.Name("TypeAlias")))
     )
 
