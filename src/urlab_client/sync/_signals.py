@@ -53,7 +53,8 @@ class DeferredSignals:
                 if callable(handler := _get_handler(number)) and getattr(handler, "__module__", "") not in _OF_LOOPS
             ]
             try:
-                # After an exception the list contains exactly the handlers that were replaced.
+                # One C call replaces all of them, and after an exception the list contains exactly those that were
+                # replaced. In a Python loop, a handler still in place could raise between replacing one and noting it.
                 self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))
                 self._holding = True
             except BaseException:  # raised by a handler that was not replaced yet
@@ -106,11 +107,13 @@ class DeferredSignals:
         ]
         try:
             _consume(starmap(_set_handler, aside))
-        except BaseException:  # raised by a handler that was already restored
+        except BaseException:  # raised by a handler that was already restored; it ran once, so the second try succeeds
             _consume(starmap(_set_handler, aside))
             raise
         finally:
             self._holding = False
+            # The restored handlers are run by Python, as after any signal: what they raise has the caller's line in its
+            # traceback, and none runs inside another.
             if self._undelivered is not None:
                 _consume(self._undelivered)
 
