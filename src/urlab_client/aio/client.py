@@ -27,11 +27,10 @@ from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.capturing import Capturing
-from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
 from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
-from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
