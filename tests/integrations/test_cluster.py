@@ -451,7 +451,7 @@ def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dic
         import ray
 
         if ray.get_runtime_context().get_node_id() == victim_id:
-            os.close(os.open(fifo, os.O_RDONLY))  # waits here until the node is removed
+            Path(fifo).read_text()  # waits here until the node is removed
         return inner(observation, rng)
 
     with WorkerPool(2) as workers:

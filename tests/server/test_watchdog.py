@@ -18,7 +18,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.errors import NotReady, StepTimeout
 from urlab_client.server import Faults, SimulatedServer
 from urlab_client.server.core import ServerCore
-from urlab_client.server.rpc import watchdog
+from urlab_client.server.rpc import dispatch
 
 STEP_TIMEOUT_S = 0.2
 BALLS = "".join(
@@ -60,7 +60,7 @@ def hurry(server: SimulatedServer) -> None:
 
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
-    monkeypatch.setattr(watchdog, "INTERVAL_S", 0.02)
+    monkeypatch.setattr(dispatch, "INTERVAL_S", 0.02)
     made = Stuck(monkeypatch)
     yield made
     made.let_go.set()

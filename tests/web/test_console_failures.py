@@ -74,13 +74,13 @@ async def mounted(folder: Path, mode: str = "direct") -> AsyncGenerator[tuple[UR
         program = Starlette(routes=[Mount("/console", site)], lifespan=lifespan)
         async with program.router.lifespan_context(program):
             console: ConsoleSession = site.state.console
-            await until(lambda: any(entry.what == "session_opened" for entry in console.entries))
+            await until(lambda: any(entry.what == "session_opened" for entry in console.view.entries))
             yield client, console
 
 
 def errors(console: ConsoleSession) -> dict[str, str]:
     """Return what viewers read about the console's own errors."""
-    return {entry.what: entry.text for entry in console.entries if (entry.kind, entry.who) == ("error", "console")}
+    return {entry.what: entry.text for entry in console.view.entries if (entry.kind, entry.who) == ("error", "console")}
 
 
 def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:
@@ -114,12 +114,12 @@ async def test_a_number_that_the_program_wrote_is_not_sent_in_live_mode(tmp_path
         assert "finite" in errors(console)["set-points"]
         arm.set_ctrl(dict.fromkeys(others, 0.0))
         console.controls.set_points(ME, {"arm": {name: 0.2}})
-        await until(lambda: console.snapshot is not None and 0.2 in arm_set_points(console))
+        await until(lambda: console.view.snapshot is not None and 0.2 in arm_set_points(console))
 
 
 def arm_set_points(console: ConsoleSession) -> list[float]:
-    assert console.snapshot is not None
-    ctrl = console.snapshot.per_articulation["arm"].ctrl
+    assert console.view.snapshot is not None
+    ctrl = console.view.snapshot.per_articulation["arm"].ctrl
     return [] if ctrl is None else [round(value, 6) for value in ctrl.tolist()]
 
 
@@ -133,7 +133,7 @@ async def test_each_loop_goes_on_after_a_failure(
             what = name.lstrip("_")
             assert "MemoryError: none left" in errors(console)[what]
             assert logged(caplog, f"urlab-web-{what}")
-        await until(lambda: console.state_json is not None)
+        await until(lambda: console.view.state_json is not None)
         await console.controls.run(ME, running=True)
         await until(lambda: client.step_count > 0)
 
@@ -156,7 +156,7 @@ async def test_pictures_go_on_after_a_failure(
 ) -> None:
     once(monkeypatch, Feed, "_run")
     async with mounted(tmp_path, "live") as (_, console):
-        feed = console.feed("arm/wrist")
+        feed = console.cameras.feed("arm/wrist")
         assert feed is not None
         async with feed.watch(), asyncio.timeout(DEADLINE_S):
             assert (await feed.after(0)).jpeg

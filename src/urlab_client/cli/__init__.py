@@ -1,8 +1,9 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has a module with its `DESCRIPTION`, its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`. Only the
-module of the command that is run is imported, because every `sim://` server is an `urlab serve`, and none for
-`urlab --help`. An expected failure prints one line on standard error and exits with code 2.
+Each command has a module with its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`; its docstring, without the
+first line, describes the command to users. Only the module of the command that is run is imported, because every
+`sim://` server is an `urlab serve`, and none for `urlab --help`. An expected failure prints one line on standard error
+and exits with code 2.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from urlab_client._installation import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError
+from urlab_client.values.names import UnknownName
 
 __all__ = ["main"]
 
@@ -92,7 +94,7 @@ def _run(argv: Sequence[str]) -> int:
             return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except (CommandError, MissingExtra, URLabError, OSError) as error:
+    except (CommandError, MissingExtra, UnknownName, URLabError, OSError) as error:
         if _is_broken_pipe(error):
             raise
         sys.stderr.write(f"{name}: {one_line(error)}\n")
@@ -137,7 +139,8 @@ def _parser(command: str | None = None) -> Parser:
             subparsers.add_parser(name, help=brief)
             continue
         module = import_module(f"{__name__}.{name.replace('-', '_')}")
-        own = subparsers.add_parser(name, help=brief, description=module.DESCRIPTION, examples=module.EXAMPLES)
+        description = (module.__doc__ or "").partition("\n\n")[2]  # none with python -OO
+        own = subparsers.add_parser(name, help=brief, description=description, examples=module.EXAMPLES)
         module.add_arguments(own)
         own.set_defaults(run=module.run)
     return parser

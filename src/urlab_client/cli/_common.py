@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Container, Generator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -78,10 +79,14 @@ def check_ending(path: Path, *endings: str) -> None:
         raise CommandError(f"{path}: write a file that ends in {' or '.join(endings)}, for example {better}")
 
 
-def check_recording(path: Path, *, overwrite: bool) -> None:
+def check_recording(path: Path | None, arguments: Namespace) -> None:
     """Refuse a recording that cannot be written, before the simulation starts."""
+    if path is None:
+        if arguments.camera or arguments.overwrite:
+            raise CommandError("--camera and --overwrite require --record")
+        return
     check_ending(path, ".mcap")
-    if path.exists() and not overwrite:
+    if path.exists() and not arguments.overwrite:
         raise CommandError(f"{path} exists; --overwrite replaces it")
     import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # a missing extra
 

@@ -1,4 +1,8 @@
-"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it."""
+"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it.
+
+Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT (Ctrl-C) and SIGTERM, and with
+code 2 if it fails.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +40,19 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
+_PASSED_ON = (
+    *("play", "unpaused", "step_mode", "host", "insecure_no_auth", *(f"{name}_port" for name in _PORTS)),
+    *("camera_size", "render_quality", "mjcf_options", "randomise", "actor_names"),
+    *("shm_dir", "dialect", "instance_id", "instance_index"),
+)
+"""Options that the server has by the same name."""
+
 # Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.
 _WAIT_S = 0.1 if sys.platform == "win32" else None
 _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
-DESCRIPTION = (
-    "Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
-    "(Ctrl-C) and SIGTERM, and with code 2 if it fails."
-)
 EXAMPLES = (
     ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
     (
@@ -254,34 +261,17 @@ def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
     from urlab_client.server.limits import Limits
     from urlab_client.server.simulated import SimulatedServer
 
+    options = {name: getattr(arguments, name) for name in _PASSED_ON}
     try:
         return SimulatedServer(
             *arguments.models,
-            play=arguments.play,
-            unpaused=arguments.unpaused,
-            step_mode=arguments.step_mode,
-            host=arguments.host,
+            **options,
             curve=_curve(arguments),
-            insecure_no_auth=arguments.insecure_no_auth,
-            step_port=arguments.step_port,
-            state_port=arguments.state_port,
-            ctrl_port=arguments.ctrl_port,
-            info_port=arguments.info_port,
-            camera_port=arguments.camera_port,
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
             controllers=dict(arguments.controller),
             camera_modes=dict(arguments.camera_mode),
-            camera_size=arguments.camera_size,
-            render_quality=arguments.render_quality,
-            mjcf_options=arguments.mjcf_options,
-            randomise=arguments.randomise,
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
-            actor_names=arguments.actor_names,
-            shm_dir=arguments.shm_dir,
-            dialect=arguments.dialect,
-            instance_id=arguments.instance_id,
-            instance_index=arguments.instance_index,
         )
     except ValueError as error:
         raise CommandError(str(error)) from None

@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
 from urlab_client.randomise.variation import draw_range, stream
@@ -32,9 +32,6 @@ class Disturbances:
         declaration: The declaration.
         mapping: The articulations as spaces.
         n_task: Length of what a task adds to an observation.
-
-    Raises:
-        ValueError: Noise is declared on a field that is not observed.
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
@@ -52,11 +49,7 @@ class Disturbances:
         self._late_actions = 0
 
     def begin(self, rng: np.random.Generator) -> int:
-        """Draw the disturbances of an episode and return its seed.
-
-        Args:
-            rng: The environment's generator, which draws the seed.
-        """
+        """Draw the disturbances of an episode and return its seed, which the environment's generator draws."""
         self.seed: int = int(rng.integers(_SEED_END))
         seed = self.seed
         declared = self._declaration
@@ -82,7 +75,7 @@ class Disturbances:
         if not self._late_actions:
             return action
         self._actions.append(_copied(action))
-        return self._actions.popleft() if len(self._actions) > self._late_actions else _zero(action)
+        return self._actions.popleft() if len(self._actions) > self._late_actions else mapped(np.zeros_like, action)
 
     def forces(self) -> dict[str, Floats]:
         """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""
@@ -96,8 +89,7 @@ class Disturbances:
     def seen(self, truth: Observation) -> Observation:
         """Return an observation with noise, delay and lost samples. Pictures have their own latency and are unchanged.
 
-        Args:
-            truth: The next observation of the episode, of this environment only. It is not modified.
+        `truth`, the next observation of the episode, is not modified.
         """
         sample = _copied(truth)
         for noise, targets, (generator, biases) in zip(
@@ -183,9 +175,3 @@ def _copied(tree: Any) -> Any:
         entries = cast("Mapping[str, Any]", tree)
         return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}
     return np.array(tree)
-
-
-def _zero(action: Any) -> Any:
-    if isinstance(action, Mapping):
-        return {key: np.zeros_like(values) for key, values in cast("Mapping[str, Any]", action).items()}
-    return np.zeros_like(action)

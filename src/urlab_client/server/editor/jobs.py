@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 
 _MOST: Final = 4096
 """Maximum number of jobs that wait, and of results that nobody has fetched; beyond it the oldest results go."""

@@ -25,12 +25,20 @@ from urlab_client.server.assets.actors import (
 )
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.compile.bounds import actor_bounds
-from urlab_client.server.editor import checks
-from urlab_client.server.editor.blueprints import Blueprints
-from urlab_client.server.editor.level_actors import ActorNames, LevelActors, match_actor
-from urlab_client.server.editor.levels import Levels
-from urlab_client.server.editor.quick_convert import QuickConvert
+from urlab_client.server.editor.level_actors import (
+    ActorNames,
+    LevelActors,
+    checked_pose,
+    checked_rotation,
+    float32,
+    match_actor,
+    refuse_infinite,
+    refuse_scale,
+    require,
+)
+from urlab_client.server.editor.levels import Blueprints, Levels
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, swap_frame
 from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode
@@ -118,12 +126,12 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees: Rz(yaw) Ry(-pitch) Rx(-roll).
             scale: Must be 1.
         """
-        checks.require(blueprint, "blueprint")
+        require(blueprint, "blueprint")
         code = "spawn_failed"
         found = self.blueprints.blueprint(blueprint, code)
-        checks.refuse_scale(scale, code)
-        understood = checks.rotation(rotation_quat, rotation_euler, code)
-        pose = checks.pose(location, understood if understood is not None else IDENTITY, code)
+        refuse_scale(scale, code)
+        understood = checked_rotation(rotation_quat, rotation_euler, code)
+        pose = checked_pose(location, understood if understood is not None else IDENTITY, code)
         existing = self._actors.of_class(actor_id, found.class_name, code)
         self._make_room(existing is None, found, code)
         return self._place(found, actor_id, existing, understood=understood or IDENTITY, pose=pose)
@@ -151,8 +159,8 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
             scale: Must be 1.
         """
-        checks.require(blueprint, "blueprint")
-        checks.require(base_actor_id, "base_actor_id")
+        require(blueprint, "blueprint")
+        require(base_actor_id, "base_actor_id")
         if count_x <= 0 or count_y <= 0:
             raise Refusal("invalid_count", f"count_x and count_y must be above zero, not {count_x} and {count_y}")
         most = self.content.limits.grid_cells
@@ -160,15 +168,15 @@ class EditorWorld:
             raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than the limit grid_cells, {most}")
         code = "spawn_failed"
         found = self.blueprints.blueprint(blueprint, code)
-        checks.refuse_scale(scale, code)
-        understood = checks.rotation(rotation_quat, rotation_euler, code) or IDENTITY
+        refuse_scale(scale, code)
+        understood = checked_rotation(rotation_quat, rotation_euler, code) or IDENTITY
         cells: list[tuple[str, Actor | None, tuple[Vec3, Quat]]] = []
         for j in range(count_y):
             for i in range(count_x):
                 actor_id = f"{base_actor_id}_{i}_{j}"
                 location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
                 existing = self._actors.of_class(actor_id, found.class_name, code)
-                cells.append((actor_id, existing, checks.pose(location, understood, code)))
+                cells.append((actor_id, existing, checked_pose(location, understood, code)))
         self._make_room(sum(existing is None for _, existing, _ in cells), found, code)
         return [
             self._place(found, actor_id, existing, understood=understood, pose=pose)
@@ -198,11 +206,11 @@ class EditorWorld:
         name = kind.casefold()
         if name not in ("directional", "point", "spot"):
             raise Refusal(code, f"'{kind}' is not a kind of light: use directional, point or spot")
-        checks.refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
-        at, rotation = checks.pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
+        refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
+        at, rotation = checked_pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
         self._make_room(1, None, code)
-        red, green, blue = (checks.float32(channel) for channel in color)
-        light = Light(kind=name, intensity=checks.float32(intensity), color=(red, green, blue))
+        red, green, blue = (float32(channel) for channel in color)
+        light = Light(kind=name, intensity=float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
         return self._actors.add(
             replace(draft, name=self._actors.numbered(draft.class_name), location=at, rotation=rotation)
@@ -229,8 +237,8 @@ class EditorWorld:
         """
         code = "set_actor_transform_failed"
         actor = self._actors.find(target, code)
-        rotation = checks.rotation(rotation_quat, rotation_euler, code)
-        at, turned = checks.pose(
+        rotation = checked_rotation(rotation_quat, rotation_euler, code)
+        at, turned = checked_pose(
             location if location is not None else actor.location,
             rotation if rotation is not None else actor.rotation,
             code,
@@ -247,11 +255,11 @@ class EditorWorld:
         """
         code = "duplicate_failed"
         source = self._actors.find(target, code)
-        checks.require(new_actor_id, "new_actor_id")
+        require(new_actor_id, "new_actor_id")
         if source.kind in (ActorKind.MANAGER, ActorKind.REPLAY_MANAGER):
             raise Refusal(code, f"'{source.name}' is a {source.class_name}, of which a level has one")
         x, y, z = source.location
-        at, rotation = checks.pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
+        at, rotation = checked_pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
         existing = self._actors.of_class(new_actor_id, source.class_name, code)
         self._make_room(existing is None, source.blueprint, code)
         if existing is not None:
@@ -400,3 +408,57 @@ class EditorWorld:
 def _node(actor: Actor, actors: Iterable[Actor]) -> ActorHierarchyNode:
     children = [_node(child, actors) for child in actors if child.parent == actor.name]
     return ActorHierarchyNode(name=actor.name, actor_class=actor.class_name, location=actor.location, children=children)
+
+
+class QuickConvert:
+    """The Quick Convert settings of the actors of the open level."""
+
+    def __init__(self, actors: LevelActors) -> None:
+        """Change the settings of these actors."""
+        self._actors = actors
+
+    def add(
+        self,
+        target: str,
+        *,
+        static: bool = False,
+        complex_mesh: bool = False,
+        coacd_threshold: float = 0.05,
+        driven_by_unreal: bool = False,
+        friction: Vec3 = UNIT_SCALE,
+    ) -> Actor:
+        """Make a static mesh actor a MuJoCo body from the next play on. Repeating it replaces all settings.
+
+        Args:
+            complex_mesh: Several convex parts of a mesh file instead of one hull; needs CoACD.
+            coacd_threshold: Concavity that a part may keep.
+
+        Raises:
+            Refusal: `missing_field`; `add_quick_convert_failed` for an unknown actor, one without a mesh, a plane that
+                is not static, a number that is not finite, or `complex_mesh` without CoACD.
+        """
+        code = "add_quick_convert_failed"
+        actor = self._actors.find(target, code)
+        if actor.mesh is None:
+            raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
+        if complex_mesh and not is_available():
+            raise Refusal(code, advice())
+        if actor.mesh.shape == "plane" and not static:
+            raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
+        refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
+        settings = ConversionSettings(
+            static=static,
+            complex_mesh=complex_mesh,
+            coacd_threshold=float32(coacd_threshold),
+            driven_by_unreal=driven_by_unreal,
+            friction=friction,
+        )
+        return self._actors.put(replace(actor, quick_convert=settings))
+
+    def remove(self, target: str) -> Actor:
+        """Make a static mesh actor decoration again."""
+        code = "remove_quick_convert_failed"
+        actor = self._actors.find(target, code)
+        if actor.quick_convert is None:
+            raise Refusal(code, f"'{actor.name}' has no Quick Convert settings")
+        return self._actors.put(replace(actor, quick_convert=None))

@@ -19,20 +19,27 @@ import mujoco
 
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import Step
-from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
-from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks, shutting_down
-from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
-from urlab_client.server.physics.physics_thread import PhysicsThread
-from urlab_client.server.physics.queued_step import QueuedStep
+from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
+from urlab_client.server.physics.scheduling import (
+    GIVE_WAY_S,
+    IDLE_S,
+    DataLock,
+    LivePacing,
+    MujocoCall,
+    Overdue,
+    PhysicsThread,
+    QueuedStep,
+    busy,
+    shutting_down,
+)
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.simulation.controller_config import ControllerConfig
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -64,7 +71,7 @@ class Engine:
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
         step_wanted: Returns, after a direct request, whether to call `on_tick` for it; always True by default.
         seed: The last `reset` seed, or None; MuJoCo does not use it.
-        variation: Variations applied at each reset, or None.
+        variation: Variations applied at each reset, or None. Set before `start`.
     """
 
     def __init__(
@@ -77,7 +84,6 @@ class Engine:
         step_timeout_s: float = 5.0,
         health: Health | None = None,
         dialect: Dialect = ALPHA,
-        randomise: Randomisation | None = None,
     ) -> None:
         """Prepare a scene for stepping; `start` starts the physics thread.
 
@@ -87,9 +93,6 @@ class Engine:
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
             health: Receives a report if the physics thread dies.
-
-        Raises:
-            ValueError: A name in `randomise` matches no element.
         """
         self.scene = scene
         self.dialect = dialect
@@ -101,9 +104,7 @@ class Engine:
         self._model = scene.model
         self._data = scene.data
         self.articulations: Articulations = Articulations(scene, controllers, dialect)
-        self.variation: SceneVariation | None = (
-            None if randomise is None else SceneVariation(scene, randomise, self.articulations)
-        )
+        self.variation: SceneVariation | None = None
         self._thread = PhysicsThread(
             scene.model,
             self.lock,
@@ -112,9 +113,7 @@ class Engine:
             give_up=self._drop_queue,
             health=Health() if health is None else health,
         )
-        self._integrator = Integrator(
-            scene, self.articulations, self.variation, self._call, lambda: self._thread.stopping
-        )
+        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._thread.stopping)
         self.on_substep: list[Hook] = self._integrator.on_substep
         self._pacing = LivePacing(scene.model)
         self._pinned = None if pinned_mode is StepMode.AUTO else pinned_mode
@@ -308,7 +307,7 @@ class Engine:
                     raise Refusal("unknown_keyframe", keyframe_name)
             self._tick_if_due()
             try:
-                self._integrator.reset(key, seed)
+                self._reset_data(key, seed)
                 self.articulations.override_joints(per_articulation_qpos or {})
                 self._integrator.forward()
             except Exception as error:
@@ -317,6 +316,17 @@ class Engine:
             self.snapshots.restart()
             self._fault = None
             self._kick()
+
+    def _reset_data(self, key: int, seed: int | None) -> None:
+        """Reset the data to a keyframe; -1 stands for the reference. The seed decides what varies."""
+        if self.variation is not None:
+            self.variation.begin(seed)
+        if key < 0:
+            mujoco.mj_resetData(self._model, self._data)
+        else:
+            mujoco.mj_resetDataKeyframe(self._model, self._data, key)
+        if self.variation is not None:
+            self.variation.start()
 
     def forward(self) -> None:
         """Run `mj_forward`; time and step counter stay."""

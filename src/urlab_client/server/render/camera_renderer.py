@@ -28,11 +28,10 @@ from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.render.viewport_picture import ViewportPicture, ViewportStage
-from urlab_client.server.system.health import Health, ended
-from urlab_client.simulation.appearance import Appearance, RenderQuality
+from urlab_client.server.system.threads import Health, ended
+from urlab_client.simulation.appearance import Appearance, RenderQuality, Tints
 from urlab_client.simulation.cameras import Instant, Latency, Past, SceneCamera
 from urlab_client.simulation.opengl import RenderingUnavailable, need_backend, search_backend
-from urlab_client.simulation.tints import Tints
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -193,13 +192,11 @@ class CameraRenderer:
         """Prepare for a scene. Drawing, and the search for OpenGL, begin with the first request for a frame.
 
         Args:
-            scene: The scene.
             modes: Meaning of the pixels by articulation key and camera name; `real` by default.
             appearance: See `Appearance`.
             health: Receives a report if the drawing thread dies.
             names: Names of articulations in requests and replies, by key; the key itself by default.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
-            dialect: Determines the names of cameras in requests and replies.
         """
         self._scene = scene
         self._health = Health() if health is None else health
@@ -238,7 +235,6 @@ class CameraRenderer:
         """Return what a request's `include_cameras` asks for; unknown names are left out.
 
         Args:
-            include_cameras: The request's field.
             fresh: Whether every picture is to show the state after the step.
         """
         if isinstance(include_cameras, bool):
@@ -283,12 +279,7 @@ class CameraRenderer:
         return any(_late(camera) is not None for camera in self._by_name.values())
 
     def see(self, frame_id: int, episode: int) -> None:
-        """Let the delayed cameras see the state; the caller holds the engine's lock.
-
-        Args:
-            frame_id: Number of its snapshot.
-            episode: Changes with each reset.
-        """
+        """Let the delayed cameras see the state; the caller holds the engine's lock."""
         now = self._now()
         if episode != self._episode:
             self._episode = episode
@@ -318,8 +309,6 @@ class CameraRenderer:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
-            shots: The requested frames.
-            frame_id: Number of the state's snapshot.
             draw: Whether frames may be drawn; otherwise existing ones are used.
 
         Returns:
@@ -352,7 +341,6 @@ class CameraRenderer:
         Without OpenGL, or if drawing fails or takes too long, cameras are left out; the log gives the reason.
 
         Args:
-            shots: The requested frames.
             film: The result of `capture`.
             wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
                 is drawn all the same. They begin when OpenGL has been found, which no request can hurry.

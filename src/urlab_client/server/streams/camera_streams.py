@@ -24,7 +24,7 @@ from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import Film, Shot
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
@@ -295,9 +295,12 @@ class CameraStreams:
                 if frame is None:
                     continue
                 number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
-                for (keys, sent), messages in zip(places, news, strict=True):
-                    if shot.key in keys and self._is_news(running, shot.key, number, sent):
-                        messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                try:
+                    for (keys, sent), messages in zip(places, news, strict=True):
+                        if shot.key in keys and self._is_news(running, shot.key, number, sent):
+                            messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
+                    self._skip(f"an image of '{shot.key}' is not published", error)
         return news
 
     def _is_news(self, running: Running, key: str, number: int, sent: _Sent) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from urlab_client._platform.files import write_whole
 from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -1,4 +1,7 @@
-"""The search: starts at the current joint positions, then at others, and iterates quadratic programs of mink."""
+"""Inverse kinematics: joint positions, within their limits, that bring a site or body of a robot to a pose.
+
+The solver is mink. Needs the extra `teleop`.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ import copy
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
-import mink
 import mujoco
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client._installation import need
 from urlab_client.aio.arguments import finite, finite_array
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
@@ -23,6 +26,12 @@ from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import split_prefix, unknown_name
 from urlab_client.values.plain import Serializable
+
+need("mink", extra="teleop")
+
+import mink  # noqa: E402
+
+__all__ = ["IkSolution", "InverseKinematics", "UnreachableTarget"]
 
 Vector = Sequence[float] | Floats
 
@@ -113,7 +122,7 @@ class InverseKinematics:
             )
         self._client = client
         self._source = model
-        self._robot = _robot(client, articulation)
+        self._robot = only_robot(client, articulation)
         if (site is None) is (body is None):
             raise ValueError("give exactly one frame: either site=NAME or body=NAME")
         kind, name = ("site", site) if site is not None else ("body", body or "")
@@ -187,11 +196,11 @@ class InverseKinematics:
             KeyError: A joint of `start` is not one of `self.joints`.
             URLabError: The client's model has been replaced since.
         """
-        aim = _vector("position", position, 3)
+        aim = vector("position", position, 3)
         turn = None if quaternion is None else _unit(quaternion)
         if starts < 1:
             raise ValueError(f"starts must be at least 1, not {starts}")
-        limits = _positive("tolerance", tolerance), _positive("rotation_tolerance", rotation_tolerance)
+        limits = positive("tolerance", tolerance), positive("rotation_tolerance", rotation_tolerance)
         found: list[IkSolution] = []
         for qpos in self._initial_positions(start, starts):
             found.append(self._descend(qpos, aim, turn, limits))
@@ -291,14 +300,15 @@ class InverseKinematics:
         return f"<InverseKinematics {self._kind} {self.frame!r} of {self._robot.name!r}>"
 
 
-def _robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulation | AsyncArticulation:
+def only_robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulation | AsyncArticulation:
+    """Return an articulation by its key, or the only one."""
     robots = client.articulations
     if key is not None:
         return robots[key]
     if len(robots) != 1:
         raise URLabError(
             f"Name the articulation: the scene has {', '.join(robots) or 'none'}.",
-            hint="Call InverseKinematics(client, KEY).",
+            hint="Pass its key as the second argument.",
         )
     return next(iter(robots.values()))
 
@@ -373,7 +383,8 @@ def _restricted(model: mujoco.MjModel, joints: list[int], low: Floats, high: Flo
     return private
 
 
-def _vector(what: str, values: Vector, length: int) -> Floats:
+def vector(what: str, values: Vector, length: int) -> Floats:
+    """Return numbers as an array of this length."""
     given = finite_array(what, values)
     if given.shape != (length,):
         raise ValueError(f"{what} takes {length} numbers, got an array of shape {given.shape}")
@@ -381,14 +392,15 @@ def _vector(what: str, values: Vector, length: int) -> Floats:
 
 
 def _unit(quaternion: Vector) -> Floats:
-    given = _vector("quaternion", quaternion, 4)
+    given = vector("quaternion", quaternion, 4)
     length = float(np.linalg.norm(given))
     if length < 1e-9:
         raise ValueError("quaternion is all zeros, which is not a valid orientation")
     return given / length
 
 
-def _positive(what: str, value: float) -> float:
+def positive(what: str, value: float) -> float:
+    """Return a number as a float above 0."""
     number = finite(what, value)
     if number <= 0:
         raise ValueError(f"{what} must be above 0, not {number:g}")

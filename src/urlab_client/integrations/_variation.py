@@ -1,28 +1,40 @@
-"""Variation by ops of the protocol, for servers that vary nothing themselves, such as an editor."""
+"""How a client's episodes vary: by its server, or by an environment through ops. Loads MuJoCo only where it is used."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.client import URLabClient
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.integrations._episode_variation import VariedByOps, controlled_actuators, varied_by_ops
-from urlab_client.protocol.base import Floats
-from urlab_client.randomise.declaration import Quantity, Randomisation, UnsupportedRandomisation, Vary
-from urlab_client.randomise.quantities import START, elements_of
-from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
+from urlab_client.enums import ControllerKind
+from urlab_client.randomise.declaration import Randomisation, UnsupportedRandomisation, Vary
 
 if TYPE_CHECKING:
     import mujoco
 
-_GAINS: Final[frozenset[Quantity]] = frozenset({"kp", "kv"})
-_SETTABLE: Final[frozenset[Quantity]] = START | frozenset[Quantity]({"gravity"})
+    from urlab_client.aio.client import URLabClient
+    from urlab_client.randomise.variation import EpisodeDraws, Variation
+
+
+def server_variation(
+    client: URLabClient, model: mujoco.MjModel, layouts: Mapping[str, ArticulationLayout]
+) -> Variation | None:
+    """Return how the server of a client varies its scene, or None if it does not."""
+    from urlab_client.randomise.variation import Variation, declared_in
+
+    declared = declared_in(model)
+    return None if declared is None else Variation(declared, model, _controlled_actuators(client, layouts))
+
+
+def wire_variation(client: URLabClient) -> WireVariation | None:
+    """Return what an environment varies by ops on this client, or None if no environment does."""
+    return next((found for found in client.observers if isinstance(found, WireVariation)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +45,14 @@ class _Controlled:
     """Unvaried gains, by gain and actuator, in the order of `actuators`."""
 
 
-class WireVariation:
-    """Variation applied before and after the reset that starts an episode.
+class WireVariation(ClientObserver):
+    """Variation by ops around the reset that starts an episode, for a server that varies nothing itself.
+
+    One of its client's observers, so that recordings, which see the client but not the environment, find it there.
 
     Attributes:
+        declaration: What varies.
+        draws: The values drawn for the current episode; None before the first.
         variation: The variation; it draws the same numbers as a server that varies its own scene.
         controlled: Controllers whose gains vary, by articulation.
     """
@@ -51,26 +67,24 @@ class WireVariation:
     ) -> None:
         """Look up what varies.
 
-        Args:
-            client: The client, after the handshake.
-            model: The client's model.
-            layouts: Layouts of the articulations in the model, by key.
-            declared: What varies.
-            earlier: The variation of an earlier session with the server, which may have left gravity and gains varied.
-                If None, the current gravity and gains count as unvaried.
+        `earlier` is the variation of an earlier session with the server, which may have left gravity and gains varied;
+        if None, the current gravity and gains count as unvaried.
 
         Raises:
             UnsupportedRandomisation: No op changes one of the quantities.
             ValueError: A name matches no element.
         """
-        controlled = controlled_actuators(client, layouts)
+        from urlab_client.randomise.variation import Variation, field_of
+
+        self.declaration = declared
+        self.draws: EpisodeDraws | None = None
+        controlled = _controlled_actuators(client, layouts)
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
-        if (before := varied_by_ops(client)) is not None:
+        if (before := wire_variation(client)) is not None:
             client.remove_observer(before)
-        self._varied = VariedByOps(declared)
-        client.add_observer(self._varied)
+        client.add_observer(self)
         self._model_fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields
         }
@@ -86,7 +100,7 @@ class WireVariation:
 
     async def apply(self, draws: EpisodeDraws) -> None:
         """Set the quantities that a reset does not change: gravity, and the gains of controllers."""
-        self._varied.draws = draws
+        self.draws = draws
         if self._model_fields:
             self.variation.write(draws, self._model_fields.__getitem__)
             await self._set_gravity()
@@ -98,16 +112,12 @@ class WireVariation:
             }
             await each.controller.set_gains(scaled.get("kp"), scaled.get("kv"))
 
-    def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
-        """Vary the start of the episode in place; see `Variation.start`."""
-        self.variation.start(draws, qpos)
-
     async def undo(self) -> None:
         """Restore gravity and gains if an episode has varied them."""
-        self._client.remove_observer(self._varied)
-        if self._varied.draws is None:
+        self._client.remove_observer(self)
+        if self.draws is None:
             return
-        self._varied.draws = None
+        self.draws = None
         if self._model_fields:
             self.variation.restore(self._model_fields.__getitem__)
             await self._set_gravity()
@@ -121,11 +131,24 @@ class WireVariation:
 
 
 def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
+    from urlab_client.randomise.quantities import START, elements_of
+
     def settable(vary: Vary) -> bool:
-        if vary.what in _GAINS:
+        if vary.what in ("kp", "kv"):
             return controlled.issuperset(elements_of(vary, model, controlled).ids.tolist())
-        return vary.what in _SETTABLE
+        return vary.what in START or vary.what == "gravity"
 
     refused = [vary.what for vary in declared.vary if not settable(vary)]
     if refused:
         raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
+
+
+def _controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
+    """Return the model ids of the actuators that a controller with gains drives."""
+    controlled: set[int] = set()
+    for key, articulation in client.articulations.items():
+        controller = articulation.controller
+        if controller is not None and controller.kind == ControllerKind.PD:
+            actuators = layouts[key].actuators
+            controlled.update(actuators[name] for name in controller.params["kp"])
+    return frozenset(controlled)
