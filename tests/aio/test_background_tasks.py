@@ -60,7 +60,7 @@ async def is_told(events: Stream[ClientEvent], caplog: pytest.LogCaptureFixture,
 
 
 async def test_the_keeper_of_the_session(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_monitor, "_LOOK_S", 0.01)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.01)
     ports = {f"{name}_port": free_port() for name in ("step", "state", "ctrl", "info", "camera")}
     async with SimulatedServer("arm", play=True, **ports) as first:
         client = URLabClient(**first.client_options(), step_mode="direct", keep_session=True)
@@ -89,7 +89,7 @@ async def test_the_watch_on_the_connection(
     async with URLabClient(**server.client_options(), step_mode="direct") as client:
         await client.discover()
         async with client.events() as events:
-            client._watch._look()
+            client._monitor._investigate()
             await is_told(events, caplog, "urlab-watch")
             assert (await client.step()).step == 1
 

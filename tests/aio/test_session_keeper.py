@@ -109,7 +109,7 @@ async def test_a_session_that_was_taken_over_is_not_taken_back(ports: dict[str, 
 
 
 async def test_a_takeover_is_noticed_without_a_call(server: SimulatedServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_monitor, "_LOOK_S", 0.02)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.02)
     async with keeping(server) as client, URLabClient(**server.client_options()) as other:
         await client.discover()
         events = client.events()
@@ -140,7 +140,7 @@ async def test_a_takeover_behind_a_broken_line_is_none_of_a_restart(server: Simu
 async def test_play_that_somebody_else_starts_is_discovered(
     server: SimulatedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection_monitor, "_LOOK_S", 0.1)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.1)
     async with keeping(server) as client:
         await client.discover()
         arm, events = client.articulations["arm"], client.events()

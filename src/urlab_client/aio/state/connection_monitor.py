@@ -73,7 +73,7 @@ class ConnectionMonitor:
         if isinstance(event, ServerReconnected):
             self._session.was_down = self._session.was_down or event.refused
             publishers.resume_regions()
-            self._look()
+            self._investigate()
 
     async def aclose(self) -> None:
         """Stop watching. Idempotent."""
@@ -122,11 +122,11 @@ class ConnectionMonitor:
 
     def _on_state_line(self, connected: bool) -> None:
         if self._playing and not connected:
-            self._look()
+            self._investigate()
 
     def _on_sign_of_play(self) -> None:
         if not (self._playing or self._announced):
-            self._look()
+            self._investigate()
 
     def _tick(self) -> None:
         """Check whether live snapshots have stopped."""
@@ -136,10 +136,10 @@ class ConnectionMonitor:
         received = self._state.live_received
         flowing = received != self._received
         if self._flowing and not flowing and self._playing and self._state.live:
-            self._look()
+            self._investigate()
         self._received, self._flowing = received, flowing
 
-    def _look(self) -> None:
+    def _investigate(self) -> None:
         """Start to determine the reason, unless that is in progress or this client is starting or ending play."""
         if self._closed or self._state.switching_play or not self._session.session_id:
             return
@@ -189,8 +189,8 @@ class _Presence(MessageHandler):
         """Do nothing: the client is being closed."""
 
 
-_LOOK_S: Final = 5.0  # interval between checks that this client still holds the session
-_WORLD_S: Final = 0.5  # a running simulation that publishes does so ten times a second
+_PROBE_INTERVAL_S: Final = 5.0  # interval between checks that this client still holds the session
+_SNAPSHOT_S: Final = 0.5  # a running simulation that publishes does so ten times a second
 _PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts; the last one repeats
 
 
@@ -221,7 +221,9 @@ class SessionKeeper:
             events = self._state.publishers.events.stream(kinds, 100)
             session = self._session
             session.unkept = None
-            self._task = background_task("urlab-keeper", self._run(events), tell=session.tell, failed=self._die)
+            self._task = background_task(
+                "urlab-keeper", self._run(events), tell=session.tell, failed=self._note_failure
+            )
 
     async def aclose(self) -> None:
         """Stop keeping the session. Idempotent."""
@@ -229,15 +231,15 @@ class SessionKeeper:
             self._task.cancel()
             await asyncio.wait((self._task,))
 
-    def _die(self, error: URLabError) -> None:
+    def _note_failure(self, error: URLabError) -> None:
         self._session.unkept = error
 
     async def _run(self, events: Stream[ClientEvent]) -> None:
         while True:
             try:
-                await self._act_on(await events.receive(timeout=_LOOK_S))
+                await self._act_on(await events.receive(timeout=_PROBE_INTERVAL_S))
             except URLabTimeoutError:
-                await self._look()
+                await self._probe()
             except ClientClosed:
                 return
             except URLabError as error:
@@ -255,7 +257,7 @@ class SessionKeeper:
             case _:
                 pass
 
-    async def _look(self) -> None:
+    async def _probe(self) -> None:
         """Detect a takeover of the session early, before a restart of the server could be mistaken for the cause."""
         session = self._session
         if session.session_id not in ("", self._taken_over) and session.transport.connected:
@@ -280,7 +282,7 @@ class SessionKeeper:
         snapshots = Stream(self._state.publishers.state(), policy=StreamPolicy.LATEST)
         try:
             async with snapshots:
-                return (await snapshots.receive(timeout=_WORLD_S)).time >= self._time
+                return (await snapshots.receive(timeout=_SNAPSHOT_S)).time >= self._time
         except URLabTimeoutError:
             return False
 

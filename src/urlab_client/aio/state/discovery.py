@@ -59,7 +59,7 @@ class Discovery:
         await self.adopt(turn, hello)
         return hello
 
-    async def look_on(self, turn: Turn, handshake: bytes) -> None:
+    async def open_read_only(self, turn: Turn, handshake: bytes) -> None:
         """Apply the result of another client's `handshake()` without opening a session.
 
         Raises:
