@@ -97,11 +97,7 @@ def _level(name: str) -> ObservationLevel | None:
 
 
 class DriverLease:
-    """One lease at a time, which expires after some time without requests.
-
-    Args:
-        clock: Returns the time, seconds.
-    """
+    """One lease at a time, which expires after some time without requests."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -152,20 +148,11 @@ class ServerCore:
     """A server without its sockets.
 
     Attributes:
-        world: The level being edited.
-        config: Configuration of the server.
         camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
         switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
         shm_directory: Directory of the shared-memory regions; None without shared memory.
-        session: The client's session.
-        play: The play session.
-        viewport: The viewport's camera.
-        drawings: Debug drawings.
         health: Whether the server's threads run.
         compiled: The level that the last play session was started with.
-        jobs: Editor ops that run in the background.
-        lease: The driver lease.
-        uploads: Models that clients upload in chunks.
         instance: Returns the identity of this server among several; None in dialects without one.
     """
 
@@ -241,9 +228,6 @@ class ServerCore:
 
     def begin_play_again(self, timeout: float) -> bool:
         """Restart play with the scene that was compiled last, and return when it is ready.
-
-        Args:
-            timeout: Longest time for stopping the current session, seconds.
 
         Returns:
             False if stopping took longer, or the level has changed since it was compiled.

@@ -73,19 +73,9 @@ class OpenServer:
     """The parts of an open server. Does not refer to its `SimulatedServer`, so that it can be collected.
 
     Attributes:
-        config: Its configuration.
-        host: Address of the interface, in numbers.
-        curve_keys: Keys, if the traffic is encrypted.
-        core: The state that handlers share.
-        dispatcher: Answers requests.
-        endpoint: The request socket.
-        streams: The sockets of state, controls and info.
-        cameras: The sockets of camera images.
-        memory: The shared memory, if any.
         served: All parts with a thread.
         authored: Result of `_mark` after the start.
         resources: Everything that `close` releases.
-        pid: The process that opened it.
     """
 
     config: ServerConfig
@@ -116,7 +106,7 @@ class OpenServer:
             core.session = ServerSession()
             core.viewport = Viewport()
             core.drawings = Drawings(limit=core.limits.markers)
-            core.world.selected = ""
+            core.world.actors.selected = ""
             if self.config.play:
                 return core.begin_play_again(CLOSE_S)
             core.stop_play()
@@ -322,7 +312,7 @@ def populate(world: EditorWorld, models: Sequence[str]) -> None:
     """Open the level among `models`, place the other models, and add a manager if there is none."""
     for level in filter(is_level, models):
         world.levels.load_file(Path(level))
-    names = [row.name for row in world.list_actors()]
+    names = [row.name for row in list(world.actors)]
     edge: float | None = None
     sources: dict[str, str] = {}
     for model in models:
@@ -348,7 +338,7 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
-    actor = world.spawn_actor(blueprint.class_path, world.unused_id(Path(path).stem)).actor
+    actor = world.spawn_actor(blueprint.class_path, world.actors.unused_id(Path(path).stem)).actor
     if edge is not None:
         bounds = world.get_actor_bounds(actor.name, components_only=True)
         if bounds.extents != (0.0, 0.0, 0.0):
@@ -380,7 +370,7 @@ def take_snapshot(
             mode=server.viewport.mode,
             primitives=server.drawings.take_frame(in_play=server.world.pie_running),
             overlay=server.drawings.overlay,
-            selected=server.world.selected,
+            selected=server.world.actors.selected,
         )
         running = server.play.current
         try:

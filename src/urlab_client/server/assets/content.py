@@ -154,9 +154,6 @@ class ContentRoot:
     def adopt(self, record: Path, digest: str) -> Blueprint | None:
         """Register the blueprint of another content root, copying its snapshot.
 
-        Args:
-            record: Its `blueprint.json`.
-
         Returns:
             The blueprint; None if the other content root has another snapshot by now.
 

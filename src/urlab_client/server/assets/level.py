@@ -82,10 +82,6 @@ _LEVEL: Final = msgspec.json.Decoder(_Level)
 def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> None:
     """Write a level atomically.
 
-    Args:
-        path: The level file; missing folders are made.
-        actors: The actors in spawn order.
-
     Raises:
         OSError: It cannot be written.
     """
@@ -220,11 +216,7 @@ def _from_source(source: str, folder: Path, content: ContentRoot, *, trusted: bo
 
 
 def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], confined_to: ContentRoot | None) -> Actor:
-    """Check an entry and return its actor.
-
-    Args:
-        confined_to: Determines the allowed folders; None for any.
-    """
+    """Check an entry and return its actor."""
     if not entry.name or entry.name != sanitized(entry.name):
         raise ValueError("a name has letters, digits and underscores only")
     if not all(math.isfinite(value) for value in (*entry.location, *entry.scale)):

@@ -56,9 +56,6 @@ def attached_scene(spec: mujoco.MjSpec, actors: Sequence[Actor]) -> tuple[str, d
     A robot's document is named after its compiled prefix, `PREFIXmodel.xml`, and so are its files. Robots of the same
     kind share the files of the first, because files are large, unlike documents.
 
-    Args:
-        actors: What it was compiled from, in spawn order.
-
     Returns:
         None for a scene that has to be one document: something in a robot aims at the world, which means the robot's
         own when it is attached.
@@ -125,13 +122,9 @@ class CompiledScene:
     """A compiled scene.
 
     Attributes:
-        model: The model.
         data: Its data, reset and with derived quantities computed.
         spec: The compiled `mujoco.MjSpec`; options of `model.opt` that changed since are not in it.
-        articulations: In spawn order.
         actors: What it was compiled from, in spawn order.
-        entities: In spawn order.
-        warnings: What the user should know about the scene.
     """
 
     model: mujoco.MjModel
@@ -200,8 +193,6 @@ def compile_scene(
     Cameras, lights and materials stay, but of floors that coincide and of suns that shine alike one is drawn.
 
     Args:
-        actors: In spawn order.
-        options: Which `<option>` the scene has, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
         limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 

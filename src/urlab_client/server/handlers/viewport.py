@@ -123,7 +123,7 @@ def look(server: ServerCore) -> ViewportCamera:
 
 def _actor(server: ServerCore, request: Request[Any], target: str, target_by: str) -> Actor:
     key = need(request, target, "target")
-    actor = server.world.actor(key, by_name=target_by.casefold() == "actor_name")
+    actor = server.world.actors.get(key, by_name=target_by.casefold() == "actor_name")
     if actor is None:
         raise Refusal("unknown_actor", key)
     return actor
@@ -134,7 +134,7 @@ def _tracked(server: ServerCore) -> Actor | None:
     track = server.viewport.track
     if track is None:
         return None
-    actor = server.world.actor(track.actor_name, by_name=True)
+    actor = server.world.actors.get(track.actor_name, by_name=True)
     if actor is None:
         server.viewport.stop_tracking()
     return actor

@@ -79,11 +79,6 @@ class Integrator:
         call: MujocoCall,
         stopping: Callable[[], bool],
     ) -> None:
-        """Prepare to step a scene's data in place.
-
-        Args:
-            call: Entered while MuJoCo works.
-        """
         self._model = scene.model
         self._data = scene.data
         self._articulations = articulations

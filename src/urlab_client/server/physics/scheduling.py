@@ -201,7 +201,6 @@ class QueuedStep(Generic[T]):
 
         Args:
             remaining: Seconds until `step_timeout` is raised.
-            timeout: The whole step timeout, seconds, for the message.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True
@@ -302,9 +301,6 @@ class PhysicsThread:
     def stop(self, timeout: float) -> bool:
         """End the thread between two sub-steps, and release callers that wait for a step. Idempotent.
 
-        Args:
-            timeout: Seconds to wait.
-
         Returns:
             False when physics was still busy after `timeout`.
         """
@@ -346,7 +342,6 @@ class LivePacing:
     """Keeps the iterations of live mode on a grid of time slots."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Pace a model's time step at the speed of real time; the first iteration is due immediately."""
         self._model = model
         self._speed = MAX_SPEED
         self._slot = -math.inf

@@ -47,9 +47,6 @@ class ViewportPicture:
 
     Attributes:
         size: Width and height, pixels.
-        view: The camera.
-        mode: View mode.
-        primitives: Debug drawing.
         overlay: Text over the picture.
         selected: Name of the actor that is marked as selected; may be empty.
         fit: Move the camera, without turning it, so that everything but endless planes is in the picture.

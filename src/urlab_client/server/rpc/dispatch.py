@@ -126,7 +126,6 @@ class Dispatcher:
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Create the dispatcher of a server."""
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
@@ -141,7 +140,6 @@ class Dispatcher:
         """Return the reply to a request; errors become error replies.
 
         Args:
-            frame: Bytes of the request.
             transport: Transport of the request; editor ops are refused over shared memory.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
@@ -307,7 +305,6 @@ class Watchdog:
     """A thread that checks the physics of a server a few times a second."""
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
-        """Configure the thread; `start` starts it."""
         self._core = core
         self._dispatcher = dispatcher
         self._stopping = threading.Event()

@@ -59,11 +59,6 @@ class _Absent(Enum):
 ABSENT: Any = _Absent.ABSENT
 
 
-def bad_request(why: str) -> Refusal:
-    """Return the refusal of a frame that is not a request."""
-    return Refusal("bad_request", why)
-
-
 def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
     """Return the map of a frame, in msgpack or JSON."""
     data: Plain = None
@@ -72,7 +67,7 @@ def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
     if not isinstance(data, dict):
         data = _decoded(frame, msgspec.json.decode)
     if not isinstance(data, dict):
-        raise bad_request("the request is neither a msgpack map nor a JSON object")
+        raise Refusal("bad_request", "the request is neither a msgpack map nor a JSON object")
     return _tidy(cast("Plain", data), depth, depth)
 
 
@@ -88,7 +83,7 @@ def _decoded(frame: bytes, decode: Callable[[bytes], Plain]) -> Plain:
 def _tidy(value: Plain, depth: int, most: int) -> Plain:
     """Replace values that the plugin's decoder does not deliver, recursively."""
     if depth < 0:
-        raise bad_request(f"the request is nested deeper than {most} levels (limit request_depth)")
+        raise Refusal("bad_request", f"the request is nested deeper than {most} levels (limit request_depth)")
     match value:
         case dict():
             tidy: dict[str, tuple[str, Plain]] = {}  # by folded key: of keys that differ in case, the last one counts
@@ -319,7 +314,7 @@ class RequestReader:
         """Decode one frame."""
         most = self._limits.request_bytes
         if len(frame) > most:
-            raise bad_request(f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
+            raise Refusal("bad_request", f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
         try:
             request = self._decode(frame)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -351,9 +346,10 @@ class RequestReader:
         for name, sent_as in zip(request.__struct_fields__, request.__struct_encode_fields__, strict=True):
             longest = _longest_string(getattr(request, name))
             if longest > most:
-                raise bad_request(
+                raise Refusal(
+                    "bad_request",
                     f"{op.name}: field '{sent_as}' holds a string of {longest} characters, more than the "
-                    f"limit string_chars, {most}"
+                    f"limit string_chars, {most}",
                 )
 
 
