@@ -66,7 +66,7 @@ async def test_the_keeper_of_the_session(caplog: pytest.LogCaptureFixture, monke
         client = URLabClient(**first.client_options(), step_mode="direct", keep_session=True)
         events = client.events()
         with monkeypatch.context() as patch:
-            patch.setattr(SessionKeeper, "_look", fail)
+            patch.setattr(SessionKeeper, "_probe", fail)
             await client.discover()
             await is_told(events, caplog, "urlab-keeper")
         assert (await client.step()).step == 1
