@@ -133,7 +133,6 @@ class Session:
 
     @property
     def transport(self) -> RequestTransport:
-        """The transport of the requests."""
         return self._transport
 
     async def call(
@@ -297,7 +296,6 @@ class Session:
             raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
     def deadlines(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Deadlines:
-        """Return the deadlines of a request."""
         default = self._default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout

@@ -64,7 +64,6 @@ class ConnectionMonitor:
         state.on_adopted = self._on_adopted
 
     def on_connection(self, event: ClientEvent) -> None:
-        """Handle an event of the request connection and publish it."""
         publishers = self._state.publishers
         if isinstance(event, ServerLost):
             self._session.confirmed = False
@@ -76,7 +75,6 @@ class ConnectionMonitor:
             self._investigate()
 
     async def aclose(self) -> None:
-        """Stop watching. Idempotent."""
         self._closed = True
         if self._timer is not None:
             self._timer.cancel()
@@ -91,7 +89,6 @@ class ConnectionMonitor:
                 self._loop.call_soon_threadsafe(self._attend)
 
     def _on_adopted(self) -> None:
-        """Handle a new handshake or the end of play."""
         self._announced = False
         self._loop = asyncio.get_running_loop()
         if self._timer is None:
@@ -129,7 +126,6 @@ class ConnectionMonitor:
             self._investigate()
 
     def _tick(self) -> None:
-        """Check whether live snapshots have stopped."""
         if self._closed or self._loop is None:
             return
         self._timer = self._loop.call_later(_SILENCE_S, self._tick)
@@ -226,7 +222,6 @@ class SessionKeeper:
             )
 
     async def aclose(self) -> None:
-        """Stop keeping the session. Idempotent."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait((self._task,))

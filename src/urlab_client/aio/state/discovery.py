@@ -220,7 +220,6 @@ class _FirstSnapshot(MessageHandler):
         self.came: asyncio.Future[StateSnapshot | None] = asyncio.get_running_loop().create_future()
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take the first snapshot that is well-formed."""
         with contextlib.suppress(ProtocolError):
             self._settle(StateSnapshot.decode(payload))
 
@@ -232,7 +231,6 @@ class _FirstSnapshot(MessageHandler):
         self._settle(None)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """End the wait because the client was closed."""
         self._settle(None)
 
     def _settle(self, found: StateSnapshot | None) -> None:

@@ -73,7 +73,6 @@ class CameraSwitch:
         self._follow()
 
     def is_on(self, info: CameraInfo) -> bool:
-        """Return whether this client has switched a camera on."""
         return self._on.get(info.zmq_topic, _OFF) != _OFF
 
     def forget(self) -> None:
