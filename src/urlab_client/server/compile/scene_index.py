@@ -33,7 +33,6 @@ class ArticulationIndex:
         key: Actor name.
         prefix: `key` and an underscore, the beginning of its compiled names.
         actor_id: Stable id given by the client; may be empty.
-        model_name: The MJCF's `model` attribute, or its file stem.
         root_body: Lowest body id; 0, the world, if the MJCF has only world geoms.
         qpos_adr: Index into `mjData.qpos` of every coordinate, in joint order.
         qvel_adr: Index into `mjData.qvel` of every velocity, in joint order.
@@ -47,7 +46,6 @@ class ArticulationIndex:
     key: str
     prefix: str
     actor_id: str
-    model_name: str = ""
     root_body: int
     bodies: Ints
     joints: Ints
@@ -111,7 +109,6 @@ def index_articulation(
         key=actor.name,
         prefix=actor.prefix,
         actor_id=actor.actor_id,
-        model_name=blueprint.model_name or blueprint.stem,
         root_body=int(bodies[0]) if bodies.size else 0,
         bodies=bodies,
         joints=joints,
