@@ -99,6 +99,9 @@ async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
         "look", "state", "picture", "contacts", "explain", "log",
     }  # fmt: skip
     assert {name for name, hint in hints.items() if hint and hint.destructive_hint} == {"reset", "play", "remove"}
+    assert {name for name, hint in hints.items() if hint and not hint.idempotent_hint} == {
+        "log", "run", "record", "import_model", "spawn",
+    }  # fmt: skip
 
 
 async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> None:

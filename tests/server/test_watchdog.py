@@ -99,6 +99,7 @@ def test_a_request_that_does_not_come_back_holds_up_nobody(
     op: str,
     fields: dict[str, Any],
     faults: Faults | None,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     with bot(mode, faults=faults) as server, Wire(server) as holder, Wire(server) as other:
         holder.hello()
@@ -111,6 +112,8 @@ def test_a_request_that_does_not_come_back_holds_up_nobody(
         assert holder.ask("pie_status")["state"] == "ready"
         code, message = holder.refusal("get_contacts")
         assert (code, "has not returned" in message) == ("not_ready", True)
+        eventually(lambda: [one.name for one in caplog.records if "stop_pie ends it" in one.message])
+        assert {one.name for one in caplog.records if "stop_pie ends it" in one.message} == {"urlab_client.server"}
         assert holder.refused("step") == "not_ready"
         assert other.hello()["manager_present"] is True
         assert len(other.ask("list_keyframes")["keyframes"]) >= 0

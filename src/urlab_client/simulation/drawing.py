@@ -1,4 +1,4 @@
-"""The OpenGL context, and how a camera's image and the viewport's picture are drawn with it."""
+"""Drawing what a camera sees, in an OpenGL context."""
 
 from __future__ import annotations
 
