@@ -24,6 +24,7 @@ from urlab_client.aio.transport.connection import (
     UNANSWERED,
     ClientKeys,
     Connection,
+    Context,
     borrow_context,
     give_back_context,
 )
@@ -196,7 +197,7 @@ class ZmqTransport:
         if self._timer is not None:
             self._timer.cancel()
         if self._open is not None:
-            context = self._open.connection.socket.context
+            context = cast("Context", self._open.connection.socket.context)
             self._open.connection.close()
             self._open = None
             give_back_context(context)
