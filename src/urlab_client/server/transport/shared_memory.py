@@ -35,9 +35,8 @@ from urlab_client.protocol.shm import (
     camera_stride,
     state_stride,
 )
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.system.threads import Health, ServingThread
 from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
