@@ -79,7 +79,6 @@ ALLOWED: dict[str, frozenset[str]] = {
 ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "background",
-        "observer",
         "features",
         "client_types",
         "defaults",
@@ -91,9 +90,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "model",
         "controllers",
         "cameras",
-        "motion",
         "articulation",
         "state",
+        "motion",
         "explain",
         "namespaces",
         "client_state",

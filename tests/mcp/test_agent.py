@@ -363,9 +363,9 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
                 assert "play with action='start'" in await one.refused(tool, **arguments)
             await one.call("play", action="start")
             await one.call("state", robot="arm")
-            assert one.console.feed("arm/wrist") is not None
+            assert one.console.cameras.feed("arm/wrist") is not None
             await one.call("remove", actor="arm")
-            await until(lambda: not one.console._feeds)  # nor is the robot kept by its pictures
+            await until(lambda: not one.console.cameras._feeds)  # nor is the robot kept by its pictures
 
 
 @pytest.mark.opengl

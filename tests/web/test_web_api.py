@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import io
 import json
+import re
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,32 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_openapi_describes_parameters_bodies_and_responses(http: TestClient) -> None:
+    from jsonschema import Draft202012Validator
+
+    document = http.get("/api/openapi.json").json()
+    operations = {(method, path): said for path, of in document["paths"].items() for method, said in of.items()}
+    ids = [said["operationId"] for said in operations.values()]
+    assert len(ids) == len(set(ids))
+    for (method, path), said in operations.items():
+        named = {one["name"] for one in said.get("parameters", ()) if one["in"] == "path"}
+        assert named == set(re.findall(r"\{(\w+)\}", path)), path
+        assert (
+            "requestBody" in said
+            or method in {"get", "delete"}
+            or path
+            in {
+                "/api/lease",
+                "/api/connection",
+                "/api/invitations",
+            }
+        )
+    for path in ("world", "status", "log", "state", "bodies", "bodies/{id}", "explain", "recordings"):
+        told = operations["get", f"/api/{path}"]["responses"]["200"]["content"]["application/json"]["schema"]
+        validator = Draft202012Validator({**told, "components": document["components"]})
+        validator.validate(http.get(f"/api/{path.format(id=1)}").json())
 
 
 @pytest.mark.opengl

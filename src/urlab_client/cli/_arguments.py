@@ -308,13 +308,6 @@ def address(text: str) -> str:
     return f"tcp://{text}"
 
 
-def running_address(text: str) -> str:
-    """Parse the address of a running server."""
-    if text.startswith("sim://"):
-        raise argparse.ArgumentTypeError(f"{text!r} would start a server; give the address of a running one")
-    return address(text)
-
-
 def one_of(*allowed: E) -> Callable[[str], E]:
     """Return a function that parses one of the given members of an enumeration."""
 

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+_COLUMNS = 120  # where the output is not a terminal
+_VARIABLE = "MUJOCO_GL"
+
+
 class CommandError(Exception):
     """An expected failure; its text is one line that says what failed, where, and what would be right."""
 
@@ -91,9 +95,6 @@ def check_recording(path: Path | None, arguments: Namespace) -> None:
     import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # a missing extra
 
 
-_COLUMNS = 120  # where the output is not a terminal
-
-
 @contextlib.contextmanager
 def progress_bar(description: str, total: float) -> Generator[Callable[[float], None]]:
     """Show a bar while the block runs, if standard error is a terminal; yields a callback that sets its position."""
@@ -154,9 +155,6 @@ def json_line(value: object) -> str:
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, as in `1 joint` and `2 joints`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-_VARIABLE = "MUJOCO_GL"
 
 
 def import_mujoco() -> None:

@@ -1,4 +1,8 @@
-"""`urlab demo`: drive a robot through both clients on a simulated server, and write the results to disk."""
+"""`urlab demo`: drive a robot through both clients on a simulated server, and write the results to disk.
+
+Start a simulated server, drive one robot through the blocking client and two robots through the async client, and write
+joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +46,6 @@ _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 
 
-DESCRIPTION = (
-    "Start a simulated server, drive one robot through the blocking client and two robots through the "
-    "async client, and write joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'."
-)
 EXAMPLES = (
     ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
     ("urlab demo robot.xml --steps 500 --output run1", "your own model"),

@@ -1,4 +1,10 @@
-"""`urlab run-policy`: a network from an ONNX file drives a robot."""
+"""`urlab run-policy`: a network from an ONNX file drives a robot.
+
+Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network observes and what its
+outputs mean. Refuses to start if the robot, step mode, timestep or controller is not the one that the policy requires.
+Without an address it starts a simulated server; with one it opens a session, which takes the server over from the
+client that drives it. Exit code 1 if the robot fell. Needs the extra 'urlab-client[onnx]'.
+"""
 
 from __future__ import annotations
 
@@ -43,13 +49,6 @@ _FELL = 1
 _SEED = 0
 
 
-DESCRIPTION = (
-    "Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network "
-    "observes and what its outputs mean. Refuses to start if the robot, step mode, timestep or controller is not "
-    "the one that the policy requires. Without an address it starts a simulated server; with one it opens a "
-    "session, which takes the server over from the client that drives it. Exit code 1 if the robot fell. Needs "
-    "the extra 'urlab-client[onnx]'."
-)
 EXAMPLES = (
     ("urlab run-policy walk.onnx", "simulates the robot that walk.toml beside it names"),
     (

@@ -1,4 +1,9 @@
-"""`urlab snapshot`: write a picture of a model, of a saved level, or of what a camera of a running server sees."""
+"""`urlab snapshot`: write a picture of a model, of a saved level, or of what a camera of a running server sees.
+
+Write a picture of models or of a saved level, which this command simulates itself, or of what a camera of a running
+server sees, in any mode and without a step. The latter opens a session, which takes the server over from the client
+that drives it, unless you pass --handshake. Needs the extra 'urlab-client[demo]'.
+"""
 
 from __future__ import annotations
 
@@ -34,12 +39,6 @@ _CHUNK = 100  # physics steps per request, for which the server allows 5 s
 _BEYOND_M = 1e5  # farther than any ray can hit
 
 
-DESCRIPTION = (
-    "Write a picture of models or of a saved level, which this command simulates itself, or of what a "
-    "camera of a running server sees, in any mode and without a step. The latter opens a session, which takes the "
-    "server over from the client that drives it, unless you pass --handshake. Needs the extra "
-    "'urlab-client[demo]'."
-)
 EXAMPLES = (
     ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
     (

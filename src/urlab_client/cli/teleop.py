@@ -1,4 +1,11 @@
-"""`urlab teleop`: move a robot's hand with the keyboard, and record each episode."""
+"""`urlab teleop`: move a robot's hand with the keyboard, and record each episode.
+
+Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint limits. The simulation is
+stepped in real time; an episode begins with the first key. With --record, each episode is saved with the outcome that
+you mark with a key, and `urlab convert` makes a LeRobot dataset of the episodes that were not discarded. Opens a
+session, which takes the server over from the client that drives it. `urlab console` supports gamepads. Needs the extra
+'urlab-client[teleop]', and with --task also 'urlab-client[gym]'.
+"""
 
 from __future__ import annotations
 
@@ -39,14 +46,6 @@ _SHOWN_S = 0.1
 _MOST = 1024
 
 
-DESCRIPTION = (
-    "Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint "
-    "limits. The simulation is stepped in real time; an episode begins with the first key. With --record, each "
-    "episode is saved with the outcome that you mark with a key, and `urlab convert` makes a LeRobot dataset of "
-    "the episodes that were not discarded. Opens a session, which takes the server over from the client that "
-    "drives it. `urlab console` supports gamepads. Needs the extra 'urlab-client[teleop]', and with --task also "
-    "'urlab-client[gym]'."
-)
 EXAMPLES = (
     ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
     ("urlab teleop sim://arm", "try it, without a recording"),

@@ -15,8 +15,8 @@ from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation, Range, Vary
 from urlab_client.randomise.quantities import DERIVED_FROM, QUANTITIES, START, Elements, Fields, elements_of, write
 
-MODEL_STREAM: Final = 0
-"""First part of the seed of the random streams for `Vary`; other parts of a declaration use other values."""
+MODEL_STREAM, NOISE_STREAM, PUSH_STREAM, DELAY_STREAM, DROP_STREAM = range(5)
+"""What follows the episode's seed in the seeds of the random streams, by part of the declaration."""
 
 _VISIBLE: Final = {
     "light_diffuse": (),

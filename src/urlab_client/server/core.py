@@ -39,11 +39,16 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
+from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.threads import Health
 from urlab_client.simulation.appearance import Appearance
+
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 
 class ServerSession:
@@ -92,11 +97,7 @@ def _level(name: str) -> ObservationLevel | None:
 
 
 class DriverLease:
-    """One lease at a time, which expires after some time without requests.
-
-    Args:
-        clock: Returns the time, seconds.
-    """
+    """One lease at a time, which expires after some time without requests."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -138,11 +139,6 @@ class DriverLease:
         return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
 
 
-logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
-
-
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
     """Do nothing, for servers without streams."""
 
@@ -152,20 +148,11 @@ class ServerCore:
     """A server without its sockets.
 
     Attributes:
-        world: The level being edited.
-        config: Configuration of the server.
         camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
         switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
         shm_directory: Directory of the shared-memory regions; None without shared memory.
-        session: The client's session.
-        play: The play session.
-        viewport: The viewport's camera.
-        drawings: Debug drawings.
         health: Whether the server's threads run.
         compiled: The level that the last play session was started with.
-        jobs: Editor ops that run in the background.
-        lease: The driver lease.
-        uploads: Models that clients upload in chunks.
         instance: Returns the identity of this server among several; None in dialects without one.
     """
 
@@ -242,9 +229,6 @@ class ServerCore:
     def begin_play_again(self, timeout: float) -> bool:
         """Restart play with the scene that was compiled last, and return when it is ready.
 
-        Args:
-            timeout: Longest time for stopping the current session, seconds.
-
         Returns:
             False if stopping took longer, or the level has changed since it was compiled.
         """
@@ -274,19 +258,21 @@ class ServerCore:
             if names_fit:
                 raise CompileFailed(problem)
             logger.warning("%s", problem)
-        try:
-            engine = Engine(
-                scene,
-                pinned_mode=config.step_mode,
-                paused=not config.unpaused,
-                controllers=controllers,
-                health=self.health,
-                dialect=self.dialect,
-                randomise=config.randomise,
-            )
-        except ValueError as error:
-            raise CompileFailed(f"what is to vary: {error}") from None
-        varied = () if engine.variation is None else engine.variation.visible_fields
+        engine = Engine(
+            scene,
+            pinned_mode=config.step_mode,
+            paused=not config.unpaused,
+            controllers=controllers,
+            health=self.health,
+            dialect=self.dialect,
+        )
+        varied: Sequence[str] = ()
+        if config.randomise is not None:
+            try:
+                engine.variation = SceneVariation(scene, config.randomise, engine.articulations)
+            except ValueError as error:
+                raise CompileFailed(f"what is to vary: {error}") from None
+            varied = engine.variation.visible_fields
         channels = UserChannels(config.user_channels)
         modes = {
             (index.key, camera.name): config.camera_mode(index, camera.name)

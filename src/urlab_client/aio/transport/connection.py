@@ -33,9 +33,6 @@ _SILENT = 0.9  # of that time, and nothing refused the attempt
 _RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
 
-NOTICED_S: Final = (HEARTBEAT_MS + SILENCE_MS) / 1000
-"""Seconds after which a connection to a silent peer is closed."""
-
 FAILED_HANDSHAKES: Final = (
     zmq.Event.HANDSHAKE_FAILED_AUTH,
     zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
@@ -155,9 +152,9 @@ class Connection:
         *,
         tell: Tell | None = None,
     ) -> None:
-        self.endpoint = endpoint
+        self.endpoint: str = endpoint
         self._loop = loop
-        self._socket = socket
+        self.socket: Socket = socket
         self._note = note
         self._attempts = Attempts(loop.time())
         self._retrying = False
@@ -188,7 +185,7 @@ class Connection:
 
     def watch(self, on_readable: Callable[[], object], *, on_demand: bool = False) -> Watch:
         """Call `on_readable` whenever the socket is readable; see `watch_socket`."""
-        watch = watch_socket(self._loop, self._socket, on_readable, on_demand=on_demand)
+        watch = watch_socket(self._loop, self.socket, on_readable, on_demand=on_demand)
         self._watches.append(watch)
         return watch
 
@@ -216,8 +213,8 @@ class Connection:
         if self._closed:
             return
         with contextlib.suppress(zmq.ZMQError):  # ZeroMQ has already dropped the endpoint
-            self._socket.disconnect(self.endpoint)
-        self._socket.connect(self.endpoint)
+            self.socket.disconnect(self.endpoint)
+        self.socket.connect(self.endpoint)
 
     def close(self) -> None:
         """Close the socket. Idempotent."""
@@ -226,9 +223,9 @@ class Connection:
         self._closed = True
         for watch in self._watches:
             watch.close()
-        self._socket.disable_monitor()
+        self.socket.disable_monitor()
         self._monitor.close(linger=0)
-        self._socket.close(linger=0)
+        self.socket.close(linger=0)
 
 
 class Attempts:

@@ -148,6 +148,7 @@ class RegionChannel:
         """Release both regions."""
         if self._watch is not None:
             self._watch.close()
+            self._watch = None  # it refers to this channel
         self.requests.close()
         self.replies.close()
         self._request_event.close()

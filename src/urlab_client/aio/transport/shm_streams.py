@@ -147,6 +147,7 @@ class _RegionReader:
     def close(self) -> None:
         if self.watch is not None:
             self.watch.close()
+            self.watch = None  # it refers to this reader, whose mapping must not wait for the garbage collector
         with self._lock:
             self._closed = True
             self.mapping.close()

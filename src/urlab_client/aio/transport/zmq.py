@@ -12,7 +12,7 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
 import zmq
 from msgspec import Struct
@@ -24,11 +24,10 @@ from urlab_client.aio.transport.connection import (
     UNANSWERED,
     ClientKeys,
     Connection,
-    Context,
     borrow_context,
     give_back_context,
 )
-from urlab_client.aio.transport.waiting import BusyPoll, Socket, Watch
+from urlab_client.aio.transport.waiting import BusyPoll, Watch
 from urlab_client.errors import (
     AuthenticationFailed,
     ClientClosed,
@@ -61,6 +60,16 @@ _Get = Callable[[int], int]
 _CERTAIN = 3  # a server that is shutting down aborts one handshake; a server with another key aborts all
 
 
+class _Open(NamedTuple):
+    """The open socket, and what each request needs of it."""
+
+    loop: asyncio.AbstractEventLoop
+    connection: Connection
+    replies: Watch
+    send: _Send
+    get: _Get
+
+
 class _Sent(Struct):
     """A request on the wire."""
 
@@ -90,11 +99,7 @@ class ZmqTransport:
         self._keys = keys
         self._rejections = 0
         self._given_up = False
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._context: Context | None = None
-        self._connection: Connection | None = None
-        self._socket: Socket | None = None
-        self._replies: Watch | None = None
+        self._open: _Open | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
@@ -103,8 +108,6 @@ class ZmqTransport:
         self._abandoned = b""  # id of the last request whose caller gave up, until a reply shows that it is done
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
-        self._send: _Send | None = None
-        self._get: _Get | None = None
         self.connected: bool = False
         self._closed = False
         self._obstacle = UNANSWERED
@@ -122,9 +125,10 @@ class ZmqTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`."""
-        loop, send, get = self._loop, self._send, self._get
-        if loop is None or send is None or get is None or asyncio._get_running_loop() is not loop:  # noqa: SLF001
-            loop, send, get = self._open()
+        opened = self._open
+        if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
+            opened = self._connect()
+        loop, _, replies, send, get = opened
         while True:
             if not self.connected:
                 await self._wait_connected(loop, op, connect_by)
@@ -157,8 +161,8 @@ class ZmqTransport:
             elif get(_EVENTS) & _POLLIN:
                 # Sending may have consumed the edge of the descriptor.
                 loop.call_soon(self._on_readable)
-            if not reply.done() and self._replies is not None:
-                self._replies.expect()
+            if not reply.done():
+                replies.expect()
             answer = await reply
         except (asyncio.CancelledError, URLabTimeoutError):
             if self.connected and not _answered(reply):
@@ -185,23 +189,22 @@ class ZmqTransport:
         if self._closed:
             return
         self._closed = True
-        self._send = self._get = None
         self.connected = False
         closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
         if self._timer is not None:
             self._timer.cancel()
-        if self._connection is not None and self._context is not None:
-            self._connection.close()
-            give_back_context(self._context)
+        if self._open is not None:
+            context = self._open.connection.socket.context
+            self._open.connection.close()
+            self._open = None
+            give_back_context(context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, _Send, _Get]:
+    def _connect(self) -> _Open:
         if self._closed:
             raise ClientClosed(f"The client of {self.endpoint} is closed.", hint="Create a new client.")
-        loop = running_loop(self._loop)
-        if self._send is not None and self._get is not None:
-            return loop, self._send, self._get
+        loop = running_loop(None if self._open is None else self._open.loop)
         context = borrow_context()
         socket = context.socket(zmq.DEALER)
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
@@ -210,11 +213,10 @@ class ZmqTransport:
         except ValueError:
             give_back_context(context)
             raise
-        self._loop, self._context, self._connection, self._socket = loop, context, connection, socket
-        self._replies = connection.watch(self._on_readable, on_demand=True)
-        send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
-        get = self._get = cast("_Get", socket.get)
-        return loop, send, get
+        replies = connection.watch(self._on_readable, on_demand=True)
+        send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
+        self._open = _Open(loop, connection, replies, send, cast("_Get", socket.get))
+        return self._open
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
         """Return a future for the reply to a request that its caller has abandoned."""
@@ -232,10 +234,10 @@ class ZmqTransport:
         waiter: asyncio.Future[None] = loop.create_future()
         started = loop.time()
         self._waiting.add(waiter)
-        if self._given_up and self._connection is not None:
+        if self._given_up and self._open is not None:
             # ZeroMQ does not retry after this rejection, but the server may have learnt the key by now.
             self._given_up = False
-            self._connection.reconnect()
+            self._open.connection.reconnect()
 
         def give_up() -> None:
             self._read_events()  # as in `_expire`
@@ -279,28 +281,28 @@ class ZmqTransport:
 
     def _give_up(self, entry: _Sent, seconds: float) -> None:
         entry.reply.set_exception(no_reply(entry.op, f"from {self.endpoint}", seconds))
-        if self._loop is not None and self._silent_since is None:
+        if self._silent_since is None:
             self._silent_since = entry.at
             self._tell(ServerSilent(endpoint=self.endpoint, op=entry.op.name, waited_s=seconds))
 
     def _look(self) -> None:
         """Poll the socket for a reply."""
-        if self._get is not None and self._get(_EVENTS) & _POLLIN:
+        if self._open is not None and self._open.get(_EVENTS) & _POLLIN:
             self._take()
 
     def _on_readable(self) -> None:
         self._take()
         # A reply may be expected to an abandoned request, too.
         unanswered = self._abandoned or self._silent_since is not None
-        if self._replies is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
-            self._replies.expect()
+        if self._open is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
+            self._open.replies.expect()
 
     def _take(self) -> None:
         """Receive replies until no request waits for one."""
-        socket, get = self._socket, self._get
-        if socket is None or get is None:  # it has been closed
+        if self._open is None:  # it has been closed
             return
-        receive = socket.recv
+        loop, connection, _, _, get = self._open
+        receive = connection.socket.recv
         while True:
             try:
                 key = receive(_NOBLOCK)
@@ -313,9 +315,9 @@ class ZmqTransport:
                     receive(_NOBLOCK)
                 self._drop_stray()
                 continue
-            if (silent := self._silent_since) is not None and self._loop is not None:
+            if (silent := self._silent_since) is not None:
                 self._silent_since = None
-                self._tell(ServerAnswers(endpoint=self.endpoint, silent_s=self._loop.time() - silent))
+                self._tell(ServerAnswers(endpoint=self.endpoint, silent_s=loop.time() - silent))
             if self._abandoned and key >= self._abandoned:
                 self._abandoned = b""  # the server answers the requests of a connection in their order
             if self._late is not None and key > self._late[0]:
@@ -349,8 +351,8 @@ class ZmqTransport:
         log.debug("%s: dropped a reply that no request waits for", self.endpoint)
 
     def _read_events(self) -> None:
-        if self._connection is not None:
-            self._connection.read_events()
+        if self._open is not None:
+            self._open.connection.read_events()
 
     def _note(self, event: zmq.Event, value: int, obstacle: str | None) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
@@ -394,25 +396,27 @@ class ZmqTransport:
         self._take()  # replies that arrived before the loss still count
         if self.connected:
             log.info("lost %s; reconnecting", self.endpoint)
-            if self._loop is not None:
-                self.lost_at = self._loop.time()
+            self.lost_at = self._now()
             self.refused = False
             self._obstacle = "the connection was lost and not restored"
             self._tell(ServerLost(endpoint=self.endpoint))
         else:
             self.refused = True  # a tunnel accepts connections even if the server is down
-        if self._connection is not None:
+        if self._open is not None:
             # Also after an aborted handshake: ZeroMQ does not retry after invalid data in it.
-            self._connection.revive(was_connected=self.connected)
+            self._open.connection.revive(was_connected=self.connected)
         self.connected = False
         self._silent_since = None
         self._fail_sent(lambda entry: lost(entry.op, f"the connection to {self.endpoint}"))
 
+    def _now(self) -> float:
+        return 0.0 if self._open is None else self._open.loop.time()
+
     def _tell_connected(self) -> None:
-        if self.stats.connects == 1 or self._loop is None:
+        if self.stats.connects == 1:
             self._tell(ServerConnected(endpoint=self.endpoint))
         else:
-            down_s = self._loop.time() - self.lost_at
+            down_s = self._now() - self.lost_at
             self._tell(ServerReconnected(endpoint=self.endpoint, down_s=down_s, refused=self.refused))
 
     def _tell(self, event: ClientEvent) -> None:

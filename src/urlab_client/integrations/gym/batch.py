@@ -24,7 +24,7 @@ from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, Pictu
 from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode, with_cameras
 from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task, TaskScene, add_observed, with_task
-from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
 from urlab_client.simulation.controller_config import ControllerConfig
@@ -213,12 +213,14 @@ class URLabBatchEnv(Vectorized):
 
     def _advance(
         self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
-    ) -> tuple[Observation, Mapping[int, Exception]]:
+    ) -> Mapping[int, Exception]:
         if len(fresh):
             self._start(fresh, self._settings.keyframe if keyframe is None else keyframe)
         if len(acting):
             self._act(acting, set_points)
-        return self._observe(np.sort(np.concatenate([fresh, acting]))), {}
+        moved = np.sort(np.concatenate([fresh, acting]))
+        put(self._observations, moved, self._observe(moved))
+        return {}
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
         key = -1 if keyframe is None else self._keyframe_id(keyframe)

@@ -226,12 +226,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         before = self._observation
+        set_points = self.mapping.set_points(action)  # validates before anything is drawn
         forces: dict[str, Floats] = {}
-        given, disturbances = action, self._disturbances
+        disturbances = self._disturbances
         if disturbances is not None:
-            self.mapping.set_points(action)  # validates before anything is drawn
-            given, forces = disturbances.delayed(action), disturbances.forces()
-        after = self._observation = portal_of(self.client).call(self._episode.step, given, forces)
+            set_points, forces = self.mapping.set_points(disturbances.delayed(action)), disturbances.forces()
+        after = self._observation = portal_of(self.client).call(self._episode.step, set_points, forces)
         self._elapsed += 1
         info = self._info()
         if self.task is not None:

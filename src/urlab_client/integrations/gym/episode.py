@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -17,7 +16,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._episode_variation import variation_of
+from urlab_client.integrations._variation import WireVariation, server_variation
 from urlab_client.integrations.gym.settings import EpisodeSettings
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
@@ -29,7 +28,6 @@ from urlab_client.integrations.gym.spaces import (
     with_cameras,
 )
 from urlab_client.integrations.gym.task import Start, States, TaskScene, add_observed, with_task
-from urlab_client.integrations.gym.wire_variation import WireVariation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
@@ -102,7 +100,7 @@ class EnvEpisode:
         self._goal: dict[str, Floats] = {}
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
-        self._variation = variation_of(client, model, layouts)
+        self._variation = server_variation(client, model, layouts)
         self.over_wire: WireVariation | None = None
         if self._variation is None and self.randomise is not None and self.randomise.vary:
             before = None if earlier is None else earlier.over_wire
@@ -167,15 +165,13 @@ class EnvEpisode:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 
-    async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
-        """Apply an action for `n_substeps` and return the observation after it.
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+        """Apply set-points for `n_substeps` and return the observation after them.
 
-        `forces` act on bodies during the action, N, world frame, shape (3,).
+        Args:
+            set_points: Set-points of each articulation, shape (n_ctrl,).
+            forces: Forces on bodies meanwhile, N, world frame, shape (3,).
         """
-        return await self.act(self.mapping.set_points(action), forces)
-
-    async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
-        """Step like `step`, given the set-points of each articulation, shape (n_ctrl,)."""
         for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
@@ -357,7 +353,7 @@ def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | Non
     """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
     if settings.render_mode is None:
         return None
-    if settings.render_camera is not None:
+    if settings.render_camera:
         return settings.render_camera
     for key, articulation in client.articulations.items():
         for name, view in articulation.cameras.items():

@@ -26,11 +26,10 @@ from urlab_client.integrations.gym.spaces import Space, camera_space
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.randomise.declaration import CameraLatency
-from urlab_client.simulation.appearance import Appearance
+from urlab_client.simulation.appearance import Appearance, Tints
 from urlab_client.simulation.cameras import Instant, Latency, SceneCamera
 from urlab_client.simulation.drawing import Stage
 from urlab_client.simulation.opengl import Backend, need_backend
-from urlab_client.simulation.tints import Tints
 from urlab_client.values.names import cleaned_name
 from urlab_client.values.pictures import Pixels, decode_camera, observed_pixels
 

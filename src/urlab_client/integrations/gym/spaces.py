@@ -227,6 +227,13 @@ def _unbounded(n: int) -> Space:
     return spaces.Box(-np.inf, np.inf, (n,), dtype=np.float64)
 
 
+def mapped(function: Callable[[NDArray[Any]], NDArray[Any]], tree: Any) -> Any:
+    """Return a tree of dictionaries with a function applied to its arrays."""
+    if isinstance(tree, Mapping):
+        return {key: mapped(function, entry) for key, entry in cast("Mapping[str, Any]", tree).items()}
+    return function(tree)
+
+
 def dict_space(entries: Mapping[str, Space]) -> Space:
     """Return a `Dict` of spaces, in the given order."""
     return spaces.Dict(dict(entries))

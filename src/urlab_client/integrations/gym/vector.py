@@ -7,12 +7,11 @@ import os
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from urlab_client.aio.background import background_task
@@ -23,12 +22,10 @@ from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.task import ResetNoise, States, Task, joined
-from urlab_client.integrations.gym.vectorized import Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Indices, Vectorized, put
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
-
-T = TypeVar("T")
 
 
 def _processors() -> int:
@@ -70,7 +67,7 @@ class _Session:
         """Apply set-points and forces for one action."""
         if self.episode is None:
             raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
-        return await self.episode.act(set_points, forces)
+        return await self.episode.step(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
@@ -274,7 +271,7 @@ class URLabVectorEnv(Vectorized):
 
     def _advance(
         self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
-    ) -> tuple[Observation, Mapping[int, Exception]]:
+    ) -> Mapping[int, Exception]:
         calls: dict[int, Callable[[], Coroutine[Any, Any, Observation]]] = {}
         for i in map(int, fresh):
             seed = self._disturbances[i].seed if self._disturbances else None
@@ -283,11 +280,13 @@ class URLabVectorEnv(Vectorized):
         for i in map(int, acting):
             own = {key: values[i] for key, values in set_points.items()}
             calls[i] = partial(self._sessions[i].step, own, forces.get(i, {}))
-        results = self._portal.call(self._all, dict(sorted(calls.items())))
-        errors = {i: result for i, result in results.items() if isinstance(result, Exception)}
-        single = self.single_observation_space
-        rows = [_row(single, self._observations, i) if i in errors else result for i, result in results.items()]
-        return concatenate(single, rows, create_empty_array(single, len(rows))), errors
+        errors: dict[int, Exception] = {}
+        for i, result in self._portal.call(self._all, calls).items():
+            if isinstance(result, Exception):
+                errors[i] = result
+            else:
+                put(self._observations, i, result)
+        return errors
 
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return the values drawn for the episode of an environment; see `URLabEnv.draws`."""
@@ -309,9 +308,10 @@ class URLabVectorEnv(Vectorized):
         restarts = np.array([session.restarts for session in self._sessions], dtype=np.int64)
         return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
 
-    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, T]]]) -> dict[int, T | Exception]:
+    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, Observation]]]) -> dict[int, Any]:
+        """Return the observation or the failure of each environment; begin to replace those that were lost."""
         tasks = {i: asyncio.create_task(call()) for i, call in calls.items()}
-        late: set[asyncio.Task[T]] = set()
+        late: set[asyncio.Task[Observation]] = set()
         try:
             # One deadline for all: a deadline per environment would cost a tenth of the client's work.
             await asyncio.wait(tasks.values(), timeout=self._step_timeout)
@@ -322,7 +322,7 @@ class URLabVectorEnv(Vectorized):
                     task.cancel()
             if late:
                 await asyncio.wait(late)
-        results: dict[int, T | Exception] = {}
+        results: dict[int, Any] = {}
         for i, task in tasks.items():
             if task in late and task.cancelled():
                 what = "did not answer" if self._sessions[i].episode else "is still starting"
@@ -337,7 +337,3 @@ class URLabVectorEnv(Vectorized):
             if isinstance(result, Exception) and not refused_for_good(result):
                 self._sessions[i].reopen()
         return results
-
-
-def _row(space: Any, observations: Observation, index: int) -> Observation:
-    return next(row for i, row in enumerate(iterate(space, observations)) if i == index)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
-from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
 from urlab_client.integrations.gym.task import States, Task
 from urlab_client.randomise.declaration import Randomisation
 
@@ -93,12 +93,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     @abstractmethod
     def _advance(
         self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
-    ) -> tuple[Observation, Mapping[int, Exception]]:
-        """Reset some environments and step others, given the set-points of all.
+    ) -> Mapping[int, Exception]:
+        """Reset some environments and step others, given the set-points of all; return the failures by index.
 
-        Returns:
-            The observations of both, in ascending order of their indices, and the failures by index. The observation
-            of a failed environment is its last one.
+        `put` the observations of the others into `_observations`.
         """
 
     @abstractmethod
@@ -209,11 +207,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Start episodes and continue others; return the failures by index."""
         for i, disturbances in self._disturbed(fresh):
             disturbances.begin(self._rngs[i])
-        observations, errors = self._advance(fresh, keyframe, acting, set_points)
-        moved = np.sort(np.concatenate([fresh, acting]))
-        _put(self._observations, moved, observations)
-        for i, disturbances in self._disturbed(moved) if self._observations_disturbed else ():
-            _put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
+        errors = self._advance(fresh, keyframe, acting, set_points)
+        for i, disturbances in self._disturbed(np.concatenate([fresh, acting])) if self._observations_disturbed else ():
+            put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
         self._elapsed[fresh] = 0
         self._elapsed[acting] += 1
         self._ended[fresh] = False
@@ -287,19 +283,19 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _true_observations(self) -> Observation:
         """Return the true observations, from which rewards and terminations are computed."""
-        return _map(np.copy, self._observations)
+        return mapped(np.copy, self._observations)
 
     def _disturbed_observations(self) -> Observation:
         """Return the observations with all disturbances."""
-        return _map(np.copy, self._sensed if self._observations_disturbed else self._observations)
+        return mapped(np.copy, self._sensed if self._observations_disturbed else self._observations)
 
     def _delayed(self, indices: Indices, actions: Any) -> Any:
         """Return the actions that take effect now; those of other environments are unchanged."""
         if self.randomise is None or not self.randomise.delays_actions:
             return actions
-        delayed = _map(np.array, actions)
+        delayed = mapped(np.array, actions)
         for i, disturbances in self._disturbed(indices):
-            _put(delayed, i, disturbances.delayed(_pick(delayed, i)))
+            put(delayed, i, disturbances.delayed(_pick(delayed, i)))
         return delayed
 
     def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
@@ -318,24 +314,15 @@ def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:
     return {int(i): infos["error"][i] for i in np.flatnonzero(infos["_error"])} if "error" in infos else {}
 
 
-def _map(function: Any, observations: Observation) -> Observation:
-    if isinstance(observations, dict):
-        entries = cast("dict[str, Observation]", observations)
-        return {key: _map(function, entry) for key, entry in entries.items()}
-    return function(observations)
-
-
-def _put(observations: Observation, indices: Indices | int, found: Observation) -> None:
+def put(observations: Observation, indices: Indices | int, found: Observation) -> None:
+    """Write observations of some environments into those of all."""
     if isinstance(observations, dict):
         entries = cast("dict[str, Observation]", observations)
         for key, entry in entries.items():
-            _put(entry, indices, found[key])
+            put(entry, indices, found[key])
     else:
         observations[indices] = found
 
 
 def _pick(observations: Observation, index: int) -> Observation:
-    def row(array: Floats) -> Floats:
-        return array[index].copy()
-
-    return _map(row, observations)
+    return mapped(lambda array: array[index].copy(), observations)

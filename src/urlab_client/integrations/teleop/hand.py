@@ -7,9 +7,9 @@ from typing import Final
 import mujoco
 import numpy as np
 
+from urlab_client.aio.arguments import finite
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
-from urlab_client.aio.model.numbers import finite
 from urlab_client.errors import URLabError
 from urlab_client.integrations.ik import IkSolution, InverseKinematics, Vector, only_robot, own_sites, positive, vector
 from urlab_client.protocol.base import Floats

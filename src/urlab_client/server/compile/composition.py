@@ -15,6 +15,17 @@ from urlab_client.server.assets.decomposition import convex_parts
 from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
 from urlab_client.values.rotation import rotate, wxyz
 
+_SIZES: Final = (  # what `<size>` sets
+    *("memory", "njmax", "nconmax", "nuserdata", "nkey"),
+    *(f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")),
+)
+
+FULL_BRIGHTNESS: Final = 5000.0
+"""Intensity that corresponds to MuJoCo's full diffuse colour; the engine's default."""
+
+_SPOT_CUTOFF: Final = 44.0
+"""Unreal's default outer cone angle, degrees."""
+
 
 def compose(
     actors: Sequence[Actor],
@@ -93,19 +104,6 @@ def attachable(blueprint: Blueprint, parent: mujoco.MjSpec) -> mujoco.MjSpec:
     for size in _SIZES:
         setattr(child, size, getattr(parent, size))
     return child
-
-
-_SIZES: Final = (  # what `<size>` sets
-    *("memory", "njmax", "nconmax", "nuserdata", "nkey"),
-    *(f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")),
-)
-
-
-FULL_BRIGHTNESS: Final = 5000.0
-"""Intensity that corresponds to MuJoCo's full diffuse colour; the engine's default."""
-
-_SPOT_CUTOFF: Final = 44.0
-"""Unreal's default outer cone angle, degrees."""
 
 
 def add_light(spec: mujoco.MjSpec, actor: Actor) -> None:

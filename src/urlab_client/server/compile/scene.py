@@ -41,14 +41,20 @@ from urlab_client.values.rotation import wxyz
 _FILE: Final = re.compile(r'\b(file\w*)="([^"]*)"')
 
 
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_DEFAULT_LIMITS: Final = Limits()
+
+Floats = NDArray[np.float64]
+
+_SAME: Final = 1e-6
+
+
 def attached_scene(spec: mujoco.MjSpec, actors: Sequence[Actor]) -> tuple[str, dict[str, bytes]] | None:
     """Return a scene as a document with attached robots, and all files it needs by their bare names.
 
     A robot's document is named after its compiled prefix, `PREFIXmodel.xml`, and so are its files. Robots of the same
     kind share the files of the first, because files are large, unlike documents.
-
-    Args:
-        actors: What it was compiled from, in spawn order.
 
     Returns:
         None for a scene that has to be one document: something in a robot aims at the world, which means the robot's
@@ -111,23 +117,14 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-logger: logging.Logger = logging.getLogger("urlab_client.server")
-
-_DEFAULT_LIMITS: Final = Limits()
-
-
 @dataclass(frozen=True, eq=False)
 class CompiledScene:
     """A compiled scene.
 
     Attributes:
-        model: The model.
         data: Its data, reset and with derived quantities computed.
         spec: The compiled `mujoco.MjSpec`; options of `model.opt` that changed since are not in it.
-        articulations: In spawn order.
         actors: What it was compiled from, in spawn order.
-        entities: In spawn order.
-        warnings: What the user should know about the scene.
     """
 
     model: mujoco.MjModel
@@ -196,8 +193,6 @@ def compile_scene(
     Cameras, lights and materials stay, but of floors that coincide and of suns that shine alike one is drawn.
 
     Args:
-        actors: In spawn order.
-        options: Which `<option>` the scene has, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
         limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 
@@ -276,10 +271,6 @@ def _fit_offscreen_buffer(model: mujoco.MjModel, sizes: Iterable[tuple[int, int]
     for width, height in sizes:
         screen.offwidth = max(screen.offwidth, width)
         screen.offheight = max(screen.offheight, height)
-
-
-Floats = NDArray[np.float64]
-_SAME: Final = 1e-6
 
 
 def coinciding_planes(model: mujoco.MjModel) -> list[list[int]]:

@@ -27,10 +27,6 @@ class EditorJobs:
 
     Results outlive the session that asked for them, so that it may be renewed meanwhile, but not for ever, as the
     plugin's do: a client that never fetches its results must not use up the server's memory.
-
-    Args:
-        health: Hears of the unexpected end of the thread.
-        clock: Returns the time, seconds.
     """
 
     def __init__(self, health: Health, clock: Callable[[], float] = time.monotonic) -> None:

@@ -70,11 +70,6 @@ class LevelActors:
     """
 
     def __init__(self, naming: ActorNames) -> None:
-        """Create an empty set of actors.
-
-        Args:
-            naming: How articulations are named: `model` after the MJCF's model name, `plugin` as the plugin does.
-        """
         self.selected: str = ""
         self._naming = naming
         self._actors: dict[str, Actor] = {}

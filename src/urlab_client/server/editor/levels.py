@@ -59,7 +59,6 @@ class Levels:
     """
 
     def __init__(self, content: ContentRoot, actors: LevelActors, playing: Callable[[], bool]) -> None:
-        """Open an empty, untitled level."""
         self._content = content
         self._actors = actors
         self._playing = playing
@@ -180,7 +179,6 @@ class Blueprints:
     """The imported blueprints, and the actors of the open level that use them."""
 
     def __init__(self, content: ContentRoot, actors: LevelActors, levels: Levels) -> None:
-        """Manage the assets of a content root."""
         self._content = content
         self._actors = actors
         self._levels = levels

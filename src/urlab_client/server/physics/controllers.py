@@ -158,10 +158,7 @@ class ArticulationControl:
         """Bind to a compiled model.
 
         Args:
-            model: The `mujoco.MjModel`.
             neutral: `mjData.ctrl` of the whole model after a reset, shape (nu,).
-            config: Controller to attach; None for raw controls.
-            exact: Keep set-points as they are; else they are rounded to float32.
         """
         self.index = index
         places: dict[str, int] = {}

@@ -16,7 +16,6 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.scheduling import MujocoCall, shutting_down
-from urlab_client.server.physics.variation import SceneVariation
 
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
@@ -77,19 +76,12 @@ class Integrator:
         self,
         scene: CompiledScene,
         articulations: Articulations,
-        variation: SceneVariation | None,
         call: MujocoCall,
         stopping: Callable[[], bool],
     ) -> None:
-        """Prepare to step a scene's data in place.
-
-        Args:
-            call: Entered while MuJoCo works.
-        """
         self._model = scene.model
         self._data = scene.data
         self._articulations = articulations
-        self._variation = variation
         self._call = call
         self._stopping = stopping
         self.substep_s: float = math.inf
@@ -127,18 +119,6 @@ class Integrator:
         with self._call:
             mujoco.mj_step(self._model, self._data)
             call_hooks(self.on_substep)
-
-    def reset(self, key: int, seed: int | None) -> None:
-        """Reset the data to a keyframe; -1 stands for the reference. The seed decides what varies."""
-        variation = self._variation
-        if variation is not None:
-            variation.begin(seed)
-        if key < 0:
-            mujoco.mj_resetData(self._model, self._data)
-        else:
-            mujoco.mj_resetDataKeyframe(self._model, self._data, key)
-        if variation is not None:
-            variation.start()
 
     def push(self, state: Step) -> None:
         """Write the state of a puppet step, but for arrays of a wrong length, and compute what follows."""

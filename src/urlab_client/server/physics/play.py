@@ -205,9 +205,6 @@ class Play:
     def close(self, timeout: float) -> bool:
         """End play permanently and refuse waiting callers with `shutting_down`.
 
-        Args:
-            timeout: Seconds to wait for the simulation to end.
-
         Returns:
             False if it was still busy then.
         """

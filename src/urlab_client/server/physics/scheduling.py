@@ -26,6 +26,30 @@ MIN_TIMEOUT_S: Final = 1.0
 """Shortest duration of an overdue MuJoCo call; a slice of a long request may take a while on a busy machine."""
 
 
+T = TypeVar("T")
+
+logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+MIN_SPEED: Final = 5.0
+
+MAX_SPEED: Final = 100.0
+
+IDLE_S: Final = 0.1
+"""Longest sleep of the physics thread while nothing integrates."""
+
+MAX_LAG_S: Final = 0.02
+"""A live step later than this counts as a stall and is not caught up; smaller delays are jitter."""
+
+MIN_PERIOD_S: Final = 1e-5
+
+MAX_PERIOD_S: Final = 3600.0
+
+HOLD_S: Final = 0.005
+"""Interval at which a live loop that runs late, and so never sleeps, releases the lock for `GIVE_WAY_S`."""
+
+GIVE_WAY_S: Final = 0.0005
+
+
 @dataclass(frozen=True)
 class Overdue:
     """A MuJoCo call that has exceeded the step timeout.
@@ -134,9 +158,6 @@ def busy() -> Refusal:
     return Refusal("not_ready", "physics is busy with a step request that is still running; try again later")
 
 
-T = TypeVar("T")
-
-
 class QueuedStep(Generic[T]):
     """A direct step that waits for the physics thread."""
 
@@ -180,7 +201,6 @@ class QueuedStep(Generic[T]):
 
         Args:
             remaining: Seconds until `step_timeout` is raised.
-            timeout: The whole step timeout, seconds, for the message.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True
@@ -191,9 +211,6 @@ class QueuedStep(Generic[T]):
         if self._error is not None:
             raise self._error
         return self._results[0]
-
-
-logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class _WarningLog:
@@ -284,9 +301,6 @@ class PhysicsThread:
     def stop(self, timeout: float) -> bool:
         """End the thread between two sub-steps, and release callers that wait for a step. Idempotent.
 
-        Args:
-            timeout: Seconds to wait.
-
         Returns:
             False when physics was still busy after `timeout`.
         """
@@ -324,29 +338,10 @@ class PhysicsThread:
             self._give_up(Refusal("internal_error", reason))
 
 
-MIN_SPEED: Final = 5.0
-MAX_SPEED: Final = 100.0
-
-IDLE_S: Final = 0.1
-"""Longest sleep of the physics thread while nothing integrates."""
-
-MAX_LAG_S: Final = 0.02
-"""A live step later than this counts as a stall and is not caught up; smaller delays are jitter."""
-
-MIN_PERIOD_S: Final = 1e-5
-MAX_PERIOD_S: Final = 3600.0
-
-HOLD_S: Final = 0.005
-"""Interval at which a live loop that runs late, and so never sleeps, releases the lock for `GIVE_WAY_S`."""
-
-GIVE_WAY_S: Final = 0.0005
-
-
 class LivePacing:
     """Keeps the iterations of live mode on a grid of time slots."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Pace a model's time step at the speed of real time; the first iteration is due immediately."""
         self._model = model
         self._speed = MAX_SPEED
         self._slot = -math.inf

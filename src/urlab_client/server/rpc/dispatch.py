@@ -42,6 +42,12 @@ BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up case-insensitively but recognise only their exact name."""
 
 
+RENEWED_S: Final = 0.25
+"""How often a waiting request checks whether the lock has been replaced."""
+
+INTERVAL_S: Final = 0.25
+
+
 class ServedRequest(Struct, frozen=True, kw_only=True):
     """An answered request; see `SimulatedServer.add_request_callback`.
 
@@ -108,10 +114,6 @@ HANDLERS: Final = HandlerTable()
 handles = HANDLERS.handles
 
 
-RENEWED_S: Final = 0.25
-"""How often a waiting request checks whether the lock has been replaced."""
-
-
 class Dispatcher:
     """Answers requests one at a time, from all transports.
 
@@ -124,7 +126,6 @@ class Dispatcher:
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Create the dispatcher of a server."""
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
@@ -139,7 +140,6 @@ class Dispatcher:
         """Return the reply to a request; errors become error replies.
 
         Args:
-            frame: Bytes of the request.
             transport: Transport of the request; editor ops are refused over shared memory.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
@@ -301,14 +301,10 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
     raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")
 
 
-INTERVAL_S: Final = 0.25
-
-
 class Watchdog:
     """A thread that checks the physics of a server a few times a second."""
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
-        """Configure the thread; `start` starts it."""
         self._core = core
         self._dispatcher = dispatcher
         self._stopping = threading.Event()

@@ -42,16 +42,21 @@ _DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)", re.ASCII)
 _INTEGER: Final = re.compile(r"[+-]?\d+", re.ASCII)
 
 
+_DEFAULT_LIMITS: Final = Limits()
+
+_EXACT_NAMES: Final = frozenset({"hello", "meta"})
+"""Ops that are recognised in lower case only."""
+
+_NUMBERS: Final = frozenset({float, int})
+
+T = TypeVar("T")
+
+
 class _Absent(Enum):
     ABSENT = "absent"
 
 
 ABSENT: Any = _Absent.ABSENT
-
-
-def bad_request(why: str) -> Refusal:
-    """Return the refusal of a frame that is not a request."""
-    return Refusal("bad_request", why)
 
 
 def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
@@ -62,7 +67,7 @@ def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
     if not isinstance(data, dict):
         data = _decoded(frame, msgspec.json.decode)
     if not isinstance(data, dict):
-        raise bad_request("the request is neither a msgpack map nor a JSON object")
+        raise Refusal("bad_request", "the request is neither a msgpack map nor a JSON object")
     return _tidy(cast("Plain", data), depth, depth)
 
 
@@ -78,7 +83,7 @@ def _decoded(frame: bytes, decode: Callable[[bytes], Plain]) -> Plain:
 def _tidy(value: Plain, depth: int, most: int) -> Plain:
     """Replace values that the plugin's decoder does not deliver, recursively."""
     if depth < 0:
-        raise bad_request(f"the request is nested deeper than {most} levels (limit request_depth)")
+        raise Refusal("bad_request", f"the request is nested deeper than {most} levels (limit request_depth)")
     match value:
         case dict():
             tidy: dict[str, tuple[str, Plain]] = {}  # by folded key: of keys that differ in case, the last one counts
@@ -248,16 +253,6 @@ _SIMPLE: Final[Mapping[type[inspect.Type], Callable[[Plain], Any]]] = {
 }
 
 
-_DEFAULT_LIMITS: Final = Limits()
-
-_EXACT_NAMES: Final = frozenset({"hello", "meta"})
-"""Ops that are recognised in lower case only."""
-
-_NUMBERS: Final = frozenset({float, int})
-
-T = TypeVar("T")
-
-
 class Incoming(Struct, frozen=True):
     """One decoded request.
 
@@ -319,7 +314,7 @@ class RequestReader:
         """Decode one frame."""
         most = self._limits.request_bytes
         if len(frame) > most:
-            raise bad_request(f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
+            raise Refusal("bad_request", f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
         try:
             request = self._decode(frame)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -351,9 +346,10 @@ class RequestReader:
         for name, sent_as in zip(request.__struct_fields__, request.__struct_encode_fields__, strict=True):
             longest = _longest_string(getattr(request, name))
             if longest > most:
-                raise bad_request(
+                raise Refusal(
+                    "bad_request",
                     f"{op.name}: field '{sent_as}' holds a string of {longest} characters, more than the "
-                    f"limit string_chars, {most}"
+                    f"limit string_chars, {most}",
                 )
 
 

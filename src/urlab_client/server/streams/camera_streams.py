@@ -102,9 +102,7 @@ class CameraStreams:
         """Bind the first port.
 
         Args:
-            health: Notified when the thread dies.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
-            curve_keys: Who may connect; None for anyone who can reach the interface.
 
         Raises:
             PortInUse: The port is in use.

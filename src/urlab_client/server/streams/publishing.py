@@ -80,11 +80,6 @@ class StreamServer:
     ) -> None:
         """Bind the sockets; `start` begins to serve.
 
-        Args:
-            health: Notified when the thread dies.
-            state_port: TCP port; 0 selects a free port, as for the other ports.
-            curve_keys: Who may connect; None for anyone who can reach the interface.
-
         Raises:
             PortInUse: A port is in use.
             OSError: The address does not belong to this machine.
@@ -153,9 +148,6 @@ class StreamServer:
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`.
-
-        Args:
-            timeout: Seconds to wait.
 
         Returns:
             False if the thread is still busy; it then closes the sockets when it ends.

@@ -21,11 +21,6 @@ class Registration:
     """Keeps the file of one server in the registry for as long as the server is open."""
 
     def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
-        """Configure the registration; `start` writes the file.
-
-        Args:
-            health: Notified when the thread dies.
-        """
         self._directory = directory
         self._describe = describe
         self._path: Path | None = None

@@ -27,10 +27,6 @@ def within(timeout: float, attempt: Callable[[float], bool]) -> bool:
 
     After a process was stopped or got no processor time, its deadline may have passed although no other thread has run.
     With slices, such a pause uses up one of them, and another follows.
-
-    Args:
-        timeout: Seconds.
-        attempt: Waits for up to the given seconds, and returns whether it succeeded.
     """
     return any(attempt(SLICE_S) for _ in range(max(2, math.ceil(timeout / SLICE_S))))
 
@@ -82,7 +78,6 @@ class Health:
         """Return a daemon thread, not started, whose death by an exception is reported.
 
         Args:
-            arguments: Arguments of `run`.
             on_death: Called with the message after the report, on that thread, to fail what waits for it.
         """
         return daemon(name, run, *arguments, failed=lambda error: on_death(self.report(error)))
@@ -111,9 +106,7 @@ class ServingThread:
         """Configure the thread; `start` starts it.
 
         Args:
-            name: Name of the thread.
             run: Body of the thread. Its argument is the reply to send first when it replaces another thread.
-            health: Notified when the thread dies.
         """
         self._name = name
         self._run = run
@@ -160,7 +153,6 @@ class ServingThread:
         """Replace `thread` if it is the serving thread and working on a request.
 
         Args:
-            thread: The thread that does not return.
             owed: The reply that the new thread sends for it.
             release: Called before the new thread starts, to hand over what the old one holds.
         """

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from urlab_client.aio.arguments import collection
-from urlab_client.aio.streams.source import PublishedSource
-from urlab_client.aio.streams.state_source import StateSource
+from urlab_client.aio.streams.sources import PublishedSource, StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.errors import ProtocolError
-from urlab_client.protocol.messages.streams import (
-    RowSample,
-)
+from urlab_client.protocol.messages.streams import RowSample
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
 from urlab_client.values.layouts import BytesLike
@@ -22,43 +19,25 @@ _OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKin
 _WITH_ID = frozenset({TopicKind.JOINT, TopicKind.SENSOR})
 
 
-class RowSource(PublishedSource):
-    """The binary rows of the state socket.
-
-    Args:
-        subscriptions: Subscriptions of the client.
-        endpoint: Callback that returns the address of the state socket.
-        articulations: Keys of the articulations whose rows are wanted.
-        kinds: Kinds of rows; empty for all kinds that the other arguments allow.
-        components: Component names of joints, free joints and sensors; empty for all.
-        entities: Whether an empty `kinds` includes the scene rows.
+class RowFilter:
+    """The rows that a reader wants. Empty `kinds` and `components` mean all; `entities` adds the rows of the scene.
 
     Attributes:
         articulations: Keys of the articulations whose rows are wanted.
+        topics: ZMQ's prefix filters.
 
     Raises:
         ValueError: A kind has no rows, a name is not valid in a topic, or there is nothing to receive.
     """
 
-    name = "row_stream"
-    unreachable: str = StateSource.unreachable
-    silent = (
-        "Rows are published only in live mode: call client.runtime.set_mode('live'). While paused they repeat. "
-        "Component names are the engine's, which may differ from the compiled names."
-    )
-
     def __init__(
         self,
-        subscriptions: Subscriptions,
-        endpoint: Callable[[], str],
         articulations: Collection[str],
         kinds: Collection[str | TopicKind] = (),
         components: Collection[str] = (),
         *,
         entities: bool = False,
     ) -> None:
-        super().__init__(subscriptions)
-        self._endpoint = endpoint
         self.articulations: frozenset[str] = frozenset(articulations)
         self._components = frozenset(collection("components", components))
         self._kinds = frozenset(TopicKind(kind) for kind in collection("kinds", kinds))
@@ -68,8 +47,8 @@ class RowSource(PublishedSource):
         no_rows = self._kinds - _OF_ARTICULATION - _OF_SCENE
         if no_rows:
             raise ValueError(f"there are no rows of kind {', '.join(sorted(no_rows))}")
-        self._filters = tuple(sorted(self._narrow()))
-        if not self._filters:
+        self.topics = tuple(sorted(self._narrow()))
+        if not self.topics:
             raise ValueError("row_stream: no articulation to receive rows from. Check that discover() found one.")
 
     def _narrow(self) -> set[bytes]:
@@ -85,17 +64,6 @@ class RowSource(PublishedSource):
                     filters.add(articulation_filter(key, kind))
         return filters
 
-    def subscription(self) -> Subscription:
-        """See the base class."""
-        return Subscription(self._endpoint(), self._filters, self._accepts)
-
-    def _accepts(self, topic: bytes) -> bool:
-        try:
-            found = StreamTopic.parse(topic)
-        except ProtocolError:
-            return False  # a kind of topic from a newer server
-        return self.has(found)
-
     def has(self, found: StreamTopic) -> bool:
         """Return whether rows of a topic are wanted."""
         if found.kind not in self._kinds:
@@ -105,12 +73,41 @@ class RowSource(PublishedSource):
         named = found.kind not in _OF_COMPONENT or not self._components or found.name in self._components
         return named and found.owner in self.articulations
 
+
+class RowSource(PublishedSource[RowSample]):
+    """The binary rows of the state socket."""
+
+    name = "row_stream"
+    unreachable: str = StateSource.unreachable
+    silent = (
+        "Rows are published only in live mode: call client.runtime.set_mode('live'). While paused they repeat. "
+        "Component names are the engine's, which may differ from the compiled names."
+    )
+
+    def __init__(self, subscriptions: Subscriptions, endpoint: Callable[[], str], wanted: RowFilter) -> None:
+        super().__init__(subscriptions)
+        self._endpoint = endpoint
+        self._wanted = wanted
+
+    def subscription(self) -> Subscription:
+        return Subscription(self._endpoint(), self._wanted.topics, self._accepts)
+
+    def _accepts(self, topic: bytes) -> bool:
+        try:
+            found = StreamTopic.parse(topic)
+        except ProtocolError:
+            return False  # a kind of topic from a newer server
+        return self._wanted.has(found)
+
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Skip components that are not in the compiled model: their rows carry a negative id and zeros."""
         return not (len(payload) >= 4 and payload[3] & 0x80 and StreamTopic.parse(topic).kind in _WITH_ID)
 
     def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
-        """Decode a row. Raises `ProtocolError`."""
-        found = StreamTopic.parse(topic)
-        row = decode_row(found, payload)
-        return RowSample(kind=found.kind, owner=found.owner, component=found.name, row=row)
+        return sample(topic, payload)
+
+
+def sample(topic: bytes, payload: BytesLike) -> RowSample:
+    """Decode a row. Raises `ProtocolError`."""
+    found = StreamTopic.parse(topic)
+    return RowSample(kind=found.kind, owner=found.owner, component=found.name, row=decode_row(found, payload))

@@ -1,4 +1,4 @@
-"""Variation by ops of the protocol, for servers that vary nothing themselves, such as an editor."""
+"""How a client's episodes vary: by its server, or by an environment through ops. Loads MuJoCo only where it is used."""
 
 from __future__ import annotations
 
@@ -9,16 +9,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.client import URLabClient
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.integrations._episode_variation import VariedByOps, controlled_actuators, varied_by_ops
+from urlab_client.enums import ControllerKind
 from urlab_client.randomise.declaration import Randomisation, UnsupportedRandomisation, Vary
-from urlab_client.randomise.quantities import START, elements_of
-from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
 
 if TYPE_CHECKING:
     import mujoco
+
+    from urlab_client.aio.client import URLabClient
+    from urlab_client.randomise.variation import EpisodeDraws, Variation
+
+
+def server_variation(
+    client: URLabClient, model: mujoco.MjModel, layouts: Mapping[str, ArticulationLayout]
+) -> Variation | None:
+    """Return how the server of a client varies its scene, or None if it does not."""
+    from urlab_client.randomise.variation import Variation, declared_in
+
+    declared = declared_in(model)
+    return None if declared is None else Variation(declared, model, _controlled_actuators(client, layouts))
+
+
+def wire_variation(client: URLabClient) -> WireVariation | None:
+    """Return what an environment varies by ops on this client, or None if no environment does."""
+    return next((found for found in client.observers if isinstance(found, WireVariation)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +45,14 @@ class _Controlled:
     """Unvaried gains, by gain and actuator, in the order of `actuators`."""
 
 
-class WireVariation(VariedByOps):
-    """Variation applied before and after the reset that starts an episode.
+class WireVariation(ClientObserver):
+    """Variation by ops around the reset that starts an episode, for a server that varies nothing itself.
+
+    One of its client's observers, so that recordings, which see the client but not the environment, find it there.
 
     Attributes:
+        declaration: What varies.
+        draws: The values drawn for the current episode; None before the first.
         variation: The variation; it draws the same numbers as a server that varies its own scene.
         controlled: Controllers whose gains vary, by articulation.
     """
@@ -54,12 +74,15 @@ class WireVariation(VariedByOps):
             UnsupportedRandomisation: No op changes one of the quantities.
             ValueError: A name matches no element.
         """
-        super().__init__(declared)
-        controlled = controlled_actuators(client, layouts)
+        from urlab_client.randomise.variation import Variation, field_of
+
+        self.declaration = declared
+        self.draws: EpisodeDraws | None = None
+        controlled = _controlled_actuators(client, layouts)
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
-        if (before := varied_by_ops(client)) is not None:
+        if (before := wire_variation(client)) is not None:
             client.remove_observer(before)
         client.add_observer(self)
         self._model_fields: dict[str, NDArray[Any]] = {
@@ -108,6 +131,8 @@ class WireVariation(VariedByOps):
 
 
 def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
+    from urlab_client.randomise.quantities import START, elements_of
+
     def settable(vary: Vary) -> bool:
         if vary.what in ("kp", "kv"):
             return controlled.issuperset(elements_of(vary, model, controlled).ids.tolist())
@@ -116,3 +141,14 @@ def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, 
     refused = [vary.what for vary in declared.vary if not settable(vary)]
     if refused:
         raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
+
+
+def _controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
+    """Return the model ids of the actuators that a controller with gains drives."""
+    controlled: set[int] = set()
+    for key, articulation in client.articulations.items():
+        controller = articulation.controller
+        if controller is not None and controller.kind == ControllerKind.PD:
+            actuators = layouts[key].actuators
+            controlled.update(actuators[name] for name in controller.params["kp"])
+    return frozenset(controlled)

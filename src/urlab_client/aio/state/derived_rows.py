@@ -3,117 +3,73 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from urlab_client.aio.streams.row_source import RowSource
-from urlab_client.aio.streams.state_source import StateSource
+from urlab_client.aio.articulation import URLabArticulation
+from urlab_client.aio.model.layout import FREE
+from urlab_client.aio.streams.handler import Source
+from urlab_client.aio.streams.rows import RowFilter, sample
+from urlab_client.aio.streams.sources import StateSource
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
-from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.messages.streams import RowSample, StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, Row, SceneRow, SensorRow, TwistRow
 from urlab_client.protocol.topics import StreamTopic, TopicKind
 from urlab_client.values.layouts import BytesLike
 
-_FREE = 0  # mjJNT_FREE
 
+class DerivedRowSource(Source[RowSample]):
+    """Rows for the clients of a server that publishes only snapshots."""
 
-class _HasJoint(Protocol):
-    id: int
-    jnt_type: int
-    qpos_local_offset: int
-    qvel_local_offset: int
-
-
-class _HasSensor(Protocol):
-    id: int
-
-
-class HasRows(Protocol):
-    """An articulation as the client knows it, with the elements of its state."""
-
-    @property
-    def joints(self) -> Mapping[str, _HasJoint]:
-        """Joints by name."""
-        ...
-
-    @property
-    def sensors(self) -> Mapping[str, _HasSensor]:
-        """Sensors by name."""
-        ...
-
-
-class DerivedRowSource(RowSource):
-    """Rows for the clients of a server that publishes only snapshots.
-
-    Args:
-        states: Source of the snapshots.
-        articulations: Callback that returns the articulations by key.
-        wanted: Keys of the articulations whose rows are wanted.
-        kinds: See the base class.
-        components: See the base class.
-        entities: See the base class.
-    """
+    name = "row_stream"
 
     def __init__(
-        self,
-        states: StateSource,
-        articulations: Callable[[], Mapping[str, HasRows]],
-        wanted: Collection[str],
-        kinds: Collection[str | TopicKind] = (),
-        components: Collection[str] = (),
-        *,
-        entities: bool = False,
+        self, states: StateSource, robots: Callable[[], Mapping[str, URLabArticulation]], wanted: RowFilter
     ) -> None:
-        super().__init__(states.subscriptions, states.endpoint, wanted, kinds, components, entities=entities)
         self._states = states
-        self._robots = articulations
+        self._robots = robots
+        self._wanted = wanted
         self._feeds: dict[MessageHandler, _RowFeed] = {}
 
     def attach(self, handler: MessageHandler) -> None:
-        """Start delivering to `handler`. Call from the event loop."""
-        feed = _RowFeed(handler, self._topics)
+        feed = _RowFeed(handler, self._rows)
         self._states.attach(feed)
         self._feeds[handler] = feed
 
     def detach(self, handler: MessageHandler) -> None:
-        """Stop delivering to `handler`. Idempotent."""
         feed = self._feeds.pop(handler, None)
         if feed is not None:
             self._states.detach(feed)
 
-    def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Return True: only elements of the model have rows."""
-        return True
+    def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
+        return sample(topic, payload)
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return what the source of the snapshots returns."""
         return self._states.first_after(self._feeds[handler])
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        """Return what the source of the snapshots returns."""
         return self._states.silence(self._feeds[handler], seconds)
 
-    def _topics(self, snapshot: StateSnapshot) -> Iterator[tuple[bytes, Row]]:
-        """Return the wanted rows of a snapshot."""
+    def _rows(self, snapshot: StateSnapshot) -> Iterator[tuple[bytes, Row]]:
+        """Yield the wanted rows of a snapshot with their topics."""
         robots = self._robots()
-        for key in self.articulations & snapshot.per_articulation.keys() & robots.keys():
+        for key in self._wanted.articulations & snapshot.per_articulation.keys() & robots.keys():
             for topic, row in _rows_of(key, robots[key], snapshot.per_articulation[key]):
-                if self.has(topic):
+                if self._wanted.has(topic):
                     yield topic.encode(), row
         for name, state in snapshot.entities.items():
             for topic, row in _rows_of_entity(name, state):
-                if self.has(topic):
+                if self._wanted.has(topic):
                     yield topic.encode(), row
 
 
-def _rows_of(key: str, robot: HasRows, state: ArticulationState) -> Iterator[tuple[StreamTopic, Row]]:
+def _rows_of(key: str, robot: URLabArticulation, state: ArticulationState) -> Iterator[tuple[StreamTopic, Row]]:
     for name, joint in robot.joints.items():
         at, moves = joint.qpos_local_offset, joint.qvel_local_offset
-        if joint.jnt_type == _FREE:
+        if joint.jnt_type == FREE:
             base = BaseStateRow.from_free_joint(state.qpos[at : at + 7], state.qvel[moves : moves + 6])
             yield StreamTopic(TopicKind.BASE_STATE, key, name), base
         else:
@@ -150,7 +106,6 @@ class _RowFeed(MessageHandler):
         self._rows = rows
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Process one snapshot."""
         try:
             for name, row in self._rows(StateSnapshot.decode(payload, topic.decode())):
                 self._reader.on_message(name, row.encode())
@@ -158,21 +113,16 @@ class _RowFeed(MessageHandler):
             self._reader.on_malformed(str(error))
 
     def on_malformed(self, problem: str) -> None:
-        """See the base class."""
         self._reader.on_malformed(problem)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """See the base class."""
         self._reader.on_end(error)
 
     def on_drained(self) -> None:
-        """See the base class."""
         self._reader.on_drained()
 
     def on_connection(self, connected: bool) -> None:
-        """See the base class."""
         self._reader.on_connection(connected)
 
     def on_gap(self, why: str) -> None:
-        """See the base class."""
         self._reader.on_gap(why)
