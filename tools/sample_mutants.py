@@ -166,7 +166,7 @@ class Record:
 
 
 def covering(mutant: Mutant, known: Record) -> set[str]:
-    """Return the tests that run a mutant's line; of one that runs on import, those that run lines with its names.
+    """Return the tests that run a mutant's line; of one that runs on import, those of its class or with its names.
 
     If none does, as of a class that others only inherit from, any test of the file may notice.
     """
@@ -178,7 +178,9 @@ def covering(mutant: Mutant, known: Record) -> set[str]:
     names = {node.name for node in around if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)}
     names = names or {node.id for stmt in around for node in ast.walk(stmt) if isinstance(node, ast.Name)}
     word = re.compile(rf"\b({'|'.join(names)})\b")
-    found: set[str] = set()
+    classes = [node for node in around if isinstance(node, ast.ClassDef)]
+    inside = range(classes[-1].lineno, (classes[-1].end_lineno or 0) + 1) if classes else range(0)
+    found = known.running(mutant.file, inside)  # methods that check fields, of which other lines may know nothing
     for file in sources(known.root):
         text = (known.root / file).read_text("utf-8").splitlines()
         found |= known.running(file, [number for number, words in enumerate(text, 1) if names and word.search(words)])
