@@ -614,9 +614,14 @@ class TestInterrupt:
                 assert seen == [True]
                 assert isinstance(signals.let_in(), Struck)
                 assert (signals.arrived, signals.let_in()) == (False, None)
-            with pytest.raises(Struck), DeferredSignals() as signals:
-                signal.raise_signal(signal.SIGTERM)
-                seen.append(signals.arrived)
+
+            def deferred() -> None:
+                with DeferredSignals() as late:
+                    signal.raise_signal(signal.SIGTERM)
+                    seen.append(late.arrived)
+
+            with pytest.raises(Struck):
+                deferred()
             assert seen == [True, True]
             assert signal.getsignal(signal.SIGTERM) is strike
         finally:
