@@ -298,6 +298,17 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
     assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
 
+def test_a_client_that_never_listens_to_the_doorbell_delays_nobody(base: Path) -> None:
+    memory = SharedMemoryServer(base, Health())
+    memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
+    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, bell=True) as shm:
+        deaf.connect(os.fspath(memory.directory / "doorbell.sock"))
+        for _ in range(600):  # its buffer holds fewer rings
+            assert shm.call({"op": "ping"}) is not None
+    memory.stop()
+    assert memory.join(30)
+
+
 def test_a_request_that_is_seen_before_its_ring_does_not_count_as_one_without(base: Path) -> None:
     memory = SharedMemoryServer(base, Health())
     memory.switch_camera("bot/eye", (4, 4))
