@@ -132,8 +132,10 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
 
 def test_openapi_describes_parameters_bodies_and_responses(http: TestClient) -> None:
     from jsonschema import Draft202012Validator
+    from openapi_spec_validator import validate
 
     document = http.get("/api/openapi.json").json()
+    validate(document)
     operations = {(method, path): said for path, of in document["paths"].items() for method, said in of.items()}
     ids = [said["operationId"] for said in operations.values()]
     assert len(ids) == len(set(ids))

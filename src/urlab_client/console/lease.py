@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass
 
 import anyio
 
@@ -13,6 +14,7 @@ from urlab_client.aio.background import background_task
 _LOOK_S = 0.1
 
 
+@dataclass(eq=False)
 class Viewer:
     """A viewer: a person with a browser, or a program.
 
@@ -23,11 +25,10 @@ class Viewer:
         keeps: Seconds for which the viewer keeps the controls without acting; None for the lease's default.
     """
 
-    def __init__(self, key: str, name: str, *, yields: bool = False, keeps: float | None = None) -> None:
-        self.key = key
-        self.name = name
-        self.yields = yields
-        self.keeps = keeps
+    key: str
+    name: str
+    yields: bool = False
+    keeps: float | None = None
 
 
 class NotDriving(Exception):

@@ -205,6 +205,11 @@ ToViewer: TypeAlias = You | World | State | Status | Log | Refused | Pong
 """Messages to a viewer."""
 
 
+def tag_of(kind: type[Struct]) -> str:
+    """Return the `type` by which a message says what it is."""
+    return str(kind.__struct_config__.tag)
+
+
 class PictureHead(Struct):
     """Header of a picture: `received` is Unix time in ms, `sim_time` is in seconds.
 

@@ -227,6 +227,16 @@ def _serialize(
 
 _MARK = 0x5A3C1E7B
 _PLACE = (12345.678, 23456.789, 34567.891)
+_MARKED: dict[str, tuple[int, str, Any]] = {
+    "camera": (0, "lookat", _PLACE),
+    "select": (1, "select", _MARK),
+    "active": (1, "active", _MARK),
+    "localpos": (1, "localpos", _PLACE),
+    "refselpos": (1, "refselpos", _PLACE),
+    "frame": (2, "frame", _MARK),
+    "flags": (2, "flags", 0x5A),
+}
+"""What the page changes in a state: in its camera (0), perturbation (1) or options (2), and a value to find it by."""
 
 
 def _layout(model: mujoco.MjModel) -> str:
@@ -238,30 +248,19 @@ def _layout(model: mujoco.MjModel) -> str:
 
     data = mujoco.MjData(model)
     places: dict[str, Any] = {"fovy": float(model.vis.global_.fovy)}
-
-    def find(name: str, mark: bytes, camera: Any = None, perturb: Any = None, option: Any = None) -> None:
-        parts = camera or mujoco.MjvCamera(), perturb or mujoco.MjvPerturb(), option or mujoco.MjvOption()
-        written = _serialize(model, data, parts, [0] * int(mujoco.mjtRndFlag.mjNRNDFLAG))
+    for name, (owner, attribute, value) in _MARKED.items():
+        view = mujoco.MjvCamera(), mujoco.MjvPerturb(), mujoco.MjvOption()
+        part = view[owner]
+        field: Any = getattr(part, attribute)
+        if isinstance(field, int):
+            setattr(part, attribute, value)
+            mark = struct.pack("<i", value)
+        else:
+            field[:] = value
+            mark = bytes(field)
+        written = _serialize(model, data, view, [0] * int(mujoco.mjtRndFlag.mjNRNDFLAG))
         if written.count(mark) == 1:
             places[name] = written.index(mark)
-
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = _PLACE
-    find("camera", struct.pack("<3d", *_PLACE), camera=camera)
-    for name in ("select", "active"):
-        perturb = mujoco.MjvPerturb()
-        setattr(perturb, name, _MARK)
-        find(name, struct.pack("<i", _MARK), perturb=perturb)
-    for name in ("localpos", "refselpos"):
-        perturb = mujoco.MjvPerturb()
-        getattr(perturb, name)[:] = _PLACE
-        find(name, struct.pack("<3d", *_PLACE), perturb=perturb)
-    option = mujoco.MjvOption()
-    option.frame = _MARK
-    find("frame", struct.pack("<i", _MARK), option=option)
-    option = mujoco.MjvOption()
-    option.flags[:] = 0x5A
-    find("flags", bytes(option.flags), option=option)
     if "flags" in places:
         shown = mujoco.mjtVisFlag
         places["contacts"] = [

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncGenerator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 import anyio.to_thread
@@ -81,17 +81,15 @@ class Cameras:
             await feed.renew()
 
 
-class EncodedPicture:
-    """One JPEG with its header for the browser; `seq` is its number among the pictures of its feed."""
+class EncodedPicture(NamedTuple):
+    """One JPEG, and the `frame` for browsers: length of the head (4 bytes, little-endian), head, and JPEG.
 
-    def __init__(self, head: PictureHead, encoded: bytes) -> None:
-        self.seq = head.seq
-        self.jpeg = encoded
-        self._head = msgspec.json.encode(head)
+    `seq` is its number among the pictures of its feed.
+    """
 
-    def frame(self) -> bytes:
-        """Return length of the head (4 bytes, little-endian), head, and JPEG."""
-        return len(self._head).to_bytes(4, "little") + self._head + self.jpeg
+    seq: int
+    jpeg: bytes
+    frame: bytes
 
 
 class Feed:
@@ -214,8 +212,10 @@ class Feed:
 
     async def _show(self, encoded: bytes, head: PictureHead) -> None:
         self._seq = head.seq
+        described = msgspec.json.encode(head)
+        frame = len(described).to_bytes(4, "little") + described + encoded
         async with self._changed:
-            self._newest = EncodedPicture(head, encoded)
+            self._newest = EncodedPicture(head.seq, encoded, frame)
             self._changed.notify_all()
 
 

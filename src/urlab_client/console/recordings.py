@@ -44,16 +44,13 @@ class RecordingView(Struct):
     at: float
 
 
-class RecordingContents(Struct):
-    """What is in a recording: length in seconds, robots, cameras, and why the file is incomplete, if it is.
+class RecordingContents(RecordingView):
+    """A recording and what is in it: length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
     `lost` counts states and pictures that came too fast to be written. `unavailable` holds the formats that the
     recording cannot be converted to here, each with what is missing.
     """
 
-    name: str
-    bytes: int
-    at: float
     seconds: float
     robots: list[str]
     cameras: list[str]

@@ -59,12 +59,12 @@ class Caller(Viewer):
     """An agent. People take the controls from it by acting; other agents wait until it is idle.
 
     Attributes:
-        told: Number of the last log entry that it has read.
+        last_read: Number of the last log entry that it has read.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(f"agent:{secrets.token_urlsafe(16)}", name, yields=True, keeps=_THINKS_S)
-        self.told = 0
+        self.last_read = 0
 
 
 class Call:

@@ -104,10 +104,10 @@ async def log(call: Call, since: int | None = None) -> Log:
     Args:
         since: Number of the last entry that you know. Without it you get the entries since your last call of `log`.
     """
-    start = call.caller.told if since is None else since
+    start = call.caller.last_read if since is None else since
     entries = call.console.view.entries_after(start)
-    call.caller.told = entries[-1].n if entries else start
-    return Log(entries=entries, next=call.caller.told)
+    call.caller.last_read = entries[-1].n if entries else start
+    return Log(entries=entries, next=call.caller.last_read)
 
 
 @tool(Needs.DRIVE)

@@ -192,8 +192,7 @@ def _routes(site: Site) -> list[Route | WebSocketRoute | Mount]:
     return [
         Route("/", page),
         *routes([*documented, *undocumented], site),
-        _socket("/api/live", live.live, site),
-        _socket("/api/cameras/{path:path}/live", live.pictures, site),
+        *(_socket(one.path, one.serve, site) for one in live.SOCKETS),
         Mount("/static", StaticFiles(directory=_STATIC)),
         *_viewer_routes(site),
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable
 from functools import lru_cache
 from importlib.metadata import version
@@ -12,11 +13,12 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.console.controls import SERVED
-from urlab_client.console.messages import Ack, FromViewer, PictureHead, ToViewer, encode
+from urlab_client.console.messages import FromViewer, PictureHead, ToViewer, encode, tag_of
 from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.messages.sim import BeginPieOk
 from urlab_client.values.schemas import prose, schemas
 from urlab_client.web.endpoints import BYTES, JSON, Endpoint
+from urlab_client.web.live import SOCKETS, Socket
 
 _SCHEMA = "#/components/schemas/{name}"
 _KEY_REQUIRED: list[dict[str, list[str]]] = [{"key": []}]
@@ -61,7 +63,7 @@ def openapi(endpoints: tuple[Endpoint, ...], root: str) -> bytes:
         root: Path under which the application is mounted or a proxy serves it.
     """
     ops = [*SERVED.values()]
-    kinds = [kind for one in endpoints for kind in (one.reply, one.parameters.get("body", (None, None))[0])]
+    kinds = [kind for one in endpoints for kind in (one.result, one.parameters.get("body", (None, None))[0])]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
     components = schemas([*_structs(kinds), Error, *(op.request for op in ops), *replies], _SCHEMA)
     for op in ops:  # a request on the wire also says which op it is, and of which session
@@ -73,7 +75,7 @@ def openapi(endpoints: tuple[Endpoint, ...], root: str) -> bytes:
             request["required"] = list(op.required)
     paths: dict[str, dict[str, Any]] = {}
     for one in endpoints:
-        paths.setdefault(_plain_path(one), {})[one.method.lower()] = _described_endpoint(one)
+        paths.setdefault(_plain_path(one.path), {})[one.method.lower()] = _described_endpoint(one)
     return encode(
         {
             "openapi": "3.1.0",
@@ -86,16 +88,14 @@ def openapi(endpoints: tuple[Endpoint, ...], root: str) -> bytes:
     )
 
 
-def _plain_path(endpoint: Endpoint) -> str:
-    path = endpoint.path
-    for kind in ("int", "path"):
-        path = path.replace(f":{kind}}}", "}")
-    return path
+def _plain_path(path: str) -> str:
+    """Return a path of Starlette's without the types of its parameters."""
+    return re.sub(r":\w+\}", "}", path)
 
 
 def _described_endpoint(endpoint: Endpoint) -> dict[str, Any]:
     doc = inspect.cleandoc(endpoint.function.__doc__ or "")
-    reply = _schema(endpoint.reply) if endpoint.media == JSON else {"type": "string"}
+    reply = _schema(endpoint.result) if endpoint.media == JSON else {"type": "string"}
     found: dict[str, Any] = {
         "operationId": endpoint.function.__name__,
         "tags": ["console"],
@@ -169,8 +169,7 @@ def _structs(kinds: Iterable[Any]) -> list[type[Struct]]:
 
 # The WebSockets
 
-_FROM_CONSOLE = cast("tuple[type[Struct], ...]", get_args(ToViewer))
-_FROM_VIEWERS = cast("tuple[type[Struct], ...]", get_args(FromViewer))
+_MESSAGES = cast("tuple[type[Struct], ...]", get_args(ToViewer | FromViewer))
 _PICTURE = {
     "title": "picture",
     "summary": "The newest picture: length of the head (4 bytes, little-endian), the head as JSON, and a JPEG.",
@@ -188,59 +187,49 @@ def asyncapi(host: str, root: str, protocol: str) -> bytes:
         root: The path under which it is mounted, or a proxy shows it.
         protocol: `ws` or `wss`.
     """
-    kinds = (*_FROM_CONSOLE, *_FROM_VIEWERS)
-    live = [*map(_tag, kinds)]
     return encode(
         {
             "asyncapi": "3.0.0",
             "info": {"title": "URLab console", "version": version("urlab-client")},
             "servers": {"console": {"host": host, "pathname": root or "/", "protocol": protocol,
                                     "security": [{"$ref": "#/components/securitySchemes/key"}]}},
-            "channels": {
-                "live": _channel("/api/live", "State, status, world and log; what viewers say.", live),
-                "pictures": {
-                    **_channel(
-                        "/api/cameras/{articulation}/{camera}/live", "Pictures of one camera.", ["picture", _tag(Ack)]
-                    ),
-                    "parameters": {
-                        "articulation": {"description": "Its articulation; `-` for cameras of the scene."},
-                        "camera": {"description": "Its name."},
-                    },
-                },
-            },
+            "channels": {one.name: _channel(one) for one in SOCKETS},
             "operations": {
-                "tell": _operation("send", "live", map(_tag, _FROM_CONSOLE)),
-                "hear": _operation("receive", "live", map(_tag, _FROM_VIEWERS)),
-                "show": _operation("send", "pictures", ["picture"]),
-                "hearShown": _operation("receive", "pictures", [_tag(Ack)]),
+                name: _operation(action, one, messages)
+                for one in SOCKETS
+                for action, (name, messages) in (("send", one.sends), ("receive", one.receives))
             },
             "components": {
-                "messages": {_tag(kind): _message(kind) for kind in kinds} | {"picture": _PICTURE},
-                "schemas": schemas([*kinds, PictureHead], _SCHEMA),
+                "messages": {tag_of(kind): _message(kind) for kind in _MESSAGES} | {"picture": _PICTURE},
+                "schemas": schemas([*_MESSAGES, PictureHead], _SCHEMA),
                 **_SECURITY,
             },
         }
     )  # fmt: skip
 
 
-def _tag(kind: type[Struct]) -> str:
-    return str(kind.__struct_config__.tag)
-
-
 def _message(kind: type[Struct]) -> dict[str, Any]:
     return {
-        "title": _tag(kind),
+        "title": tag_of(kind),
         "summary": " ".join(prose(kind).split()),
         "contentType": JSON,
         "payload": _schema(kind),
     }
 
 
-def _channel(address: str, description: str, messages: list[str]) -> dict[str, Any]:
-    refs = {name: {"$ref": f"#/components/messages/{name}"} for name in messages}
-    return {"address": address, "description": description, "messages": refs}
+def _channel(socket: Socket) -> dict[str, Any]:
+    messages = (*socket.sends[1], *socket.receives[1])
+    found: dict[str, Any] = {
+        "address": _plain_path(socket.path),
+        "description": socket.description,
+        "messages": {name: {"$ref": f"#/components/messages/{name}"} for name in messages},
+    }
+    if socket.parameters:
+        found["parameters"] = {name: {"description": text} for name, text in socket.parameters.items()}
+    return found
 
 
-def _operation(action: str, channel: str, messages: Iterable[str]) -> dict[str, Any]:
-    refs = [{"$ref": f"#/channels/{channel}/messages/{name}"} for name in messages]
-    return {"action": action, "channel": {"$ref": f"#/channels/{channel}"}, "messages": refs}
+def _operation(action: str, socket: Socket, messages: Iterable[str]) -> dict[str, Any]:
+    channel = f"#/channels/{socket.name}"
+    refs = [{"$ref": f"{channel}/messages/{name}"} for name in messages]
+    return {"action": action, "channel": {"$ref": channel}, "messages": refs}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
@@ -75,10 +76,11 @@ class Call(NamedTuple):
         return str(self.request.scope.get("root_path", ""))
 
 
+@dataclass(frozen=True, eq=False)
 class Endpoint:
     """One operation of the HTTP API.
 
-    Args:
+    Attributes:
         method: Its HTTP method.
         path: Its path, in the form of Starlette's routes.
         function: What it does; its name is the operation's id, its docstring the description.
@@ -89,26 +91,14 @@ class Endpoint:
         upload: Whether the body is a file's bytes, which the function reads itself.
     """
 
-    def __init__(
-        self,
-        method: str,
-        path: str,
-        function: _Function,
-        *,
-        drives: bool = False,
-        public: bool = False,
-        reply: Any = None,
-        media: str = JSON,
-        upload: bool = False,
-    ) -> None:
-        self.method = method
-        self.path = path
-        self.function = function
-        self.drives = drives
-        self.public = public
-        self.media = media
-        self.upload = upload
-        self._reply = reply
+    method: str
+    path: str
+    function: _Function
+    drives: bool = False
+    public: bool = False
+    reply: Any = None
+    media: str = JSON
+    upload: bool = False
 
     @cached_property
     def _types(self) -> dict[str, Any]:
@@ -126,10 +116,10 @@ class Endpoint:
         return frozenset(re.findall(r"\{(\w+)", self.path))
 
     @property
-    def reply(self) -> Any:
-        """Type of the JSON in its response; None if it has none."""
+    def result(self) -> Any:
+        """Type of the JSON in its response; None if that is empty, or is not JSON."""
         made = self._types["return"]
-        return self._reply if made is Response or made is type(None) else made
+        return self.reply if made is Response or made is type(None) else made
 
     def handler(self, site: Site) -> _Handler:
         """Return the handler for a site, which turns exceptions into responses."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, get_args
 
 import anyio
 import msgspec
@@ -25,6 +27,7 @@ from urlab_client.console.messages import (
     ToViewer,
     You,
     encode,
+    tag_of,
 )
 from urlab_client.console.session import ConsoleSession
 from urlab_client.web.endpoints import explain_error
@@ -145,7 +148,7 @@ def _obey(console: ConsoleSession, viewer: Viewer, message: Name | Ctrl | Hand) 
 
 async def pictures(console: ConsoleSession, socket: WebSocket) -> None:
     """Send the pictures of a camera, the newest whenever the browser is ready."""
-    feed = console.cameras.feed(socket.path_params["path"])
+    feed = console.cameras.feed("{articulation}/{camera}".format_map(socket.path_params))
     await socket.accept()
     if feed is None:
         await socket.close(4404, "no such camera")
@@ -159,7 +162,7 @@ async def pictures(console: ConsoleSession, socket: WebSocket) -> None:
             picture = await feed.after(seq)
             seq = picture.seq
             flow.sent()
-            await socket.send_bytes(picture.frame())
+            await socket.send_bytes(picture.frame)
 
     async def listen() -> None:
         while True:
@@ -208,3 +211,50 @@ async def refuse_panels(_: ConsoleSession, socket: WebSocket) -> None:
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone already
         await socket.accept()
         await socket.close(mujoco_viewer.TAKEN, "this page watches")
+
+
+class Socket(NamedTuple):
+    """One WebSocket of the API, from which its route and its channel in the AsyncAPI document are made.
+
+    Attributes:
+        name: Name of the channel.
+        path: Its path, in the form of Starlette's routes.
+        serve: What it does.
+        description: What it is for.
+        sends: Name of the operation by which the console sends, and the types of messages.
+        receives: The same of what viewers send.
+        parameters: Descriptions of the parameters in the path.
+    """
+
+    name: str
+    path: str
+    serve: Callable[[ConsoleSession, WebSocket], Awaitable[None]]
+    description: str
+    sends: tuple[str, tuple[str, ...]]
+    receives: tuple[str, tuple[str, ...]]
+    parameters: Mapping[str, str] = MappingProxyType({})
+
+
+def _tags(kinds: Any) -> tuple[str, ...]:
+    return tuple(tag_of(kind) for kind in get_args(kinds) or (kinds,))
+
+
+SOCKETS = (
+    Socket(
+        "live",
+        "/api/live",
+        live,
+        "State, status, world and log; what viewers say.",
+        ("tell", _tags(ToViewer)),
+        ("hear", _tags(FromViewer)),
+    ),
+    Socket(
+        "pictures",
+        "/api/cameras/{articulation}/{camera:path}/live",
+        pictures,
+        "Pictures of one camera.",
+        ("show", ("picture",)),
+        ("hearShown", _tags(Ack)),
+        {"articulation": "Its articulation; `-` for cameras of the scene.", "camera": "Its name."},
+    ),
+)
