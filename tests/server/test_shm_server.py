@@ -301,7 +301,7 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
 def test_a_client_that_never_listens_to_the_doorbell_delays_nobody(base: Path) -> None:
     memory = SharedMemoryServer(base, Health())
     memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
-    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, bell=True) as shm:
+    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, doorbell=True) as shm:
         deaf.connect(os.fspath(memory.directory / "doorbell.sock"))
         for _ in range(600):  # its buffer holds fewer rings
             assert shm.call({"op": "ping"}) is not None
