@@ -69,12 +69,13 @@ async def one_step(bench: Bench) -> None:
     start = await bench.direct()
     model, data = _local(bench)
     _agree(bench, start, data, _ONE_STEP)
-    values = _inputs(bench, bench.robot)
-    data.ctrl[bench.robot.layout.ctrl_adr] = values
-    reply = await bench.wire.ask("step", **_idle(bench, bench.robot, values))
-    mujoco.mj_step(model, data)
-    _agree(bench, reply, data, _ONE_STEP)
-    same("time", float(data.time), float(reply["time"]), _ONE_STEP)
+    reply = start
+    for values in (_inputs(bench, bench.robot), -2 * _inputs(bench, bench.robot)):
+        data.ctrl[bench.robot.layout.ctrl_adr] = values
+        reply = await bench.wire.ask("step", **_idle(bench, bench.robot, values))
+        mujoco.mj_step(model, data)
+        _agree(bench, reply, data, _ONE_STEP)
+        same("time", float(data.time), float(reply["time"]), _ONE_STEP)
     exact = all(
         np.array_equal(bench.vector(reply, "qvel", robot), data.qvel[robot.layout.qvel_adr]) for robot in bench.robots
     )
@@ -128,8 +129,9 @@ async def observations(bench: Bench) -> None:
     model, data = _local(bench)
     values = _inputs(bench, bench.robot)
     data.ctrl[bench.robot.layout.ctrl_adr] = values
-    reply = await bench.wire.ask("step", observations="standard", **_idle(bench, bench.robot, values))
-    mujoco.mj_step(model, data)
+    fields = _idle(bench, bench.robot, values)
+    reply = await bench.wire.ask("step", n_steps=_SUBSTEPS, observations="standard", **fields)
+    mujoco.mj_step(model, data, nstep=_SUBSTEPS)
     same("ctrl", values, bench.vector(reply, "ctrl"), 0.0)
     same("length of act", len(values), len(bench.vector(reply, "act")))
     for robot in bench.robots:

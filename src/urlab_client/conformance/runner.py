@@ -111,7 +111,10 @@ async def run(bench: Bench, choice: Choice, progress: Progress = _unseen) -> Rep
     try:
         for group in Group:
             chosen = [check for check in wanted if check.group is group and not check.last]
-            obstacle = await _begin(bench, group, choice, chosen)
+            obstacle, differs = await _begin(bench, group, choice, chosen)
+            if differs:
+                title, statements = f"The {group} checks can begin", _BEGINNING[group]
+                results.append(CheckResult(title, statements, group, Verdict.DIFFERS, obstacle))
             for check in chosen:
                 if obstacle or stopped:
                     result = CheckResult(check.title, check.statements, group, Verdict.NOT_TRIED, obstacle or stopped)
@@ -157,19 +160,25 @@ async def one(bench: Bench, check: Check) -> CheckResult:
     return CheckResult(check.title, check.statements, check.group, verdict, detail, (before + 1, bench.wire.count))
 
 
-async def _begin(bench: Bench, group: Group, choice: Choice, checks: Collection[Check]) -> str:
-    """Prepare the world for a group; return what stands in the way."""
+async def _begin(bench: Bench, group: Group, choice: Choice, checks: Collection[Check]) -> tuple[str, bool]:
+    """Prepare the world for a group; return what stands in the way, and whether the server answers wrongly."""
     if group not in choice.groups:
-        return f"changes the world, so it needs --{group}"
+        return f"changes the world, so it needs --{group}", False
     if not checks or group is Group.READ:
-        return ""
+        return "", False
     try:
         await (bench.play() if group is Group.PLAY else authoring.prepare(bench))
     except NotTried as reason:
-        return str(reason)
-    except (Differs, URLabError) as error:
-        return f"the {group} checks could not begin: {error}"
-    return ""
+        return str(reason), False
+    except (Differs, URLabError, LookupError, TypeError, ValueError) as error:
+        return f"the {group} checks could not begin: {error}", True
+    return "", False
+
+
+_BEGINNING: Final = {
+    Group.PLAY: ("Session 9.6", "Editor 3.2 begin_pie"),
+    Group.AUTHOR: ("Editor 3.1 create_level", "Editor 3.1 import_xml"),
+}
 
 
 async def _answers(bench: Bench) -> bool:
