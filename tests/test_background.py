@@ -44,17 +44,15 @@ AWAITED = {
     "sync/_loop.py:_cancel_all": "likewise",
     "sync/_loop.py:_main": "waits for them in bounded time, and logs their errors",
     "sync/_loop.py:_end": "likewise",
-    "console/stoppable.py:stoppable": "waits for the task and raises its error",
-    "web/recording_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
+    "console/file_jobs.py:run_job": "waits for the task and raises its error",
+    "web/file_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
     "console/recordings.py:start": "start() waits for its begin, stop() or the console's end for its end; both raise",
     "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
     "console/session.py:_keep": "waits for both tasks, and raises the error of the first",
-    "web/application.py:_live": "the task group of one connection, which ends with the error",
-    "web/application.py:_pictures": "likewise",
-    "web/application.py:_poses": "likewise",
+    "web/live.py:_converse": "the task group of one connection, which ends with the error",
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
-    "integrations/gym/threaded_batch.py:__init__": "a pool, whose results the caller reads",
-    "cli/mcp.py:_serve_stdio": "waits for the task and raises its error",
+    "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
+    "cli/mcp.py:_serve_stdio_and_console": "waits for the task and raises its error",
 }
 """Functions that make tasks or threads without the helpers, and who sees their end."""
 

@@ -121,6 +121,12 @@ def test_the_protocol_alone_needs_no_transport() -> None:
     assert "urlab_client.protocol.registry" in report["own"]
 
 
+def test_the_console_loads_no_web_framework() -> None:
+    report = after_import("urlab_client.console.session")
+    assert not {"starlette", "uvicorn", "mcp"} & set(report["modules"])
+    assert not [name for name in report["own"] if name.startswith(("urlab_client.web", "urlab_client.server"))]
+
+
 def test_the_public_names_are_the_documented_ones() -> None:
     import urlab_client
     import urlab_client.aio

@@ -165,7 +165,10 @@ class Record:
 
 
 def covering(mutant: Mutant, known: Record) -> set[str]:
-    """Return the tests that run a mutant's line; of one that runs on import, those that run lines with its names."""
+    """Return the tests that run a mutant's line; of one that runs on import, those that run lines with its names.
+
+    If none does, as of a class that others only inherit from, any test of the file may notice.
+    """
     line, statements = mutant.line, (node for node in ast.walk(ast.parse(mutant.old)) if isinstance(node, ast.stmt))
     around = [node for node in statements if node.lineno <= line <= (node.end_lineno or 0)]  # from the outside inwards
     functions = [node for node in around if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
@@ -178,7 +181,7 @@ def covering(mutant: Mutant, known: Record) -> set[str]:
     for file in sources(known.root):
         text = (known.root / file).read_text("utf-8").splitlines()
         found |= known.running(file, [number for number, words in enumerate(text, 1) if names and word.search(words)])
-    return found
+    return found or known.running(mutant.file, range(1, mutant.old.count("\n") + 1))
 
 
 def in_order(tests: Iterable[str], seconds: Mapping[str, float], ways: Mapping[str, object], limit: float) -> list[str]:
@@ -256,7 +259,7 @@ def places(code: str) -> dict[int, list[list[Callable[[], str]]]]:
         | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger"))))
         | m.If(test=m.Name("TYPE_CHECKING") | m.Comparison(left=m.Attribute(value=m.Name("sys"))))
         | m.Assign(targets=[m.AssignTarget(target=m.Name("__all__"))])
-        | m.Assign(value=m.Call(func=m.Name("TypeVar")))
+        | m.Assign(value=m.Call(func=m.Name("TypeVar") | m.Name("TypeVarTuple") | m.Name("ParamSpec")))
         | m.AnnAssign(annotation=m.Annotation(annotation=m.Name("TypeAlias")))
     )
 

@@ -23,6 +23,10 @@ ROOT_PAGES = {
     name: f"project/{name.lower()}" for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")
 }
 
+# Weight of pages in the search, by how their path begins: an answer comes before a class, a class before a list.
+_BOOSTS = {"howto/": 4.0, "quickstart": 3.0, "concepts": 2.0, "tutorials/": 2.0, "reference/": 0.5, "coverage": 0.1,
+           "promises": 0.1, "project/": 0.3}  # fmt: skip
+
 _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
 _TAB = re.compile(
     r"^<!-- tab: (?P<name>[^\n]+?) -->\n(?P<body>```.*?^```$(?:\n\n```text\n.*?^```$)?)", re.MULTILINE | re.DOTALL
@@ -51,6 +55,8 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     """Lead links to where the site has the page; take those away that lead out of it."""
     del config
     uri = page.file.src_uri
+    if boost := next((boost for start, boost in _BOOSTS.items() if uri.startswith(start)), None):
+        page.meta["search"] = {"boost": boost}
     source = next((name for name, own in ROOT_PAGES.items() if own == uri), f"docs/{uri}")
     kept: list[str] = []
     end = 0

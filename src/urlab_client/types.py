@@ -8,14 +8,12 @@ from urlab_client.aio.client_types import (
     CallOutcome,
     CallRecord,
     ClientConfig,
+    ClientObserver,
     Diagnosis,
     Finding,
     Resync,
     ServerInfo,
     Verdict,
-)
-from urlab_client.aio.observer import (
-    ClientObserver,
 )
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,

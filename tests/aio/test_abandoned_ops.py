@@ -13,7 +13,6 @@ from resting import rest
 from waiting import DEADLINE_S, gives_up
 
 from urlab_client.aio import URLabClient
-from urlab_client.aio.state.step_mode import _paused_between_steps
 from urlab_client.protocol.base import Effect
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import ControllerConfig, Delay, Faults, SimulatedServer
@@ -139,7 +138,7 @@ def mirrored(client: URLabClient) -> dict[str, Any]:
     assert arm.controller is not None
     return known | {
         "mode": str(client.step_mode),
-        "paused": _paused_between_steps(client._state),
+        "paused": client._state.mode._paused_between_steps,
         "step": client.step_count,
         "time": client.sim_time,
         "qpos": arm.qpos_array.tolist(),

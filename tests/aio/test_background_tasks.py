@@ -231,7 +231,7 @@ async def test_an_error_in_one_receiver_costs_the_others_nothing(
 ) -> None:
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()
-        monkeypatch.setattr(LiveState, "_take_over", die)
+        monkeypatch.setattr(LiveState, "_apply", die)
         async with client.state_stream("all") as states:
             for _ in range(3):
                 await states.receive(timeout=DEADLINE_S)

@@ -97,7 +97,7 @@ async def test_the_server_is_not_taken_for_lost(client: Any, scripted: Any) -> N
         call = asyncio.create_task(client.meta())
         await asyncio.sleep(0)
         scripted.request()
-        compute(connection.NOTICED_S + 0.5)
+        compute((connection.HEARTBEAT_MS + connection.SILENCE_MS) / 1000 + 0.5)
         assert await call
         assert await client.meta()
         told = list(iter(events.receive_nowait, None))

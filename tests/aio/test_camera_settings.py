@@ -72,6 +72,19 @@ async def test_a_camera_that_was_switched_off_waits_for_the_next_stream(
     await streams(beta, NEITHER)
 
 
+async def test_a_camera_stays_on_for_the_stream_that_is_left(client: URLabClient, beta: ScriptedBeta) -> None:
+    camera = client.articulations["arm_a"].cameras["wrist"]
+    other = client.articulations["arm_C_1"].cameras["wrist"]
+    async with camera.frames():
+        async with camera.frames():
+            await streams(beta, BOTH)
+        async with other.frames():
+            await streams(beta, BOTH, "arm_C_1/wrist")
+        await streams(beta, NEITHER, "arm_C_1/wrist")
+        assert beta.streaming["arm_a/wrist"] == BOTH
+    await streams(beta, NEITHER)
+
+
 async def test_background_pictures_do_not_switch_a_camera_on_again(beta: ScriptedBeta) -> None:
     async with URLabClient("tcp://127.0.0.1", step_port=beta.port) as client:
         await client.discover()

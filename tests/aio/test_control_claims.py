@@ -17,7 +17,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.aio.session.control import process_owner
 from urlab_client.errors import UnknownArticulation
 from urlab_client.protocol.messages.control import ReleaseControl
-from urlab_client.web.explained_errors import explain_error
+from urlab_client.web.endpoints import explain_error
 
 OURS = process_owner()
 

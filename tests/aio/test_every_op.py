@@ -13,11 +13,18 @@ from waiting import DEADLINE_S
 
 import urlab_client
 from urlab_client.aio import URLabClient
+from urlab_client.aio.namespaces import _ops
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.registry import OPS
 
 GENERATED = [name for name, op in OPS.items() if op.generated]
+
+
+def test_methods_are_generated_for_the_ops_that_say_so_and_no_others() -> None:
+    classes = [cls for cls in vars(_ops).values() if isinstance(cls, type) and cls.__module__ == _ops.__name__]
+    methods = [name for cls in classes for name, method in vars(cls).items() if asyncio.iscoroutinefunction(method)]
+    assert sorted(methods) == sorted(str(OPS[name].method) for name in GENERATED)
 
 
 def arguments(op: Op) -> tuple[dict[str, Any], dict[str, Any]]:

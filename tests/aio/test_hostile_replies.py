@@ -28,7 +28,7 @@ from urlab_client.aio import URLabClient, URLabPDController
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.rows import decode_row
 from urlab_client.protocol.topics import StreamTopic
-from urlab_client.server.streams.control_messages import ActuatorInfo, ControlPayload, decode_gains
+from urlab_client.server.streams.commands import StreamedSetPoints, decode_gains
 from urlab_client.values.pictures import decode_camera
 
 pytestmark = pytest.mark.mujoco("3.12")  # one of its actuators is a `pid`
@@ -590,7 +590,7 @@ def test_any_row(topic: bytes, payload: bytes) -> None:
 
 @given(st.binary(max_size=80))
 def test_any_message_of_the_other_sockets(payload: bytes) -> None:
-    for decode in (ControlPayload.decode, decode_gains, ActuatorInfo.decode):
+    for decode in (StreamedSetPoints.decode, decode_gains):
         try:
             decode(payload)
         except ProtocolError:

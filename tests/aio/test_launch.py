@@ -19,6 +19,7 @@ import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable, URLabError
 from urlab_client.aio import URLabClient, check_address, launch
 from urlab_client.aio.launch import serve_arguments, start_seconds, with_model_options
+from urlab_client.events import ServerReconnected
 
 
 def children() -> set[int]:
@@ -132,6 +133,7 @@ async def test_a_killed_server_is_noticed() -> None:
     async with URLabClient("sim://ball", step_mode="direct") as client:
         await client.discover()
         (server,) = children()
+        reconnections = client.events(kinds=[ServerReconnected])
         os.kill(server, signal.SIGKILL)
         with pytest.raises((OutcomeUnknown, ServerUnreachable)):
             await client.step(timeout=10)
@@ -141,6 +143,7 @@ async def test_a_killed_server_is_noticed() -> None:
             await client.step()
         await client.discover()
         assert (await client.step()).step == 1
+        assert (await reconnections.receive()).refused is True, "another server, not another connection"
 
 
 class LateNews:

@@ -255,3 +255,67 @@ def test_what_a_reader_raises_does_not_deafen_it() -> None:
         assert all(isinstance(context["exception"], RuntimeError) for context in told)
 
     run_bare(main())
+
+
+async def test_news_in_a_region_is_reported_once_each_time_it_is_expected() -> None:
+    news, reports = threading.Event(), list[bool]()
+
+    def report() -> None:
+        reports.append(news.is_set())
+        news.clear()
+
+    watch = transport_waiting.watch_memory(asyncio.get_running_loop(), news.is_set, report, fastest_s=1e-4)
+    assert len(watchers()) == 1
+    for _ in range(3):
+        news.set()
+        watch.expect()
+        await until(lambda: not news.is_set())
+    watch.expect()
+    watch.close()
+    assert reports == [True] * 3
+    assert not watchers()
+
+
+async def test_a_thread_that_sleeps_until_a_signal_looks_when_it_comes() -> None:
+    signal, pauses, came = threading.Event(), list[float](), asyncio.Event()
+
+    def block(seconds: float) -> None:
+        pauses.append(seconds)
+        signal.wait(DEADLINE_S)
+
+    loop = asyncio.get_running_loop()
+    watch = transport_waiting.watch_memory(loop, signal.is_set, came.set, fastest_s=1e-4, block=block)
+    watch.expect()
+    await until(lambda: pauses)
+    signal.set()
+    await asyncio.wait_for(came.wait(), DEADLINE_S)
+    watch.close()
+    assert all(1e-4 <= pause <= 5e-3 for pause in pauses)
+
+
+def test_one_thread_watches_sockets_and_regions_of_a_loop() -> None:
+    async def main() -> None:
+        loop, heard, news = asyncio.get_running_loop(), list[bytes](), threading.Event()
+        with zmq.Context() as context, context.socket(zmq.PULL) as pull, context.socket(zmq.PUSH) as push:
+            pull.bind("inproc://here")
+            push.connect("inproc://here")
+
+            def hear() -> None:
+                while pull.get(zmq.EVENTS) & zmq.POLLIN:
+                    heard.append(pull.recv())
+
+            socket_watch = transport_waiting.watch_socket(loop, pull, hear)
+            region_watch = transport_waiting.watch_memory(loop, news.is_set, news.clear, fastest_s=1e-4)
+            region_watch.expect()
+            assert len(watchers()) == 1
+            push.send(b"one")
+            await until(lambda: heard)
+            news.set()
+            await until(lambda: not news.is_set())
+            push.send(b"two")
+            await until(lambda: len(heard) == 2)
+            socket_watch.close()
+            region_watch.close()
+        assert not watchers()
+
+    run_bare(main())

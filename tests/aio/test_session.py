@@ -91,7 +91,7 @@ async def test_a_reply_that_came_before_the_line_broke_counts(client: Any, scrip
     await until(scripted.held.qsize)
     transport = client._transport
     scripted.release(PAUSED)
-    assert transport._socket.poll(round(1e3 * DEADLINE_S))  # the loop stands still
+    assert transport._open.connection.socket.poll(round(1e3 * DEADLINE_S))  # the loop stands still
     transport._note(zmq.Event.DISCONNECTED, 0, None)
     assert not client.connected
     assert await call is True

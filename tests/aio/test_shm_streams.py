@@ -19,12 +19,12 @@ from written_region import WrittenRegion, create
 
 from urlab_client._platform.processors import processor_fence
 from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import CameraMode
 from urlab_client.protocol import shm
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
-from urlab_client.values.pictures import PictureMemory
 
 STATE = b"state/full"
 WIDTH, HEIGHT = 32, 24
@@ -36,17 +36,13 @@ def snapshot(time: float) -> bytes:
     return msgspec.msgpack.encode(fields | {"per_articulation": {}, "entities": {}})
 
 
-class Camera:
-    name = "eye"
-    memory = PictureMemory()
-    mode: CameraMode | str = CameraMode.REAL
-    info = CameraInfo(
-        mode="real",
-        resolution=(WIDTH, HEIGHT),
-        fovy=45.0,
-        zmq_endpoint="tcp://127.0.0.1:9",
-        zmq_topic="arm/camera/eye",
-    )
+INFO = CameraInfo(
+    mode="real",
+    resolution=(WIDTH, HEIGHT),
+    fovy=45.0,
+    zmq_endpoint="tcp://127.0.0.1:9",
+    zmq_topic="arm/camera/eye",
+)
 
 
 def picture(value: int) -> bytes:
@@ -94,8 +90,9 @@ def states(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
     return Stream(publishers.state(policy), policy=policy, default_timeout=DEADLINE_S)
 
 
-def frames(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
-    return Stream(publishers.camera(Camera(), policy), policy=policy, default_timeout=DEADLINE_S)
+def frames(publishers: Publishers, policy: str = "latest", *, camera: Camera | None = None) -> Stream[Any]:
+    source = publishers.camera(camera or Camera("eye", INFO), policy)
+    return Stream(source, policy=policy, default_timeout=DEADLINE_S)
 
 
 async def test_state_comes_from_the_region(publishers: Publishers, state_region: WrittenRegion) -> None:
@@ -250,12 +247,10 @@ async def test_a_picture_read_in_place_of_the_one_before_does_not_come_twice(
             await stream.receive(timeout=0.05)
 
 
-async def test_no_torn_picture_is_handed_out(
-    publishers: Publishers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_no_torn_picture_is_handed_out(publishers: Publishers, tmp_path: Path) -> None:
     # So large that the interpreter lets the writer on in the midst of a conversion.
     size = (800, 600)
-    monkeypatch.setattr(Camera, "info", msgspec.structs.replace(Camera.info, resolution=size))
+    camera = Camera("eye", msgspec.structs.replace(INFO, resolution=size))
     region = WrittenRegion(tmp_path / "cam_arm_eye.shm", shm.camera_stride(*size))
     pictures = [bytes([value, value + 1, value + 2, 0]) * (size[0] * size[1]) for value in range(16)]
     stop, taken = threading.Event(), threading.Event()
@@ -272,7 +267,7 @@ async def test_no_torn_picture_is_handed_out(
     writer = threading.Thread(target=hammer)
     writer.start()
     try:
-        async with frames(publishers) as stream:
+        async with frames(publishers, camera=camera) as stream:
             for _ in range(100):
                 pixels = (await stream.receive()).pixels
                 taken.set()
@@ -287,7 +282,7 @@ async def test_no_torn_picture_is_handed_out(
 async def test_a_shared_frame_says_when_it_was_overwritten(
     publishers: Publishers, camera_region: WrittenRegion
 ) -> None:
-    camera = Camera()
+    camera = Camera("eye", INFO)
     assert publishers.shared_frame(camera) is None
     camera_region.publish(picture(5))
     async with frames(publishers) as stream:

@@ -212,6 +212,20 @@ async def test_a_handshake_that_ran_into_its_deadline_is_not_somebody_else(clien
     assert reply.per_articulation["arm"].bodies is None, "at this client's level"
 
 
+async def test_a_step_in_the_session_of_a_cancelled_handshake_shows_the_mode(
+    client: URLabClient, served: tuple[SimulatedServer, Faults], faults: Faults
+) -> None:
+    assert client.step_mode == "direct"
+    async with URLabClient(**served[0].client_options() | {"step_mode": "auto"}) as user:
+        await user.discover()
+        late = faults.add(Delay("hello", seconds=0.1, times=1))
+        discovering = asyncio.create_task(user.discover())
+        await until(lambda: late.applied)
+        await cancelled(discovering)
+        assert (await user.step(1)).step == 1
+        assert user.step_mode == "direct"
+
+
 async def test_a_handshake_lost_with_its_connection_is_named(client: URLabClient, faults: Faults) -> None:
     cut = faults.add(Cut("hello", times=1))
     discovering = asyncio.create_task(client.discover())

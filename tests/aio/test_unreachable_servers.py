@@ -77,7 +77,7 @@ async def test_a_request_is_not_left_in_a_queue_for_a_later_server(client: Any, 
         scripted.request()
     scripted.close()
     # The connection is gone, and the client, whose loop did not run, does not know it yet.
-    eventually(lambda: not client._transport._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)
+    eventually(lambda: not client._transport._open.connection.socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)
     assert client.connected
     call = asyncio.create_task(client.reset(timeout=DEADLINE_S))
     await asyncio.sleep(0)

@@ -12,7 +12,7 @@ from waiting import DEADLINE_S, until
 
 from urlab_client.cli import serve as serve_command
 from urlab_client.cli._pages import bound, serve
-from urlab_client.cli.serve import Event, Events, Starter, next_event, watch_input
+from urlab_client.cli.serve import Event, Events, next_event, start_aside, watch_input
 
 
 def die(*_: Any) -> Any:
@@ -24,10 +24,10 @@ def test_the_thread_that_starts_a_server() -> None:
         start = die
 
     events: Events = queue.SimpleQueue()
-    starter = Starter(Deadly(), events)  # type: ignore[arg-type]
-    assert starter.thread.name == "urlab-start"
-    assert next_event(events) is Event.STARTED
-    assert isinstance(starter.error, SystemExit)
+    thread = start_aside(Deadly(), events)  # type: ignore[arg-type]
+    assert thread.name == "urlab-start"
+    with pytest.raises(SystemExit, match="enough"):
+        next_event(events)
 
 
 def test_the_thread_that_waits_for_the_end_of_input(

@@ -81,7 +81,40 @@ def test_the_robots_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(Path(robot["path"]).is_file() for robot in listed)
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("urlab pi", ["ping"]),
+        ("urlab run", ["run-policy"]),
+        ("urlab serve --step-", ["--step-port", "--step-mode"]),
+        ("urlab serve arm --step-mode p", ["puppet"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_values(tmp_path: Path, line: str, words: list[str]) -> None:
+    found = tmp_path / "found"
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    asked["_ARGCOMPLETE_STDOUT_FILENAME"] = str(found)
+    command = [sys.executable, "-m", "urlab_client"]
+    done = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    assert [word.strip() for word in found.read_text().splitlines()] == words
+
+
+def test_help_shows_what_the_option_shows(capsys: pytest.CaptureFixture[str]) -> None:
+    shown: list[str] = []
+    for arguments in (["help", "ping"], ["ping", "--help"], ["help"], ["--help"]):
+        with pytest.raises(SystemExit) as exited:
+            main(arguments)
+        assert exited.value.code == 0
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1] != shown[2] == shown[3]
+    assert shown[0].startswith("usage: urlab ping")
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["-V"])
+    assert version("urlab-client") in capsys.readouterr().out
     with pytest.raises(SystemExit) as end:
         main(["--version"])
     assert end.value.code == 0

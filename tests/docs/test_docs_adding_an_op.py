@@ -69,7 +69,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_page_has_all_kinds_of_steps() -> None:
     assert {kind: len(of(kind)) for kind in ("append", "insert", "shows", "use")} == {
         "append": 2,
-        "insert": 3,
+        "insert": 2,
         "shows": 2,
         "use": 1,
     }

@@ -94,7 +94,11 @@ def test_every_field_of_an_op_has_a_row_with_type_default_and_meaning(op: Any) -
         assert all(len(row) == 4 and all(cell.strip() for cell in row) for row in table)
 
 
-PUBLIC = ("urlab_client", "urlab_client.aio", "urlab_client.sync", "urlab_client.server", *gen_docs.around())
+PUBLIC = (
+    "urlab_client",
+    *(f"urlab_client.{name}" for name in ("aio", "enums", "events", "server", "sync", "types")),
+    *gen_docs.around(),
+)
 
 
 @pytest.mark.parametrize("module", PUBLIC)

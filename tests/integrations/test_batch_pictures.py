@@ -12,7 +12,7 @@ import pytest
 
 from urlab_client.enums import CameraMode
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
-from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
+from urlab_client.integrations.gym.engines import ThreadedBatch
 from urlab_client.randomise import Randomisation, Vary
 from urlab_client.server import SimulatedServer
 

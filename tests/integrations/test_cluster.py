@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import secrets
@@ -17,6 +18,7 @@ from typing import Any
 import anyio.to_thread
 import numpy as np
 import pytest
+from waiting import DEADLINE_S, until
 
 from urlab_client import URLabClient
 from urlab_client.errors import LeaseBusy
@@ -248,6 +250,114 @@ def test_tasks_give_the_same_episodes_and_are_run_again_by_ray(expected: dict[in
     assert gone(tmp_path / "killed")
 
 
+def ends_its_server_once(notes: Path) -> Any:
+    """Return a policy that kills its server in the first attempt and notes the process id of each attempt's worker."""
+    name = str(notes)
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        seen = Path(name).read_text().split() if Path(name).exists() else []
+        if not seen:
+            children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
+            for pid in "".join(children).split():
+                os.kill(int(pid), 9)
+        if len(seen) < 2:
+            Path(name).write_text(" ".join([*seen, str(os.getpid())]))
+        return np.zeros(7)
+
+    return policy
+
+
+def test_an_episode_whose_server_died_runs_again_on_a_new_one(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import rollouts
+
+    policy = ends_its_server_once(tmp_path / "workers")
+    (episode,) = rollouts(policy, "sim://arm", 1, n_workers=1, retries=1, **OPTIONS)
+    assert episode.attempt == 2
+    first, second = (tmp_path / "workers").read_text().split()
+    assert first == second, "the worker itself stays"
+
+
+def test_a_worker_keeps_its_server_for_equal_episodes_and_not_beyond_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    from urlab_client.cluster.episodes import Job, Setup, Worker
+    from urlab_client.errors import ConnectionLost, UnknownActor
+
+    monkeypatch.setattr(Worker, "node_id", lambda _: "here")
+    job = Job(id=3, seed=1, scene="sim://arm", attempt=2, holder="", leases=None)
+    setup, other = (Setup.of({"max_episode_steps": steps}, {}, lease_timeout=1.0) for steps in (2, 3))
+    worker = Worker()
+
+    def steps(setup: Any = setup, error: Exception | None = None) -> Any:
+        def policy(observation: Any, rng: np.random.Generator) -> Any:
+            if error is not None:
+                raise error
+            return np.zeros(7)
+
+        return worker.run(policy, setup, job)
+
+    try:
+        episode = steps()
+        assert (episode.id, episode.seed, episode.attempt, episode.node_id) == (3, 1, 2, "here")
+        assert (episode.scene, episode.address, episode.pid) == ("sim://arm", "sim://arm", os.getpid())
+        assert (len(episode.actions), episode.terminated, episode.truncated) == (2, False, True)
+        kept = worker._env
+        steps()
+        assert worker._env is kept
+        with pytest.raises(UnknownActor):
+            steps(error=UnknownActor("unknown_actor", "refused"))
+        assert worker._env is kept, "a refusal says nothing against the server"
+        assert len(steps(other).actions) == 3
+        assert worker._env is not kept
+        with pytest.raises(ConnectionLost):
+            steps(other, ConnectionLost("gone"))
+        assert worker._env is None
+    finally:
+        worker.close()
+
+
+async def test_addresses_pass_from_holder_to_holder(monkeypatch: pytest.MonkeyPatch) -> None:
+    from urlab_client.cluster import leases
+
+    now = 100.0
+    monkeypatch.setattr(leases, "time", SimpleNamespace(monotonic=lambda: now))
+    book = leases.Book(["a", "b"], ttl=30.0)
+    assert [await book.take(holder, 60.0) for holder in ("one", "two")] == ["a", "b"]
+    assert await book.take("late", 0.0) is None
+    third, fourth = (asyncio.create_task(book.take(holder, 60.0)) for holder in ("three", "four"))
+    await until(lambda: book._waiting == {"three", "four"})
+    await book.give_back("one")
+    assert await third == "a"
+    await book.give_back("four")
+    assert await fourth is None, "nobody waits for one that is ended"
+    assert await book.holders() == {"a": "three", "b": "two"}
+    now = 125.0
+    assert await book.renew("three")
+    now = 130.0
+    assert await book.holders() == {"a": "three", "b": None}
+    assert not await book.renew("two")
+    assert await book.take("five", 60.0) == "b"
+    await book.give_back("two")
+    assert await book.holders() == {"a": "three", "b": "five"}, "what an earlier holder gives back is no longer its own"
+    assert await book.server_lease("a") is None
+    await book.note_server_lease("a", "first")
+    await book.note_server_lease("a", "second")
+    assert (await book.server_lease("a"), await book.server_lease("b")) == ("second", None)
+
+
+async def test_an_address_whose_lease_expires_goes_to_whoever_waits() -> None:
+    from urlab_client.cluster.leases import Book
+
+    book = Book(["a"], ttl=0.02)
+    assert [await book.take(holder, DEADLINE_S) for holder in ("one", "two")] == ["a", "a"]
+
+
+def test_a_cluster_that_cannot_place_a_worker_is_not_waited_for(cluster: Any) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    nowhere = {"resources": {"a thing that no node has": 1}}
+    with pytest.raises(RolloutError, match=r"placed no worker within 0\.1 s.*It has .*worker_options"):
+        list(rollouts(noisy(), "sim://arm", 1, worker_options=nowhere, start_timeout=0.1, **OPTIONS))
+
+
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
 def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path, dialect: Any) -> None:
     from urlab_client.cluster import LeaseLost, LeasePool, rollouts
@@ -451,7 +561,7 @@ def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dic
         import ray
 
         if ray.get_runtime_context().get_node_id() == victim_id:
-            os.close(os.open(fifo, os.O_RDONLY))  # waits here until the node is removed
+            Path(fifo).read_text()  # waits here until the node is removed
         return inner(observation, rng)
 
     with WorkerPool(2) as workers:

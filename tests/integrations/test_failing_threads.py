@@ -109,10 +109,12 @@ async def test_the_tasks_that_feed_a_view(client: URLabClient, monkeypatch: pyte
 
     monkeypatch.setattr(Follower, "_follow_states", fail)
     options = ViewOptions(cameras=(), camera_hz=10.0, max_hz=100.0, contacts=False)
-    async with AsyncView(client, Fine(), options, "view") as view:
+    display = Fine()
+    async with AsyncView(client, display, options, "view") as view:
         await until(lambda: view.closed)
         assert isinstance(view.error, URLabError)
         assert isinstance(view.error.__cause__, MemoryError)
+        await until(lambda: display.closed)  # although the block goes on
 
 
 def test_the_thread_that_draws_for_a_batch(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:

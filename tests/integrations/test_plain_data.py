@@ -41,7 +41,6 @@ from urlab_client.values.types import CameraPose, SimOptions
 
 # What transports and robots are sent; no call returns any of it.
 SENT = (Request, Header, Publication, StreamTopic)
-SENT_MODULE = "urlab_client.server.streams.control_messages"
 
 
 def structs() -> list[type[Struct]]:
@@ -50,7 +49,7 @@ def structs() -> list[type[Struct]]:
     for module in pkgutil.walk_packages(urlab_client.protocol.__path__, "urlab_client.protocol."):
         members = vars(importlib.import_module(module.name)).values()
         found |= {kind for kind in members if isinstance(kind, type) and issubclass(kind, Struct)}
-    returned = {kind for kind in found - {Struct} if not issubclass(kind, SENT) and kind.__module__ != SENT_MODULE}
+    returned = {kind for kind in found - {Struct} if not issubclass(kind, SENT)}
     return sorted((kind for kind in returned if not kinds_of(kind)), key=lambda kind: kind.__name__)
 
 

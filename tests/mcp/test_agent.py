@@ -99,6 +99,9 @@ async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
         "look", "state", "picture", "contacts", "explain", "log",
     }  # fmt: skip
     assert {name for name, hint in hints.items() if hint and hint.destructive_hint} == {"reset", "play", "remove"}
+    assert {name for name, hint in hints.items() if hint and not hint.idempotent_hint} == {
+        "log", "run", "record", "import_model", "spawn",
+    }  # fmt: skip
 
 
 async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> None:
@@ -360,9 +363,9 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
                 assert "play with action='start'" in await one.refused(tool, **arguments)
             await one.call("play", action="start")
             await one.call("state", robot="arm")
-            assert one.console.feed("arm/wrist") is not None
+            assert one.console.cameras.feed("arm/wrist") is not None
             await one.call("remove", actor="arm")
-            await until(lambda: not one.console._feeds)  # nor is the robot kept by its pictures
+            await until(lambda: not one.console.cameras._feeds)  # nor is the robot kept by its pictures
 
 
 @pytest.mark.opengl

@@ -51,10 +51,12 @@ async def test_the_progress_of_a_call(caplog: pytest.LogCaptureFixture, monkeypa
     class Controls:
         running = False
 
+    class View:
+        def notify(self) -> None: ...
+
     class Console:
         controls = Controls()
-
-        def tell(self) -> None: ...
+        view = View()
 
     monkeypatch.setattr(Call, "_report", fail)
     call = object.__new__(Call)

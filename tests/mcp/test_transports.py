@@ -48,6 +48,37 @@ async def test_an_agent_starts_the_command_and_drives(tmp_path: Path) -> None:
     assert "?token=" in lines[0]
 
 
+WEB = """
+import builtins, sys
+importing, asked = builtins.__import__, set()
+
+def note(name, globals=None, *arguments):
+    asking = (globals or {}).get("__name__", "")
+    if name.partition(".")[0] in ("starlette", "uvicorn") and asking.startswith("urlab_client"):
+        asked.add(asking)
+    return importing(name, globals, *arguments)
+
+builtins.__import__ = note
+from urlab_client.cli import main
+assert main(["mcp", "sim://arm", "--no-console"]) == 0
+print(sorted(asked), [name for name in sys.modules if name.startswith("urlab_client.web")])
+"""
+
+
+def test_standard_streams_alone_load_no_web_framework(tmp_path: Path) -> None:
+    # The SDK imports Starlette for its other transport; nothing of this package does.
+    done = subprocess.run(
+        [sys.executable, "-c", WEB],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[] []\n", "")
+
+
 @pytest.mark.long
 def test_the_command_ends_with_its_input(tmp_path: Path) -> None:
     done = subprocess.run(

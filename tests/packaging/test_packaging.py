@@ -208,7 +208,7 @@ def test_the_doctor_names_a_package_in_the_way(venv: Path, rival: Path, tmp_path
 
 
 def test_a_broken_import_names_the_package_in_the_way(venv: Path, rival: Path, tmp_path: Path) -> None:
-    file = rival / "urlab_client" / "aio" / "session.py"
+    file = rival / "urlab_client" / "aio" / "session" / "session.py"
     own = file.read_bytes()
     command = [venv / PROGRAMS / "python", "-c", "from urlab_client import URLabClient"]
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -54,6 +55,13 @@ def described(annotation: Any) -> bool:
     if get_origin(annotation) is Annotated:
         return any(isinstance(extra, msgspec.Meta) and extra.description for extra in get_args(annotation)[1:])
     return get_origin(annotation) in {Union, UnionType} and any(map(described, get_args(annotation)))
+
+
+@pytest.mark.parametrize("name", OPS)
+def test_every_field_is_given_by_its_name(name: str) -> None:
+    """A field that is added anywhere changes no caller."""
+    for struct in (OPS[name].request, OPS[name].reply):
+        assert {one.kind for one in inspect.signature(struct).parameters.values()} <= {inspect.Parameter.KEYWORD_ONLY}
 
 
 @pytest.mark.parametrize("name", OPS)

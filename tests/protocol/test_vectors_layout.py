@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 import vectors
@@ -18,14 +21,7 @@ from urlab_client.enums import CameraMode
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol import rows, shm
 from urlab_client.protocol.topics import StreamTopic, TopicKind
-from urlab_client.server.streams.control_messages import (
-    ActuatorInfo,
-    ControlPayload,
-    JointGains,
-    decode_gains,
-    encode_gains,
-    gains_by_parameter,
-)
+from urlab_client.server.streams.commands import Actuators, CameraEndpoint, StreamedSetPoints, decode_gains
 from urlab_client.values.pictures import decode_camera, encode_camera
 
 # What the codec, not these layouts, is responsible for.
@@ -73,8 +69,11 @@ SENSOR = Golden(
     TopicKind.SENSOR,
 )
 CONTROL = Golden(
-    ControlPayload.decode,
-    ControlPayload.encode,
+    StreamedSetPoints.decode,
+    lambda payload: (
+        struct.pack("<i", len(payload.values))
+        + b"".join(map(struct.Struct("<if").pack, payload.actuator_ids, payload.values))
+    ),
     lambda payload: {
         "n": payload.values.size,
         "entries": [
@@ -199,27 +198,23 @@ def test_set_gains() -> None:
     topic, payload = vector.frames
     assert StreamTopic.parse(topic) == StreamTopic(TopicKind.SET_GAINS, "g1")
     assert StreamTopic.parse(topic).encode() == topic
-    gains = decode_gains(payload)
-    assert gains_by_parameter(gains) == vector.decoded["reshaped"]
-    assert (
-        encode_gains(
-            {
-                "left_knee": JointGains(kp=320.0, kv=6.5),
-                "waist": JointGains(torque_limit=35),
-            }
-        )
-        == payload
-    )
-    assert decode_gains(encode_gains(gains)) == gains
+    assert decode_gains(payload) == vector.decoded["reshaped"]
 
 
 def test_info() -> None:
     vector = vectors.load("msg_info")
-    (frame,) = vector.frames
-    info = ActuatorInfo.decode(frame)
-    assert json.loads(info.encode()) == vector.decoded
-    assert info.ids.tolist() == vector.decoded["ids"]
-    assert [(camera.name, camera.endpoint) for camera in info.cameras] == [("head", "tcp://0.0.0.0:5558")]
+    ranges = {3: ' ctrlrange="-1.5 1.5"'}
+    motors = "".join(f'<motor joint="j"{ranges.get(number, "")}/>' for number in range(12))
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
+    )
+    index = SimpleNamespace(
+        key="g1", prefix="g1_", actuators=np.array([3, 11], np.int32), actuator_names=("left_knee", "waist")
+    )
+    robot: Any = SimpleNamespace(index=index)
+    info = Actuators(model, [robot]).info(robot, [CameraEndpoint("head", "tcp://0.0.0.0:5558")])
+    assert json.loads(info) == vector.decoded
 
 
 @pytest.mark.parametrize("name", ["camera_peer_header_v1", "camera_peer_header_v2"])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from urlab_client.randomise import Delay, Push, Randomisation, Vary
-from urlab_client.randomise.declaration import QUANTITIES
+from urlab_client.randomise.quantities import QUANTITIES
 from urlab_client.randomise.variation import Variation, field_of
 
 MODEL = """

@@ -6,15 +6,13 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numpy as np
 import pytest
 import zmq
 from beta_bench import ME, OTHER, Bench, Clock
 from waiting import eventually
-from wire import Wire
+from wire import Wire, set_points
 
-from urlab_client.server.session import DriverLease
-from urlab_client.server.streams.control_messages import ControlPayload
+from urlab_client.server.core import DriverLease
 
 # Claims.
 
@@ -30,7 +28,7 @@ def test_streamed_controls_of_a_robot_with_an_owner_are_dropped(bench: Bench) ->
         wanted = f"{bench.b}/control ".encode()
         eventually(lambda: publisher.recv() == b"\x01" + wanted, look=0)
         for actuator in (0, 1):  # the owned robot's first
-            payload = ControlPayload(np.array([actuator]), np.array([0.5], np.float32)).encode()
+            payload = set_points({actuator: 0.5})
             publisher.send_multipart([wanted, payload])
         for reply in bench.wire.until("step"):
             if reply["arts"][bench.b]["ctrl"] == [0.5]:

@@ -15,7 +15,7 @@ from wire import Wire
 from urlab_client.server import SimulatedServer
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 
 
 def test_jobs(bench: Bench, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +16,8 @@ from wire import Wire
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render.camera_renderer import CameraRenderer
+from urlab_client.server.streams import camera_streams
+from urlab_client.values.pictures import camera_header
 
 ROBOT = """
 <mujoco model="robot">
@@ -143,6 +146,36 @@ def test_images_go_on_after_one_that_failed(
     assert socket.recv_multipart()[0] == b"robot/camera/wrist "
     assert "no room for pixels" in caplog.text
     assert server.failure is None
+
+
+@pytest.mark.opengl
+def test_an_image_that_fails_costs_the_other_cameras_nothing(
+    robot: Path,
+    connect: Callable[[SimulatedServer], Wire],
+    subscribe: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def header(number: int, sim_time: float, width: int, height: int, captured: float) -> bytes:
+        if width == 16:
+            raise struct.error("no header for this one")
+        return camera_header(number, sim_time, width, height, captured)
+
+    monkeypatch.setattr(camera_streams, "camera_header", header)
+    with SimulatedServer(robot, play=True, dialect="beta") as server:
+        wire = connect(server)
+        wire.hello()
+        wire.ask("set_mode", mode="direct")
+        on = {name: {"zmq": True} for name in ("robot/wrist", "robot/far")}
+        told = wire.ask("set_camera_streaming", cameras=on)["cameras"]
+        wrist, far = (subscribe(told[name]["zmq_endpoint"], f"{name} ") for name in on)
+        while "no header for this one" not in caplog.text:  # from here on, both cameras have a subscriber
+            wire.ask("step")
+            assert far.recv_multipart()[0] == b"robot/far "
+        wire.ask("step")
+        assert far.recv_multipart()[0] == b"robot/far "
+        assert not wrist.poll(0)
+    assert "an image of 'robot/wrist' is not published" in caplog.text
 
 
 @pytest.mark.opengl

@@ -88,7 +88,7 @@ def test_parts_are_convex_cover_the_mesh_and_come_out_the_same_again(tmp_path: P
 
 
 def test_without_the_library_it_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("editor.quick_convert", "assets.level"):
+    for module in ("editor.world", "assets.level"):
         monkeypatch.setattr(f"urlab_client.server.{module}.is_available", lambda: False)
     with pytest.raises(ModelError, match=r"\[coacd\]"), SimulatedServer(level(tmp_path, complex_mesh=True)):
         pass

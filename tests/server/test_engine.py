@@ -23,7 +23,7 @@ from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.handlers.runtime import parse_control_source, parse_mode
 from urlab_client.server.physics import engine as engine_module
-from urlab_client.server.physics import pacing
+from urlab_client.server.physics import scheduling
 from urlab_client.server.physics.controllers import ControlSource
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.refusal import Refusal
@@ -207,7 +207,7 @@ class PacedSim:
     """A live engine without its thread, driven through simulated seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, clock: FakeClock) -> None:
-        for module in (engine_module, pacing):
+        for module in (engine_module, scheduling):
             monkeypatch.setattr(module, "time", clock)
         self.clock = clock
         self.engine = Engine(make_scene(bot=BOT), paused=False)

@@ -21,7 +21,7 @@ from mangling import FACTOR, golden_replies, golden_requests, mutated, strange
 from samples import filled
 from scenes import hasty
 from waiting import attempts
-from wire import Wire, pack
+from wire import Wire, pack, set_points
 
 from urlab_client import URLabRPCError
 from urlab_client.errors import RPC_ERRORS, ProtocolError
@@ -35,7 +35,7 @@ from urlab_client.server import ControllerConfig, Limits, SimulatedServer
 from urlab_client.server.dialects import ALPHA, DIALECTS
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
-from urlab_client.server.streams.control_messages import ActuatorInfo, ControlPayload, decode_gains
+from urlab_client.server.streams.commands import StreamedSetPoints, decode_gains
 
 FRAMES = 2_000 * FACTOR
 """For each direction of the codec."""
@@ -79,10 +79,10 @@ def test_stream_payloads_are_read_or_raise_what_callers_expect() -> None:
     numbers = np.arange(12, dtype="<f4").tobytes()
     golden = [
         numbers, numbers[:16], numbers[:4], pack({"joint": {"kp": 1.0}}), b'{"joint":{"kp":1.0}}',
-        ControlPayload(np.array([1, 2]), np.array([0.5, 1.0])).encode(), b"bot actuator a:0:-1:1|b:1:0:2",
+        set_points({1: 0.5, 2: 1.0}), b"bot actuator a:0:-1:1|b:1:0:2",
     ]  # fmt: skip
     kinds = [kind for kind in TopicKind if kind is not TopicKind.SET_GAINS]
-    readers: list[Callable[[bytes], Any]] = [ControlPayload.decode, decode_gains, ActuatorInfo.decode]
+    readers: list[Callable[[bytes], Any]] = [StreamedSetPoints.decode, decode_gains]
 
     def reader_of(kind: TopicKind) -> Callable[[bytes], Any]:
         return lambda payload: decode_row(StreamTopic(kind, "bot", "x"), payload)

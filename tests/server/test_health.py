@@ -23,7 +23,7 @@ from urlab_client.protocol.messages.scene import CreateLevelOk
 from urlab_client.server import CurveServer, Drop, Faults, SimulatedServer
 from urlab_client.server.physics.play import Play
 from urlab_client.server.rpc.dispatch import HANDLERS
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.server.transport.curve_authentication import CurveKeys
 
 

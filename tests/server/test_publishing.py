@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 from waiting import attempts, eventually
-from wire import Wire, check_numbers, float32, server_threads, write_level
+from wire import Wire, check_numbers, float32, server_threads, set_points, write_level
 
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
@@ -23,7 +23,6 @@ from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server import SimulatedServer
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.streams import broadcast, publishing
-from urlab_client.server.streams.control_messages import ControlPayload, encode_gains
 from urlab_client.server.transport.endpoint import bound_peers
 from urlab_client.simulation.controller_config import ControllerConfig
 
@@ -292,6 +291,22 @@ def test_without_articulations_there_are_no_rows(play: Play, tmp_path: Path) -> 
     assert len(snapshot(tick).entities) == 1
 
 
+def test_a_message_that_fails_costs_the_others_nothing(
+    play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_: JointRow) -> bytes:
+        raise ValueError("no such row")
+
+    monkeypatch.setattr(JointRow, "encode", fail)
+    bench = play("bot", unpaused=True)
+    socket = bench.subscribe(b"")
+    tick = next(ticks(socket))
+    assert [topic for topic, _ in tick] == [*(row for row in ROWS if row != b"bot/joint/j"), b"state/full"]
+    assert snapshot(tick).per_articulation.keys() == {"bot"}
+    assert "no such row" in caplog.text
+    assert bench.server.failure is None
+
+
 # What it costs
 
 
@@ -359,7 +374,7 @@ def test_closing_does_not_wait_for_subscribers(play: Play) -> None:
 
 def test_streamed_set_points_reach_the_actuators_by_global_id(play: Play) -> None:
     bench = play()
-    payload = ControlPayload(np.array([99, 0, -1]), np.array([5.0, 0.1, 7.0], np.float32)).encode()
+    payload = set_points({99: 5.0, 0: 0.1, -1: 7.0})
     bench.control().send_multipart([b"bot/control ", payload + b"surplus"])
     for reply in bench.wire.until("forward"):
         (ctrl,) = reply["per_articulation"]["bot"]["ctrl"]
@@ -372,7 +387,7 @@ def test_ids_are_global_whatever_the_topic_says(play: Play, models: Path) -> Non
     bench = play("bot", "limited")
     publisher = bench.open(zmq.XPUB, bench.server.ctrl_port)
     assert len({publisher.recv() for _ in range(4)}) == 4
-    payload = ControlPayload(np.array([1]), np.array([0.5], np.float32)).encode()
+    payload = set_points({1: 0.5})
     publisher.send_multipart([b"bot/control ", payload])
     for reply in bench.wire.until("forward"):
         if reply["per_articulation"]["copy1_bot"]["ctrl"] == [0.5]:
@@ -388,7 +403,7 @@ def test_an_actuator_of_several_inputs_takes_its_first_by_id(play: Play, tmp_pat
     publisher = bench.open(zmq.XPUB, bench.server.ctrl_port)
     assert len({publisher.recv() for _ in range(4)}) == 4
     ids = np.arange(1, 6)
-    publisher.send_multipart([b"multi/control ", ControlPayload(ids, ids.astype(np.float32)).encode()])
+    publisher.send_multipart([b"multi/control ", set_points({int(number): float(number) for number in ids})])
     for reply in bench.wire.until("forward"):
         ctrl = {key: state["ctrl"] for key, state in reply["per_articulation"].items()}
         if ctrl["multi"][4]:
@@ -406,7 +421,7 @@ def test_set_points_streamed_outside_live_mode_are_lost(play: Play, caplog: pyte
     next(stream)
     publisher = bench.control()
     with caplog.at_level(logging.WARNING, "urlab_client.server"):
-        publisher.send_multipart([b"bot/control ", ControlPayload(np.array([0]), np.array([0.5])).encode()])
+        publisher.send_multipart([b"bot/control ", set_points({0: 0.5})])
         publisher.send_multipart([b"bot/control ", b"\x05"])
         assert next(True for _ in bench.wire.until("pie_status") if "control message is ignored" in caplog.text)
     # A snapshot made after that was published after the commands were dealt with.
@@ -433,7 +448,7 @@ def test_a_bad_message_disturbs_nothing(play: Play, frames: list[bytes]) -> None
     bench = play()
     publisher = bench.control()
     publisher.send_multipart(frames)
-    publisher.send_multipart([b"bot/control ", ControlPayload(np.array([0]), np.array([0.5])).encode()])
+    publisher.send_multipart([b"bot/control ", set_points({0: 0.5})])
     assert next(True for reply in bench.wire.until("forward") if reply["per_articulation"]["bot"]["ctrl"] == [0.5])
 
 
@@ -446,8 +461,8 @@ def test_of_too_many_commands_that_wait_for_physics_the_oldest_go(play: Play, mo
     commands = [(1, 0.9), (0, 0.1), (0, 0.2), (0, 0.3)]
     with bench.engine.lock:
         for actuator, value in commands:
-            payload = ControlPayload(np.array([actuator]), np.array([value]))
-            publisher.send_multipart([b"bot/control ", payload.encode()])
+            payload = set_points({actuator: value})
+            publisher.send_multipart([b"bot/control ", payload])
         eventually(lambda: len(waiting) == 3 and waiting[-1].values[0] == np.float32(0.3))
     for reply in bench.wire.until("forward"):
         ctrl = {key: state["ctrl"] for key, state in reply["per_articulation"].items()}
@@ -459,7 +474,7 @@ def test_of_too_many_commands_that_wait_for_physics_the_oldest_go(play: Play, mo
 def test_streamed_gains_reach_the_controller(play: Play) -> None:
     bench = play(controllers={"*": ControllerConfig()})
     gains = {"m": {"kp": 7.0, "torque_limit": 0.1}}
-    bench.control().send_multipart([b"bot/set_gains ", encode_gains(msgspec.convert(gains, dict[str, Any]))])
+    bench.control().send_multipart([b"bot/set_gains ", msgspec.json.encode(gains)])
     for reply in bench.wire.until("configure_controller", articulation="bot", params={}):
         if reply["params"]["kp"] == {"m": 7.0}:
             assert reply["params"]["torque_limit"] == {"m": float32(0.1)}

@@ -86,6 +86,11 @@ def test_files_elsewhere_are_refused(bot: Wire, path: str) -> None:
     assert bot.refused("replay_load", path=path) == "path_not_readable"
 
 
+def test_a_refusal_names_the_folders_that_recordings_are_loaded_from(bot: Wire, tmp_path: Path, models: Path) -> None:
+    said = bot.refusal("replay_load", path="/etc/ep.json")[1]
+    assert f"({(tmp_path / 'saved/URLab/Replays').resolve()}, {models.resolve()})" in said
+
+
 def test_links_lead_nowhere_else_and_models_stay(bot: Wire, tmp_path: Path, models: Path) -> None:
     replays = tmp_path / "saved" / "URLab" / "Replays"
     replays.mkdir(parents=True)

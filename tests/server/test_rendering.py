@@ -23,10 +23,9 @@ from wire import Wire
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render import camera_renderer
 from urlab_client.simulation import drawing, opengl
-from urlab_client.simulation.appearance import APPEARANCE_TEXT, Appearance
+from urlab_client.simulation.appearance import APPEARANCE_TEXT, Appearance, tint
 from urlab_client.simulation.drawing import NO_HIT_CM
 from urlab_client.simulation.opengl import Backend, find_backend, free_context, make_context, search_backend
-from urlab_client.simulation.tints import tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
 WALL = """

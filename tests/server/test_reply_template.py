@@ -100,7 +100,7 @@ def test_whatever_the_numbers_are(
         for array in shown:
             array.flat = state
         data.time = time
-        engine._step_count = step
+        engine.step_count = step
         mine = engine.articulations.control("bot").twist
         mine.vx, mine.vy, mine.yaw_rate, mine.actions = twist
         frame, wall_time = filled(engine, frames, level)

@@ -19,7 +19,7 @@ import pytest
 from wire import Wire
 
 from urlab_client import URLabTimeoutError
-from urlab_client._sandbox import process
+from urlab_client._sandbox import process, references
 from urlab_client._sandbox.confinement import is_available
 from urlab_client.aio import URLabClient
 from urlab_client.errors import ImportFailed
@@ -390,6 +390,58 @@ def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
         "<worldbody><body><geom\ttype='mesh'\nmesh='m'/></body></worldbody></mujoco>\n"
     )
     assert wire.ask("import_xml", path=str(model))["imported_now"] is True
+
+
+INCLUDES = "<mujoco><include file='{}'/></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("files", "limits", "problem"),
+    [
+        ({"m.xml": INCLUDES.format("inner/a.xml"), "inner/a.xml": INCLUDES.format("../m.xml")}, {}, ""),
+        ({"m.xml": INCLUDES.format("gone.xml")}, {}, ""),
+        ({"m.xml": INCLUDES.format("inner"), "inner/a.xml": "not read"}, {}, ""),
+        ({"m.xml": INCLUDES.format("x" * 300)}, {}, ""),
+        (
+            {"m.xml": INCLUDES.format("../beside.xml")},
+            {},
+            "it names {0}/../beside.xml, which lies outside the folders this server may read models from ({0})",
+        ),
+        ({"m.xml": INCLUDES.format("out.xml")}, {}, "it names {0}/out.xml, which lies outside"),
+        (
+            {"m.xml": INCLUDES.format("inner/a.xml"), "inner/a.xml": INCLUDES.format("../../beside.xml")},
+            {},
+            "it names {0}/inner/../../beside.xml, which lies outside",
+        ),
+        ({"m.xml": INCLUDES.format("pipe")}, {}, "it names {0}/pipe, which is not a regular file"),
+        ({"m.xml": INCLUDES.format("a.xml"), "a.xml": "<mujoco>"}, {"most_files": 1}, "the limit model_files, 1"),
+        (
+            {"m.xml": INCLUDES.format("a.xml"), "a.xml": "<" * 99},
+            {"most_bytes": 98},
+            "{0}/a.xml is larger than the limit model_file_bytes, 98",
+        ),
+        ({"m.xml": INCLUDES.format("a.xml"), "a.xml": "<"}, {}, "it names {0}/a.xml; it is not XML"),
+        ({"m.xml": "<"}, {}, "it is not XML that is understood here: see line 1"),
+    ],
+)
+def test_what_a_model_names_lies_in_its_folders(
+    tmp_path: Path, files: dict[str, str], limits: dict[str, int], problem: str
+) -> None:
+    """What the child checks before MuJoCo reads a model."""
+    root = tmp_path.resolve() / "models"
+    (root / "inner").mkdir(parents=True)
+    (tmp_path / "beside.xml").write_text("<mujoco/>", encoding="utf-8")
+    (root / "out.xml").symlink_to(tmp_path / "beside.xml")
+    os.mkfifo(root / "pipe")
+    for name, text in files.items():
+        (root / name).write_text(text, encoding="utf-8")
+    allowed = {"most_bytes": 1000, "most_files": 10, **limits}
+    if not problem:
+        references.check_references(root / "m.xml", (root,), **allowed)
+        return
+    with pytest.raises(references.Outside) as refused:
+        references.check_references(root / "m.xml", (root,), **allowed)
+    assert problem.format(root) in str(refused.value)
 
 
 @pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")

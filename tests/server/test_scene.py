@@ -15,6 +15,7 @@ from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.world import EditorWorld
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import CompileFailed
 
 BALL = mjcf(BALL_BODY, model="ball")
@@ -196,6 +197,11 @@ def test_a_model_that_asks_for_memory_gets_it(scene_of: SceneOf) -> None:
     scene = scene_of(("big", mjcf(BALL_BODY, head='<size memory="40M"/>')), ("ball", BALL))
 
     assert scene.model.narena >= 40 * 2**20
+
+
+def test_the_memory_that_mujoco_reserves_for_contacts_counts_against_the_limit(scene_of: SceneOf) -> None:
+    with pytest.raises(CompileFailed, match=r"the scene takes \d{8} bytes, more than the limit scene_bytes, 8388608"):
+        scene_of(("ball", BALL), limits=Limits(scene_bytes=8 * 2**20))
 
 
 # Keyframes

@@ -24,8 +24,8 @@ from raw_shm import HEADER, RawRegion, RawShm
 from waiting import eventually
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.system.health import Health
 from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.system.threads import Health
 from urlab_client.server.transport.region_files import RegionFile
 from urlab_client.server.transport.shared_memory import MAX_LISTENERS, SharedMemoryServer
 

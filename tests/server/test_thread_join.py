@@ -7,7 +7,7 @@ import threading
 import pytest
 from waiting import DEADLINE_S
 
-from urlab_client.server.system.health import ended, within
+from urlab_client.server.system.threads import ended, within
 
 
 @pytest.mark.parametrize("timeout", [1.0, 0.0, -5.0])

@@ -18,7 +18,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.errors import NotReady, StepTimeout
 from urlab_client.server import Faults, SimulatedServer
 from urlab_client.server.core import ServerCore
-from urlab_client.server.rpc import watchdog
+from urlab_client.server.rpc import dispatch
 
 STEP_TIMEOUT_S = 0.2
 BALLS = "".join(
@@ -60,7 +60,7 @@ def hurry(server: SimulatedServer) -> None:
 
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
-    monkeypatch.setattr(watchdog, "INTERVAL_S", 0.02)
+    monkeypatch.setattr(dispatch, "INTERVAL_S", 0.02)
     made = Stuck(monkeypatch)
     yield made
     made.let_go.set()
@@ -99,6 +99,7 @@ def test_a_request_that_does_not_come_back_holds_up_nobody(
     op: str,
     fields: dict[str, Any],
     faults: Faults | None,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     with bot(mode, faults=faults) as server, Wire(server) as holder, Wire(server) as other:
         holder.hello()
@@ -111,6 +112,8 @@ def test_a_request_that_does_not_come_back_holds_up_nobody(
         assert holder.ask("pie_status")["state"] == "ready"
         code, message = holder.refusal("get_contacts")
         assert (code, "has not returned" in message) == ("not_ready", True)
+        eventually(lambda: [one.name for one in caplog.records if "stop_pie ends it" in one.message])
+        assert {one.name for one in caplog.records if "stop_pie ends it" in one.message} == {"urlab_client.server"}
         assert holder.refused("step") == "not_ready"
         assert other.hello()["manager_present"] is True
         assert len(other.ask("list_keyframes")["keyframes"]) >= 0

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from worlds import BALL_BODY, BOT, Workspace, mjcf, write_obj
 
+from urlab_client.server.assets.actors import ConversionSettings
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import compile_scene
 from urlab_client.server.editor.world import Actor, ActorKind, ActorNames, EditorWorld
@@ -59,7 +60,7 @@ def names(rows: list[Actor]) -> list[str]:
 
 
 def row(world: EditorWorld, key: str) -> Actor:
-    return next(row for row in world.list_actors() if key in (row.name, row.actor_id))
+    return next(row for row in list(world.actors) if key in (row.name, row.actor_id))
 
 
 def same_rotation(a: Any, b: Any) -> bool:
@@ -147,9 +148,9 @@ def test_a_level_is_created_once_unless_forced(workspace: Workspace, bot: str) -
     world.spawn_actor(bot, "a")
 
     assert refusal(world.levels.create, "lab").code == "create_level_failed"
-    assert len(world.list_actors()) == 1
+    assert len(list(world.actors)) == 1
     assert world.levels.create("lab", force_overwrite=True) == "/Game/Levels/lab"
-    assert world.list_actors() == []
+    assert list(world.actors) == []
     assert refusal(world.levels.create, "").code == "missing_field"
     assert refusal(world.levels.create, "../lab").code == "create_level_failed"
 
@@ -159,15 +160,15 @@ def test_levels_keep_what_was_saved(workspace: Workspace, bot: str, ball: str, w
     world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_euler=(0, 0, 90))
     world.spawn_actor(ball)
     world.spawn_light("spot", "lamp", location=(0, 0, 4), rotation_euler=(0, -90, 0), intensity=123.456)
-    before = world.list_actors()
+    before = list(world.actors)
     world.levels.save()
     world.spawn_actor(ball, "unsaved")
     world.levels.create("other")
-    assert world.list_actors() == []
+    assert list(world.actors) == []
 
     assert world.levels.load("lab") == world.levels.package == "/Game/Levels/lab"
 
-    assert world.list_actors() == before
+    assert list(world.actors) == before
     assert EditorWorld(ContentRoot(workspace.saved)).levels.load("/Game/Levels/lab")
 
 
@@ -176,7 +177,7 @@ def test_a_level_that_is_not_there_is_not_loaded(bot: str, world: EditorWorld, n
     world.spawn_actor(bot, "a")
 
     assert refusal(world.levels.load, name).code == "load_level_failed"
-    assert names(world.list_actors()) == ["bot"]
+    assert names(list(world.actors)) == ["bot"]
 
 
 def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: EditorWorld) -> None:
@@ -186,7 +187,7 @@ def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: Editor
     assert world.blueprints.destroy_asset("/Game/Levels/lab.lab")
 
     assert world.levels.package == "/Temp/Untitled_1"
-    assert world.list_actors() == []
+    assert list(world.actors) == []
     assert refusal(world.levels.load, "lab").code == "load_level_failed"
 
 
@@ -220,7 +221,7 @@ def test_a_save_that_fails_leaves_the_level_as_it_was(
     assert refused.code == "save_level_failed"
     assert "No space" in refused.message
     world.levels.load("lab")
-    assert world.list_actors() == []
+    assert list(world.actors) == []
 
 
 def test_a_content_root_can_be_moved(workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path) -> None:
@@ -247,7 +248,7 @@ def test_a_level_file_with_its_models_can_be_moved(tmp_path: Path) -> None:
     fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
     fresh.levels.load_file(tmp_path / "there" / "saved" / "Levels" / "lab.json")
 
-    assert names(fresh.list_actors()) == ["bot"]
+    assert names(list(fresh.actors)) == ["bot"]
     assert compile_scene(fresh.freeze()).model.nu == 1
 
 
@@ -321,7 +322,7 @@ def test_bundled_models_in_a_level_are_found_on_any_machine(
     fresh.levels.load_file(level)
 
     assert '"bundled:ball"' in text
-    assert names(fresh.list_actors()) == ["ball"]
+    assert names(list(fresh.actors)) == ["ball"]
 
 
 HEAD = {"format": "urlab-level", "version": 1, "blueprints": {}}
@@ -384,7 +385,7 @@ def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
     }
     world = load(workspace, HEAD | {"actors": [BOX | {"location": [1, 2, 3], "scale": [1, 2, 3]}, rock]})
 
-    rows = world.list_actors()
+    rows = list(world.actors)
     assert [item.class_name for item in rows] == ["StaticMeshActor", "StaticMeshActor"]
     assert {item.kind for item in rows} == {ActorKind.STATIC_MESH}
     assert rows[1].tags == ("URLab.ActorId=rock-1",)
@@ -473,12 +474,12 @@ def test_no_copy_has_a_name_that_begins_with_that_of_another_robot(tmp_path: Pat
     world = workspace.world
     robot, copy = (workspace.blueprint(name, mjcf(BALL_BODY, model=name)) for name in ("robot", "copy2"))
     world.spawn_actor(robot, "copy1_rob")
-    world.spawn_actor(copy, world.unused_id("robot"))
+    world.spawn_actor(copy, world.actors.unused_id("robot"))
     for blueprint in (robot, copy, robot, copy):
-        world.spawn_actor(blueprint, world.unused_id("robot"))
+        world.spawn_actor(blueprint, world.actors.unused_id("robot"))
 
-    names = [actor.name for actor in world.list_actors()]
-    ids = [actor.actor_id for actor in world.list_actors()]
+    names = [actor.name for actor in list(world.actors)]
+    ids = [actor.actor_id for actor in list(world.actors)]
     for known in (names, ids):
         assert len(set(known)) == 6
         assert [(a, b) for a in known for b in known if a != b and a.startswith(b)] == []
@@ -491,7 +492,7 @@ def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: EditorWorl
     assert (first.was_existing, second.was_existing) == (False, True)
     assert second.actor.name == first.actor.name
     assert second.actor.location == (4, 5, 6)
-    assert [(item.actor_id, item.location) for item in world.list_actors()] == [("a", (4, 5, 6))]
+    assert [(item.actor_id, item.location) for item in list(world.actors)] == [("a", (4, 5, 6))]
     assert row(world, "a").rotation == (0, 0, 0, 1)
     assert world.actor_path(first.actor) == "/Game/Levels/lab.lab:PersistentLevel.bot"
 
@@ -533,7 +534,7 @@ def test_a_pose_that_is_none_is_refused(bot: str, world: EditorWorld, pose: dict
 
     assert refused.code == "spawn_failed"
     assert text in refused.message
-    assert world.list_actors() == []
+    assert list(world.actors) == []
 
 
 def test_what_is_missing_is_named(bot: str, world: EditorWorld) -> None:
@@ -552,10 +553,10 @@ def test_a_grid_is_placed_x_first(ball: str, world: EditorWorld) -> None:
 
     assert [cell.actor.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
     assert placed[3].actor.location == (11, 22, 30)
-    assert names(world.list_actors()) == ["ball", "copy1_ball", "copy2_ball", "copy3_ball", "copy4_ball", "copy5_ball"]
+    assert names(list(world.actors)) == ["ball", "copy1_ball", "copy2_ball", "copy3_ball", "copy4_ball", "copy5_ball"]
     again = world.spawn_grid(ball, "g", 3, 1)
     assert [cell.was_existing for cell in again] == [True, True, False]
-    assert len(world.list_actors()) == 7
+    assert len(list(world.actors)) == 7
 
 
 def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, world: EditorWorld) -> None:
@@ -563,7 +564,7 @@ def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, w
 
     assert refusal(world.spawn_grid, ball, "g", 2, 2).code == "spawn_failed"
     assert refusal(world.spawn_grid, ball, "g", 2, 2, spacing=(math.inf, 1, 0)).code == "spawn_failed"
-    assert names(world.list_actors()) == ["bot"]
+    assert names(list(world.actors)) == ["bot"]
 
 
 @pytest.mark.parametrize(
@@ -588,7 +589,7 @@ def test_lights_are_added_each_time(world: EditorWorld) -> None:
     assert first.light.kind == "spot"
     assert first.light.color == pytest.approx((0.1, 0.2, 0.3))
     assert first.light.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
-    listed = world.list_actors()
+    listed = list(world.actors)
     assert [item.label for item in listed] == ["SpotLight", "SpotLight2"]
     assert all(item.kind is ActorKind.LIGHT and item.tags == ("URLab.ActorId=lamp",) for item in listed)
     assert refusal(world.spawn_light, "sun").code == "spawn_failed"
@@ -634,9 +635,9 @@ def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: EditorWor
 
     assert world.set_actor_transform("bot").name == "copy1_bot"
     assert world.set_actor_transform("other").name == "bot"
-    assert world.actor("bot").name == "copy1_bot"  # type: ignore[union-attr]  # by id
-    assert world.actor("bot", by_name=True).actor_id == "other"  # type: ignore[union-attr]
-    assert world.actor("copy1_bot") is None
+    assert world.actors.get("bot").name == "copy1_bot"  # type: ignore[union-attr]  # by id
+    assert world.actors.get("bot", by_name=True).actor_id == "other"  # type: ignore[union-attr]
+    assert world.actors.get("copy1_bot") is None
 
 
 def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, world: EditorWorld) -> None:
@@ -649,7 +650,7 @@ def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, wo
     assert copy.actor.class_path == bot
     assert world.duplicate_actor("a", "b", location=(9, 9, 9)).was_existing
     assert row(world, "b").location == (9, 9, 9)
-    assert len(world.list_actors()) == 2
+    assert len(list(world.actors)) == 2
 
 
 def test_lights_can_be_copied_and_managers_cannot(bot: str, world: EditorWorld) -> None:
@@ -672,9 +673,9 @@ def test_a_destroyed_actor_is_gone(workspace: Workspace, bot: str) -> None:
 
     world.destroy_actor("crate")
 
-    assert names(world.list_actors()) == ["lid"]
-    assert world.actor("lid", by_name=True).parent == ""  # type: ignore[union-attr]
-    assert world.selected == ""
+    assert names(list(world.actors)) == ["lid"]
+    assert world.actors.get("lid", by_name=True).parent == ""  # type: ignore[union-attr]
+    assert world.actors.selected == ""
     assert refusal(world.destroy_actor, "crate").code == "destroy_failed"
 
 
@@ -683,7 +684,7 @@ def test_one_actor_is_selected(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "b")
 
     world.select_actor("a")
-    assert world.select_actor("b").name == world.selected == "copy1_bot"
+    assert world.select_actor("b").name == world.actors.selected == "copy1_bot"
     assert refusal(world.select_actor, "c").code == "select_failed"
 
 
@@ -733,7 +734,7 @@ def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world:
     assert described.actuators == ["bot_m"]
     assert described.sensors == ["bot_s"]
     assert described.cameras == ["cam"]
-    assert names(world.list_actors()) == ["bot", "ball"]
+    assert names(list(world.actors)) == ["bot", "ball"]
     rows, in_play = world.find_actors(class_filter="Pawn", in_pie=True)
     assert (names(rows), in_play) == (["bot"], True)
     assert (names(world.find_actors()[0]), world.find_actors()[1]) == (["bot", "ball"], False)
@@ -795,12 +796,12 @@ def test_lights_managers_and_bare_models_have_no_bounds(workspace: Workspace, wo
 def test_a_mesh_is_converted_with_the_settings_of_the_last_call(workspace: Workspace) -> None:
     world = load(workspace, HEAD | {"actors": [BOX]})
 
-    world.quick_convert.add("crate", static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1))
+    world.quick_convert.add("crate", ConversionSettings(static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1)))
     settings_ = row(world, "crate").quick_convert
     assert settings_ is not None
     assert (settings_.static, settings_.friction) == (True, (0.5, 0.1, 0.1))
     assert settings_.coacd_threshold == 0.10000000149011612
-    world.quick_convert.add("crate")
+    world.quick_convert.add("crate", ConversionSettings())
     again = row(world, "crate").quick_convert
     assert again is not None
     assert (again.static, again.friction) == (False, (1, 1, 1))
@@ -815,11 +816,11 @@ def test_only_meshes_are_converted(workspace: Workspace, bot: str) -> None:
     world.spawn_actor(bot, "a")
     code = "add_quick_convert_failed"
 
-    assert refusal(world.quick_convert.add, "a").code == code
-    assert refusal(world.quick_convert.add, "nobody").code == code
-    assert refusal(world.quick_convert.add, "crate", friction=(math.nan, 0, 0)).code == code
-    assert refusal(world.quick_convert.add, "ground").code == code
-    assert world.quick_convert.add("ground", static=True).quick_convert is not None
+    assert refusal(world.quick_convert.add, "a", ConversionSettings()).code == code
+    assert refusal(world.quick_convert.add, "nobody", ConversionSettings()).code == code
+    assert refusal(world.quick_convert.add, "crate", ConversionSettings(friction=(math.nan, 0, 0))).code == code
+    assert refusal(world.quick_convert.add, "ground", ConversionSettings()).code == code
+    assert world.quick_convert.add("ground", ConversionSettings(static=True)).quick_convert is not None
 
 
 def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: EditorWorld) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,6 +16,13 @@ from waiting import attempts
 from urlab_client.server import SimulatedServer
 
 pack = msgspec.msgpack.encode
+
+
+def set_points(values: Mapping[int, float]) -> bytes:
+    """Return the payload of a control topic with these values by actuator id."""
+    entries = (struct.pack("<if", actuator, value) for actuator, value in values.items())
+    return struct.pack("<i", len(values)) + b"".join(entries)
+
 
 BOT = """
 <mujoco model="bot">

@@ -58,10 +58,14 @@ class PluginMemory:
         """Publish a reply to whatever was asked."""
         self.replies.publish(msgspec.msgpack.encode(answer))
 
-    def close(self) -> None:
-        """Stop serving and remove the files."""
+    def stop(self) -> None:
+        """Stop serving."""
         self._stop.set()
         self._thread.join(60)
+
+    def close(self) -> None:
+        """Stop serving and remove the files."""
+        self.stop()
         self.requests.close()
         self.replies.close()
 

@@ -1112,6 +1112,19 @@ class TestTwins:
         assert type(wrap(portal, RobotTwin, WalkingRobot())) is WalkingRobotTwin
         assert type(wrap(portal, RobotTwin, Unlisted())) is WalkingRobotTwin
 
+    def test_are_those_of_a_thread_that_was_quicker(self, portal: Portal, monkeypatch: pytest.MonkeyPatch) -> None:
+        robot, lock = Robot(), portal._lock
+        made: list[Facade] = []
+
+        @contextlib.contextmanager
+        def after_another() -> Iterator[None]:
+            monkeypatch.setattr(portal, "_lock", lock)
+            made.append(wrap(portal, RobotTwin, robot))
+            yield
+
+        monkeypatch.setattr(portal, "_lock", after_another())
+        assert wrap(portal, RobotTwin, robot) is made[0]
+
     def test_are_made_once_under_races(self, portal: Portal) -> None:
         with ThreadPoolExecutor(8) as pool:
             for _ in range(50):

@@ -26,17 +26,27 @@ def unused():
 
 def once():
     return 1
+
+class Base:
+    size = 2
+
+class Square(Base):
+    def area(self):
+        return self.size**2
 """
 
 TESTS = """
 from pathlib import Path
-from urlab_client.adding import capped, once, shout
+from urlab_client.adding import Square, capped, once, shout
 
 def test_capped():
     assert capped(5) == 3
 
 def test_shout():
     shout("a")
+
+def test_area():
+    assert Square().area() == 4
 
 def test_that_passes_only_once():
     assert once() == 1
@@ -93,18 +103,20 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         mutant(7, "upper", "lower"),
         mutant(10, "1 + 1", "1 - 1"),
         mutant(13, "return 1\n", "return 2\n"),
+        mutant(16, "size = 2", "size = None"),
     ]
     monkeypatch.setattr(tool, "draw", lambda *_: drawn)
     capsys.readouterr()
     assert tool.main(["--seed", "7", "--jobs", "2"], **where) == 0
     assert capsys.readouterr().out.splitlines()[:-1] == [
-        "6 mutants, seed 7",
+        "7 mutants, seed 7",
         f"caught     {FILE}:1",
         f"caught     {FILE}:4",
         f"equivalent {FILE}:6",
         f"survives   {FILE}:7",
         f"no test    {FILE}:10",
         f"no test    {FILE}:13",
+        f"caught     {FILE}:16",
         "",
         f"survives: {FILE}:7 (1 of the 1 tests that run it passed)",
         "@@ -5,5 +5,5 @@",
@@ -125,14 +137,16 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         " def once():",
         "",
         f"no test: {FILE}:13 (0 of the 1 tests that run it passed)",
-        "@@ -11,3 +11,3 @@",
+        "@@ -11,5 +11,5 @@",
         " ",
         " def once():",
         "-    return 1",
         "+    return 2",
+        " ",
+        " class Base:",
         "",
-        "(top)             2 of    5   40%",
-        "all               2 of    5   40%",
+        "(top)             3 of    6   50%",
+        "all               3 of    6   50%",
     ]
     assert (tree / FILE).read_text("utf-8") == SOURCE
 

@@ -16,7 +16,6 @@ from starlette.routing import Mount
 from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient, background
-from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.console.controls import Controls
 from urlab_client.console.hand_driving import HandDriving
 from urlab_client.console.lease import DrivingLease, Viewer
@@ -75,13 +74,13 @@ async def mounted(folder: Path, mode: str = "direct") -> AsyncGenerator[tuple[UR
         program = Starlette(routes=[Mount("/console", site)], lifespan=lifespan)
         async with program.router.lifespan_context(program):
             console: ConsoleSession = site.state.console
-            await until(lambda: any(entry.what == "session_opened" for entry in console.entries))
+            await until(lambda: any(entry.what == "session_opened" for entry in console.view.entries))
             yield client, console
 
 
 def errors(console: ConsoleSession) -> dict[str, str]:
     """Return what viewers read about the console's own errors."""
-    return {entry.what: entry.text for entry in console.entries if (entry.kind, entry.who) == ("error", "console")}
+    return {entry.what: entry.text for entry in console.view.entries if (entry.kind, entry.who) == ("error", "console")}
 
 
 def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:
@@ -115,12 +114,12 @@ async def test_a_number_that_the_program_wrote_is_not_sent_in_live_mode(tmp_path
         assert "finite" in errors(console)["set-points"]
         arm.set_ctrl(dict.fromkeys(others, 0.0))
         console.controls.set_points(ME, {"arm": {name: 0.2}})
-        await until(lambda: console.snapshot is not None and 0.2 in arm_set_points(console))
+        await until(lambda: console.view.snapshot is not None and 0.2 in arm_set_points(console))
 
 
 def arm_set_points(console: ConsoleSession) -> list[float]:
-    assert console.snapshot is not None
-    ctrl = console.snapshot.per_articulation["arm"].ctrl
+    assert console.view.snapshot is not None
+    ctrl = console.view.snapshot.per_articulation["arm"].ctrl
     return [] if ctrl is None else [round(value, 6) for value in ctrl.tolist()]
 
 
@@ -134,7 +133,7 @@ async def test_each_loop_goes_on_after_a_failure(
             what = name.lstrip("_")
             assert "MemoryError: none left" in errors(console)[what]
             assert logged(caplog, f"urlab-web-{what}")
-        await until(lambda: console.state_json is not None)
+        await until(lambda: console.view.state_json is not None)
         await console.controls.run(ME, running=True)
         await until(lambda: client.step_count > 0)
 
@@ -145,8 +144,8 @@ async def test_a_mode_that_changes_meanwhile_makes_no_step_of_set_points(tmp_pat
         session = client._session
         async with session.turn(SetMode) as turn:
             console.controls.set_points(ME, {"arm": {actuator: 0.1}})
-            await until(lambda: session.turns._waiting or session.line._waiting)
-            await ask_mode(client._state, turn, StepMode.DIRECT)
+            await until(lambda: session.state_lock._waiting or session.request_lock._waiting)
+            await client._state.mode.ask(turn, StepMode.DIRECT)
         assert (await client.step()).step == 1
         assert errors(console) == {}
 
@@ -157,7 +156,7 @@ async def test_pictures_go_on_after_a_failure(
 ) -> None:
     once(monkeypatch, Feed, "_run")
     async with mounted(tmp_path, "live") as (_, console):
-        feed = console.feed("arm/wrist")
+        feed = console.cameras.feed("arm/wrist")
         assert feed is not None
         async with feed.watch(), asyncio.timeout(DEADLINE_S):
             assert (await feed.after(0)).jpeg

@@ -22,7 +22,7 @@ from test_web_api import mounted
 from urlab_client.aio import URLabClient
 from urlab_client.aio.model import compilation
 from urlab_client.aio.model.upload import flatten
-from urlab_client.console import model_import
+from urlab_client.console import model_import, recordings
 from urlab_client.console.session import ConsoleSession
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access
@@ -190,6 +190,16 @@ def test_a_damaged_archive_is_refused_with_a_reason(http: TestClient) -> None:
     broken[60] ^= 0xFF  # in the first file: its checksum is wrong now
     assert "Bad CRC-32" in refusal(http.put("/api/models/crate.zip", content=bytes(broken)))
     assert "not a ZIP archive" in refusal(http.put("/api/models/crate.zip", content=b"nonsense"))
+
+
+def test_what_a_viewer_sends_may_be_so_large_and_no_larger(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = b"{}"
+    monkeypatch.setattr(model_import, "_LARGEST_FILE", len(BALL))
+    monkeypatch.setattr(recordings, "_LARGEST_FILE", len(robot))
+    assert http.put("/api/models/ball.xml", content=BALL).status_code == 200
+    assert f"at most {len(BALL)} bytes" in refusal(http.put("/api/models/ball.xml", content=BALL + " "))
+    assert "at most" not in refusal(http.put("/api/recordings/run.json", content=robot), 502)
+    assert f"at most {len(robot)} bytes" in refusal(http.put("/api/recordings/run.json", content=robot + b" "))
 
 
 def test_a_model_is_imported_by_a_console_as_it_is_started(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import io
 import json
+import re
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from urlab_client.console import mujoco_viewer
 from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
 from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
-from urlab_client.server import SimulatedServer
+from urlab_client.server import ControllerConfig, SimulatedServer
 from urlab_client.web import Access, app
 
 
@@ -127,6 +128,34 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_openapi_describes_parameters_bodies_and_responses(http: TestClient) -> None:
+    from jsonschema import Draft202012Validator
+    from openapi_spec_validator import validate
+
+    document = http.get("/api/openapi.json").json()
+    validate(document)
+    operations = {(method, path): said for path, of in document["paths"].items() for method, said in of.items()}
+    ids = [said["operationId"] for said in operations.values()]
+    assert len(ids) == len(set(ids))
+    for (method, path), said in operations.items():
+        named = {one["name"] for one in said.get("parameters", ()) if one["in"] == "path"}
+        assert named == set(re.findall(r"\{(\w+)\}", path)), path
+        assert (
+            "requestBody" in said
+            or method in {"get", "delete"}
+            or path
+            in {
+                "/api/lease",
+                "/api/connection",
+                "/api/invitations",
+            }
+        )
+    for path in ("world", "status", "log", "state", "bodies", "bodies/{id}", "explain", "recordings"):
+        told = operations["get", f"/api/{path}"]["responses"]["200"]["content"]["application/json"]["schema"]
+        validator = Draft202012Validator({**told, "components": document["components"]})
+        validator.validate(http.get(f"/api/{path.format(id=1)}").json())
 
 
 @pytest.mark.opengl
@@ -348,6 +377,17 @@ def picture_of(socket: Any, time: float) -> tuple[dict[str, Any], bytes]:
     """Return the next picture of a moment, in seconds."""
     pictures = (picture_in(socket) for _ in attempts(f"no picture of {time} s came"))
     return next(picture for picture in pictures if picture[0]["sim_time"] == pytest.approx(time, abs=1e-6))
+
+
+def test_the_world_shows_the_controller_of_a_robot() -> None:
+    with SimulatedServer("arm", play=True, controllers={"arm": ControllerConfig(kp=40.0)}) as server:
+        site = mounted(server, "/", access=Access(tokens=False))
+        with TestClient(site, "http://localhost") as http, http.websocket_connect("ws://localhost/api/live") as live:
+            world = heard(live, "world", lambda message: bool(message["world"]["articulations"]))["world"]
+    (arm,) = world["articulations"]
+    assert arm["controller"]["kind"] == "pd"
+    assert set(arm["controller"]["params"]["kp"].values()) == {40.0}
+    assert arm["controller"]["schema"]["kp"]["type"] == "per_joint"
 
 
 @pytest.mark.opengl

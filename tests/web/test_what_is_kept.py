@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,9 @@ from typing import Any
 import pytest
 from starlette.datastructures import Headers
 
+from urlab_client.aio import URLabClient
 from urlab_client.console import recordings
+from urlab_client.console.session import ConsoleSession
 from urlab_client.web import Access, access
 
 
@@ -43,3 +46,29 @@ async def test_a_recording_that_grows_or_goes_leaves_no_descriptions(
     assert len(made._described) == 1
     made.remove(file.name)
     assert not made._described
+
+
+async def test_a_status_is_encoded_once_for_all_viewers_until_it_changes(tmp_path: Path) -> None:
+    async with URLabClient("tcp://localhost") as client:
+        console = ConsoleSession(client, recordings=tmp_path)
+        with console.new_viewer() as one, console.new_viewer() as other:
+            told = console.status_json(one)
+            for _ in range(3):
+                console.view.notify()  # as with each state
+                assert console.status_json(one) is told
+                assert console.status_json(other) is told
+            console.lease.use(one)
+            console.view.notify()
+            assert json.loads(console.status_json(one))["mine"]
+            assert not json.loads(console.status_json(other))["mine"]
+
+
+async def test_a_viewer_gets_the_entries_of_the_log_that_it_does_not_have(tmp_path: Path) -> None:
+    async with URLabClient("tcp://localhost") as client:
+        view = ConsoleSession(client, recordings=tmp_path).view
+        assert view.entries_after(-1) == []
+        for number in range(1, 1001):
+            view.note("event", "test", "counted", str(number))
+        assert [entry.n for entry in view.entries_after(998)] == [999, 1000]
+        assert view.entries_after(1000) == view.entries_after(2000) == []
+        assert [*view.entries_after(-1)] == [*view.entries_after(3)] == [*view.entries]

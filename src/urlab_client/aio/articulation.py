@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Sized
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping, Sequence, Sized
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from urlab_client.aio.arguments import mapping, require
+from urlab_client.aio.arguments import finite, finite_array, mapping, require
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.model.numbers import finite, finite_array
-from urlab_client.aio.motion import Motion
 from urlab_client.aio.session.control import CLAIM_S
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
@@ -31,6 +29,9 @@ from urlab_client.values.descriptions import (
 )
 from urlab_client.values.names import NameMap
 from urlab_client.values.rotation import rotate
+
+Move: TypeAlias = Callable[["URLabArticulation", Mapping[str, float], float, float], Awaitable[float]]
+"""See `URLabArticulation.move_to`."""
 
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
@@ -178,11 +179,11 @@ class URLabArticulation(URLabEntity):
 
     _record: MirroredArticulation
 
-    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, motion: Motion) -> None:
+    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, move: Move) -> None:
         super().__init__(record)
         self._session = session
         self._publishers = publishers
-        self._motion = motion
+        self._move = move
         self._controller: tuple[ControllerInfo, URLabController] | None = None
         self._handles: tuple[ArticulationLayout, ArticulationElements] | None = None
         self._cameras: NameMap[URLabCameraView] = NameMap()
@@ -237,7 +238,7 @@ class URLabArticulation(URLabEntity):
                 for name, info in topics.items()
             }
             for name, info in topics.items():
-                views[name].info = info
+                views[name].camera.info = info
             self._cameras = NameMap(views, kind="camera", owner=self.prefix)
         return self._cameras
 
@@ -460,7 +461,7 @@ class URLabArticulation(URLabEntity):
                 position servo; nothing was set.
             URLabTimeoutError: Simulation time does not advance, for example while paused in live mode.
         """
-        return await self._motion.move_to(self, targets, tolerance, timeout)
+        return await self._move(self, targets, tolerance, timeout)
 
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
         """Become the only client that controls the articulation, before the first write does so automatically.

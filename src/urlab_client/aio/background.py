@@ -37,11 +37,8 @@ def background_task(
 ) -> asyncio.Task[None]:
     """Start a task that nobody awaits, or not at once. The caller must keep a reference to it.
 
-    Args:
-        name: Its name.
-        work: What it does.
-        tell: Publishes the event of its unexpected end; None where there are no events.
-        failed: Called on the event loop with the error of its unexpected end, to fail what waits for it.
+    If it ends unexpectedly, `failed` is called on the event loop with the error, to fail what waits for the task, and
+    `tell` publishes the event.
     """
 
     def note_end(task: asyncio.Task[None]) -> None:
@@ -65,12 +62,7 @@ def background_thread(
 ) -> threading.Thread:
     """Return a daemon thread, not started.
 
-    Args:
-        name: Its name.
-        run: What it does.
-        arguments: Arguments of `run`.
-        tell: Publishes the event of its unexpected end, on the running event loop; None where there are no events.
-        failed: Called on the thread with the error of its unexpected end, to fail what waits for it.
+    If it ends unexpectedly, `failed` is called on the thread, and `tell` on the event loop that runs now.
     """
     loop = None if tell is None else asyncio.get_running_loop()
 
@@ -84,13 +76,7 @@ def background_thread(
 
 
 async def kept_running(name: str, work: Callable[[], Awaitable[None]], failed: Callable[[URLabError], object]) -> None:
-    """Run something until it returns, and whenever it fails, run it again after a pause, which grows to half a minute.
-
-    Args:
-        name: Its name.
-        work: What to run.
-        failed: Called with the error of each failure, which has been logged.
-    """
+    """Run something until it returns; whenever it fails, again after a pause, which grows to half a minute."""
     loop, pause = asyncio.get_running_loop(), _PAUSE_S
     while True:
         began = loop.time()
@@ -121,10 +107,6 @@ def running_loop(
     bound: asyncio.AbstractEventLoop | None = None, owner: str = "This client"
 ) -> asyncio.AbstractEventLoop:
     """Return the running event loop.
-
-    Args:
-        bound: The loop that the caller has been used on; None before its first use.
-        owner: Name of the caller for the error message.
 
     Raises:
         URLabError: No asyncio event loop is running, or another one than `bound`.

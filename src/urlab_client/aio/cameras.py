@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.streams.live_state import LatestPicture
+from urlab_client.aio.streams.pictures import LatestPicture
 from urlab_client.aio.streams.publishers import Publishers, SharedFrame
+from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.enums import CameraMode, known
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pictures import PictureMemory, Pixels
+from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -22,21 +23,25 @@ __all__ = ["SharedFrame", "URLabCameraView"]
 class URLabCameraView:
     """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
-    name: str
-    """Name without the articulation's prefix."""
-    info: CameraInfo
-    """Description from the handshake."""
     delivered: bool
     """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
 
     def __init__(self, name: str, info: CameraInfo, publishers: Publishers) -> None:
-        self.name = name
-        self.info = info
         self.delivered = True
         self._publishers = publishers
         # For the client. Not declared above, to keep them out of the façade.
-        self.memory: PictureMemory = PictureMemory()
-        self.pictures: LatestPicture = LatestPicture(publishers.camera(self, asked=False))
+        self.camera: Camera = Camera(name, info)
+        self.pictures: LatestPicture = LatestPicture(publishers.camera(self.camera, asked=False))
+
+    @property
+    def name(self) -> str:
+        """Name without the articulation's prefix."""
+        return self.camera.name
+
+    @property
+    def info(self) -> CameraInfo:
+        """Description from the handshake."""
+        return self.camera.info
 
     @property
     def latest_frame(self) -> Pixels | None:
@@ -60,7 +65,7 @@ class URLabCameraView:
     @property
     def mode(self) -> CameraMode | str:
         """Meaning of the pixels; a plain string for a mode that this client does not know."""
-        return known(CameraMode, self.info.mode)
+        return self.camera.mode
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -104,7 +109,7 @@ class URLabCameraView:
             ModeLocked: The project is locked to a mode that delivers pictures only with steps.
             URLabError: The camera is no longer in the scene.
         """
-        (sample,) = await self._publishers.capture([self], timeout)
+        (sample,) = await self._publishers.capture([self.camera], timeout)
         return sample
 
     def frames(
@@ -137,7 +142,7 @@ class URLabCameraView:
                 policy than `latest`.
         """
         return Stream(
-            self._publishers.camera(self, policy),
+            self._publishers.camera(self.camera, policy),
             policy=policy,
             max_rate=max_rate,
             buffer=buffer,
@@ -152,7 +157,7 @@ class URLabCameraView:
         None unless the client is receiving the camera's pictures from shared memory: in live mode, or in any mode while
         a stream of `frames` is open.
         """
-        return self._publishers.shared_frame(self)
+        return self._publishers.shared_frame(self.camera)
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"

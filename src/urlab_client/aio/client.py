@@ -25,19 +25,18 @@ from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayName
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
-from urlab_client.aio.session.control import Control
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.capturing import Capturing
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
-from urlab_client.aio.state.resetting import take_reset
 from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.aio.state.stepping import send_step, take_steps
+from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
+from urlab_client.aio.streams.rows import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
@@ -173,15 +172,18 @@ class URLabClient(ClientState):
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         session = Session(
-            self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json", observe=observe
+            self._transport,
+            default_timeout=rcv_timeout_ms / 1000,
+            json=encoding == "json",
+            observe=observe,
+            claim_control=claim_control,
+            read_only=read_only,
         )
-        session.control = Control(session, wanted=claim_control)
-        session.read_only = read_only
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
             self._state_port,
             default_timeout=rcv_timeout_ms / 1000,
-            live=lambda: self._state.mode is StepMode.LIVE,
+            live=lambda: self._state.mode.live,
             features=lambda: session.features,
             keys=keys,
             memory=memory,
@@ -191,16 +193,11 @@ class URLabClient(ClientState):
             memory.tell = session.tell
         if not read_only:
             self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
+        state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
         self._motion = Motion(
-            self,
-            driven=lambda: any(record.driven for record in self._state.objects.records.values()),
-            locate=self._locate,
-            stall_timeout=rcv_timeout_ms / 1000,
-            session=session,
+            state, step=self.step, explain=self.explain, locate=self._locate, stall_timeout=rcv_timeout_ms / 1000
         )
-        state = SimState(
-            session, self._publishers, self._motion, wanted_mode=StepMode(step_mode), live_pictures=live_pictures
-        )
+        state.objects.move = self._motion.move_to
         self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
         super().__init__(config, session, state)
         self._discovery = Discovery(
@@ -479,7 +476,7 @@ class URLabClient(ClientState):
             except TypeError:
                 raise TypeError(f"capture takes camera names, got {cameras!r:.80}.") from None
         views = [self.camera(name) for name in names.values()]
-        samples = await self._publishers.capture(views, timeout) if views else []
+        samples = await self._publishers.capture([view.camera for view in views], timeout) if views else []
         return dict(zip(names, samples, strict=True))
 
     def state_stream(
@@ -564,10 +561,14 @@ class URLabClient(ClientState):
                 hint="Create the client with local_model=True, or use state_stream().",
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
+        wanted = RowFilter(keys, kinds, components, entities=articulation is None)
+        source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
+        if not self._session.features.publishes_rows:
+            # From the socket, which delivers every snapshot; a region holds only the newest.
+            states = self._publishers.state(StreamPolicy.ALL)
+            source = DerivedRowSource(states, lambda: self.articulations, wanted)
         return Stream(
-            self._publishers.rows(
-                keys, kinds, components, entities=articulation is None, robots=lambda: self.articulations
-            ),
+            source,
             policy=policy,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
@@ -627,7 +628,7 @@ class URLabClient(ClientState):
         if self._closed:
             return
         self._closed = True
-        promoted_from = self._state.promoted_from
+        promoted_from = self._state.mode.promoted_from
         self._publishers.close()
         try:
             playing = self.connected and self.manager_present
@@ -640,7 +641,7 @@ class URLabClient(ClientState):
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # best effort: play may have ended
                     async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
-                        await ask_mode(self._state, turn, promoted_from)
+                        await self._state.mode.ask(turn, promoted_from)
         finally:
             await self._session.aclose()
 

@@ -9,9 +9,8 @@ from msgspec.structs import replace
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.client_types import ClientConfig, ServerInfo
+from urlab_client.aio.client_types import ClientConfig, ClientObserver, ServerInfo
 from urlab_client.aio.model.mirror import binary_model
-from urlab_client.aio.observer import ClientObserver
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
@@ -79,7 +78,7 @@ class ClientState:
             instance=None if hello is None else hello.instance,
             urlab_version=self.urlab_version,
             mujoco_version=self.mujoco_version,
-            step_mode=self._state.mode_word,
+            step_mode=self._state.mode.word,
         )
 
     @property
@@ -90,12 +89,12 @@ class ClientState:
     @property
     def manager_present(self) -> bool:
         """Whether a play session is running, as far as this client knows."""
-        return self._state.hello is not None and self._state.hello.manager_present
+        return self._state.playing
 
     @property
     def step_mode(self) -> StepMode:
         """Step mode in force, as far as this client knows."""
-        return self._state.mode
+        return self._state.mode.current
 
     @property
     def model(self) -> MjModel | None:
@@ -140,7 +139,7 @@ class ClientState:
     @property
     def step_count(self) -> int:
         """Steps since `discover()` or `reset()`, as counted by the server; constant in live mode."""
-        return self._state.step_count
+        return self._state.clocks.step_count
 
     @property
     def reset_seed(self) -> int | None:
@@ -150,32 +149,32 @@ class ClientState:
     @property
     def sim_time(self) -> float:
         """Simulation time of the last reply, seconds."""
-        return self._state.sim_time
+        return self._state.clocks.sim_time
 
     @property
     def sim_time_sec(self) -> int:
         """Whole seconds of the simulation time."""
-        return self._state.sim_time_sec
+        return self._state.clocks.sim_time_sec
 
     @property
     def sim_time_nsec(self) -> int:
         """Nanoseconds within the second of the simulation time."""
-        return self._state.sim_time_nsec
+        return self._state.clocks.sim_time_nsec
 
     @property
     def wall_time_sec(self) -> int:
         """Whole seconds of the server's UTC clock when the last reply was built."""
-        return self._state.wall_time_sec
+        return self._state.clocks.wall_time_sec
 
     @property
     def wall_time_nsec(self) -> int:
         """Nanoseconds within the second of the server's UTC clock when the last reply was built."""
-        return self._state.wall_time_nsec
+        return self._state.clocks.wall_time_nsec
 
     @property
     def recv_wall_time_ns(self) -> int:
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
-        return self._state.recv_wall_time_ns
+        return self._state.clocks.recv_wall_time_ns
 
     def describe(self) -> SceneDescription:
         """Return all robots, other dynamic bodies and scene cameras as of the last reply.

@@ -28,6 +28,7 @@ _CONNECT_S = 2.0
 _POLLS = 5
 _POLL_S = 0.05
 _LISTED = 8
+_CHANGED = "the mode was changed. Call runtime.set_mode() or discover()."
 
 
 class _Status(Protocol):
@@ -199,12 +200,12 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
         }.get(second.state, "")
         return Finding(Verdict.PROBLEM, "play", f"Play is {second.state}. {advice}".strip()), False
     runs = second.sim_time != first.sim_time
-    if state.mode is StepMode.LIVE and not runs:
+    if state.mode.live and not runs:
         text = f"Physics stands still at {second.sim_time or 0:g} s: it is paused. Call runtime.set_paused(False)."
         return Finding(Verdict.PROBLEM, "play", text), True
-    if state.mode is not StepMode.LIVE and runs:
-        text = f"Time passes without steps although this client expects mode {state.mode}: the mode was changed. "
-        return Finding(Verdict.PROBLEM, "play", text + "Call runtime.set_mode() or discover()."), True
+    if not state.mode.live and runs:
+        text = f"Time passes without steps although this client expects mode {state.mode.current}: "
+        return Finding(Verdict.PROBLEM, "play", text + _CHANGED), True
     how = "running" if runs else "waiting for step()"
     return Finding(Verdict.OK, "play", f"Play is ready, physics {how} at {second.sim_time or 0:g} s."), True
 
@@ -226,14 +227,15 @@ def _physics(session: Session, state: SimState) -> Iterator[Finding]:
 def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
     wanted = config.step_mode
     if wanted is StepMode.AUTO:
-        known = "assumed until a step shows otherwise" if state.mode_assumed else "as the server reports"
-        yield Finding(Verdict.OK, "step mode", f"{state.mode}, {known}.")
-    elif state.mode is wanted:
-        yield Finding(Verdict.OK, "step mode", f"{state.mode}, as requested.")
+        known = "assumed until a step shows otherwise" if state.mode.assumed else "as the server reports"
+        yield Finding(Verdict.OK, "step mode", f"{state.mode.current}, {known}.")
+    elif state.mode.current is wanted:
+        yield Finding(Verdict.OK, "step mode", f"{state.mode.current}, as requested.")
     else:
-        text = f"{state.mode} instead of {wanted}. The project may be locked to it, or runtime.set_mode() changed it."
+        text = f"{state.mode.current} instead of {wanted}. "
+        text += "The project may be locked to it, or runtime.set_mode() changed it."
         yield Finding(Verdict.NOTE, "step mode", text)
-    if state.step_count == 0 and state.mode is not StepMode.LIVE:
+    if state.clocks.step_count == 0 and not state.mode.live:
         yield Finding(Verdict.NOTE, "steps", "step() has not been called since discover(). Nothing moves without it.")
 
 
@@ -264,7 +266,7 @@ def _articulations(state: SimState) -> Iterator[Finding]:
         if not np.any(record.ctrl):
             text = "All set-points are 0. Set them with set_ctrl() or ctrl_array before step()."
             yield Finding(Verdict.NOTE, key, text)
-        elif not controlled and state.step_count and not np.any(record.applied):
+        elif not controlled and state.clocks.step_count and not np.any(record.applied):
             text = "Set-points are sent but not applied. Is the control source `ui`? "
             yield Finding(Verdict.PROBLEM, key, text + "Call runtime.set_control_source('zmq').")
         else:

@@ -460,12 +460,6 @@ _LAST_PORT = 65535
 def transport_to(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
     """Return the transport to a server at an address.
 
-    Args:
-        address: Address given by the user.
-        step_port: RPC port, if the address names none.
-        keys: CURVE keys for the server; None if it needs none.
-        shm: Whether a server that this process starts offers shared memory.
-
     Raises:
         ValueError: The address is malformed.
     """

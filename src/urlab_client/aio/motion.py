@@ -9,23 +9,18 @@ from __future__ import annotations
 import inspect
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Mapping
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Protocol
 
-from urlab_client.aio.arguments import mapping
+from urlab_client.aio.arguments import finite, mapping
+from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_types import Diagnosis, Verdict
-from urlab_client.aio.model.elements import Actuator, Joint
-from urlab_client.aio.model.numbers import finite
-from urlab_client.aio.session.session import Session, server_restarted
+from urlab_client.aio.model.elements import Joint
+from urlab_client.aio.session.session import server_restarted
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.enums import OutOfRange, StepMode
 from urlab_client.errors import NotSettled, URLabTimeoutError
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.values.names import NameMap
-
-if TYPE_CHECKING:
-    import mujoco
 
 _CHECK_S = 0.01  # simulation time between two checks of a predicate
 _SLICE_S = 0.1  # simulation time per request without a predicate: a slow scene still finishes it within its deadline
@@ -33,56 +28,24 @@ _MOVING = 0.01  # rad/s or m/s: a joint that is slower than this is stuck
 _AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for this long
 
 
-class _Simulation(Protocol):
-    """The part of a client that `Motion` needs."""
-
-    @property
-    def step_mode(self) -> StepMode: ...
-    @property
-    def sim_time(self) -> float: ...
-    @property
-    def model(self) -> mujoco.MjModel | None: ...
-    async def step(self, n_steps: int = 1) -> StepOk: ...
-    def state_stream(self) -> Stream[StateSnapshot]: ...
-    async def explain(self) -> Diagnosis: ...
-
-
-class _Movable(Protocol):
-    """The part of an articulation that `Motion` needs."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def joints(self) -> NameMap[Joint]: ...
-    @property
-    def actuators(self) -> NameMap[Actuator]: ...
-
-
 class Motion:
-    """Lets simulation time pass.
-
-    Args:
-        simulation: The client.
-        driven: Returns whether the client has set-points of its own, which must be sent in live mode.
-        locate: Asks the server for the state if it is not known yet.
-        stall_timeout: Wall-clock seconds within which simulation time must advance; None waits without limit.
-        session: The client's session, which counts restarts of the server.
-    """
+    """Lets simulation time pass."""
 
     def __init__(
         self,
-        simulation: _Simulation,
+        state: SimState,
         *,
-        driven: Callable[[], bool],
+        step: Callable[[int], Awaitable[StepOk]],
+        explain: Callable[[], Awaitable[Diagnosis]],
         locate: Callable[[], Awaitable[None]],
         stall_timeout: float | None,
-        session: Session,
     ) -> None:
-        self._simulation = simulation
-        self._session = session
-        self._driven = driven
-        self._locate = locate
-        self._stall_timeout = stall_timeout
+        self._state = state
+        self._session = state.session
+        self._step = step
+        self._explain = explain
+        self._locate = locate  # asks the server for the state if it is not known yet
+        self._stall_timeout = stall_timeout  # wall-clock seconds within which simulation time must advance
 
     async def run_for(self, seconds: float) -> float:
         """See `URLabClient.run_for`."""
@@ -116,7 +79,7 @@ class Motion:
         return passed
 
     async def move_to(
-        self, articulation: _Movable, targets: Mapping[str, float], tolerance: float, timeout: float
+        self, articulation: URLabArticulation, targets: Mapping[str, float], tolerance: float, timeout: float
     ) -> float:
         """See `URLabArticulation.move_to`."""
         tolerance, limit = _positive("move_to: tolerance", tolerance), _positive("move_to: timeout", timeout)
@@ -143,13 +106,13 @@ class Motion:
 
     async def _until(self, done: Callable[[], bool], what: str, limit: float, slice_s: float) -> tuple[float, bool]:
         """Let time pass until `done` or the limit; return the seconds that passed, and the last result of `done`."""
-        simulation = self._simulation
-        live = simulation.step_mode is StepMode.LIVE
-        if simulation.step_mode is StepMode.DIRECT:  # in puppet mode the state is the client's own
+        state = self._state
+        live = state.mode.live
+        if state.mode.current is StepMode.DIRECT:  # in puppet mode the state is the client's own
             await self._locate()
         if done():
             return 0.0, True
-        start = simulation.sim_time
+        start = state.clocks.sim_time
         restarts = self._session.restarts
         passed = 0.0
         async with aclosing(self._passing(what, limit, slice_s)) as times:
@@ -165,8 +128,8 @@ class Motion:
         return passed, False
 
     async def _passing(self, what: str, limit: float, slice_s: float) -> AsyncGenerator[float, None]:
-        simulation = self._simulation
-        if simulation.step_mode is StepMode.LIVE:
+        state = self._state
+        if state.mode.live:
             end: float | None = None
             async with aclosing(self._live_times(what)) as times:
                 async for now in times:
@@ -174,22 +137,22 @@ class Motion:
                     end = now + limit if end is None else end
                     if now >= end:
                         return
-        end = simulation.sim_time + limit
-        model = simulation.model
+        end = state.clocks.sim_time + limit
+        model = state.mirror.model
         timestep = 0.0 if model is None else float(model.opt.timestep)
-        while (left := end - simulation.sim_time) > timestep / 2:
-            before = simulation.sim_time
+        while (left := end - state.clocks.sim_time) > timestep / 2:
+            before = state.clocks.sim_time
             n = max(1, round(min(left, slice_s) / timestep)) if timestep else 1
-            await simulation.step(n)
-            timestep = timestep or max(0.0, simulation.sim_time - before)
-            yield simulation.sim_time
+            await self._step(n)
+            timestep = timestep or max(0.0, state.clocks.sim_time - before)
+            yield state.clocks.sim_time
 
     async def _live_times(self, what: str) -> AsyncGenerator[float, None]:
         loop = running_loop()
-        if self._driven():
-            await self._simulation.step()
+        if any(record.driven for record in self._state.objects.records.values()):  # set-points must be sent
+            await self._step(1)
         newest, since, restarts = -1.0, loop.time(), self._session.restarts
-        async with self._simulation.state_stream() as snapshots:
+        async with Stream(self._state.publishers.state(), policy="latest") as snapshots:
             while True:
                 now = (await snapshots.receive(timeout=self._stall_timeout)).time
                 self._check_restarts(what, restarts)  # a new server is paused: time stands still there
@@ -213,14 +176,14 @@ class Motion:
 
     async def _findings(self) -> str | None:
         """Return the problems that keep robots from moving, as found by `explain()`."""
-        found = (await self._simulation.explain()).findings
+        found = (await self._explain()).findings
         return " ".join(f"{one.subject}: {one.text}" for one in found if one.verdict is Verdict.PROBLEM) or None
 
 
 class _Aim:
     """One joint on its way to its target."""
 
-    def __init__(self, articulation: _Movable, name: str, target: float) -> None:
+    def __init__(self, articulation: URLabArticulation, name: str, target: float) -> None:
         driven = None if name in articulation.joints else articulation.actuators.get(name)
         if driven is not None and driven.joint is not None:
             raise KeyError(f"move_to takes joints; {name!r} is an actuator, which moves the joint {driven.joint!r}.")

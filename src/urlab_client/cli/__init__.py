@@ -1,8 +1,9 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has a module with its `DESCRIPTION`, its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`. Only the
-module of the command that is run is imported, because every `sim://` server is an `urlab serve`, and none for
-`urlab --help`. An expected failure prints one line on standard error and exits with code 2.
+Each command has a module with its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`; its docstring, without the
+first line, describes the command to users. Only the module of the command that is run is imported, because every
+`sim://` server is an `urlab serve`, and none for `urlab --help`. An expected failure prints one line on standard error
+and exits with code 2.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from urlab_client._installation import MissingExtra
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError
+from urlab_client.values.names import UnknownName
 
 __all__ = ["main"]
 
@@ -60,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name. Defaults to those of this process.
     """
+    if "_ARGCOMPLETE" in os.environ:
+        _complete(os.environ.get("COMP_LINE", ""))
     try:
         try:
             return _run(sys.argv[1:] if argv is None else argv)
@@ -74,12 +78,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _FAILED
 
 
+def _complete(line: str) -> None:
+    """Answer the shell, which asks for the words that can come next, and exit."""
+    import argcomplete
+
+    argcomplete.autocomplete(_parser(next(iter(line.split()[1:]), "")))
+
+
 def _run(argv: Sequence[str]) -> int:
     if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
         reconfigure(errors="backslashreplace")  # not every terminal can encode every file name
     if not argv:
         print(_parser("").format_help(), end="")
         return 0
+    if argv[0] == "help":  # as git and others have it
+        argv = [*argv[1:], "--help"]
     parser = _parser(next((word for word in argv if not word.startswith("-")), ""))
     arguments = parser.parse_args(argv)
     run: Callable[[object], int] = arguments.run
@@ -94,7 +107,7 @@ def _run(argv: Sequence[str]) -> int:
             return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except (CommandError, MissingExtra, URLabError, OSError) as error:
+    except (CommandError, MissingExtra, UnknownName, URLabError, OSError) as error:
         if _is_broken_pipe(error):
             raise
         sys.stderr.write(f"{name}: {one_line(error)}\n")
@@ -132,14 +145,15 @@ def _parser(command: str | None = None) -> Parser:
             ("urlab COMMAND --help", "show the options and examples of a command"),
         ),
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
+    parser.add_argument("-V", "--version", action=_Version, nargs=0, help="show program's version number and exit")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     for name, brief in COMMANDS.items():
         if command not in (None, name):
             subparsers.add_parser(name, help=brief)
             continue
         module = import_module(f"{__name__}.{name.replace('-', '_')}")
-        own = subparsers.add_parser(name, help=brief, description=module.DESCRIPTION, examples=module.EXAMPLES)
+        description = (module.__doc__ or "").partition("\n\n")[2]  # none with python -OO
+        own = subparsers.add_parser(name, help=brief, description=description, examples=module.EXAMPLES)
         module.add_arguments(own)
         own.set_defaults(run=module.run)
     return parser

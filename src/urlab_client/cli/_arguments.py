@@ -209,7 +209,7 @@ def add_cameras(parser: Parser, what: str, hz: float | None = 30.0) -> None:
     Args:
         parser: The command's parser.
         what: What the camera is used for.
-        hz: Default rate, or None for a command without the option.
+        hz: Default rate; None for a command without the option, which takes 30.
     """
     parser.add_argument(
         "--camera",
@@ -218,10 +218,18 @@ def add_cameras(parser: Parser, what: str, hz: float | None = 30.0) -> None:
         metavar="NAME",
         help=f"{what}, as ARTICULATION/CAMERA, or 'all'; may be repeated",
     )
+    parser.set_defaults(camera_hz=30.0)
     if hz is not None:
         parser.add_argument(
             "--camera-hz", type=hertz, default=hz, metavar="HZ", help="pictures per second (default: %(default)s)"
         )
+
+
+def add_record(parser: Parser, hz: float | None = 30.0) -> None:
+    """Add `--record` and what belongs to it; see `recorded`."""
+    parser.add_argument("--record", type=Path, metavar="FILE", help="record into a .mcap file (extra 'mcap')")
+    add_cameras(parser, "with --record: a camera to record", hz)
+    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
 
 
 def cameras(given: list[str]) -> list[str] | Literal["all"]:
@@ -298,13 +306,6 @@ def address(text: str) -> str:
     if text in bundled_models() or text.endswith((".xml", ".json")):
         raise argparse.ArgumentTypeError(f"{text!r} is a model, not an address; write sim://{text} to start a server")
     return f"tcp://{text}"
-
-
-def running_address(text: str) -> str:
-    """Parse the address of a running server."""
-    if text.startswith("sim://"):
-        raise argparse.ArgumentTypeError(f"{text!r} would start a server; give the address of a running one")
-    return address(text)
 
 
 def one_of(*allowed: E) -> Callable[[str], E]:

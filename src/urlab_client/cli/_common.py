@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Container, Generator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -15,6 +16,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+
+_COLUMNS = 120  # where the output is not a terminal
+_VARIABLE = "MUJOCO_GL"
 
 
 class CommandError(Exception):
@@ -78,15 +83,16 @@ def check_ending(path: Path, *endings: str) -> None:
         raise CommandError(f"{path}: write a file that ends in {' or '.join(endings)}, for example {better}")
 
 
-def check_recording(path: Path, *, overwrite: bool) -> None:
+def check_recording(path: Path | None, arguments: Namespace) -> None:
     """Refuse a recording that cannot be written, before the simulation starts."""
+    if path is None:
+        if arguments.camera or arguments.overwrite:
+            raise CommandError("--camera and --overwrite require --record")
+        return
     check_ending(path, ".mcap")
-    if path.exists() and not overwrite:
+    if path.exists() and not arguments.overwrite:
         raise CommandError(f"{path} exists; --overwrite replaces it")
     import urlab_client.integrations.record  # noqa: F401  # pyright: ignore[reportUnusedImport]  # a missing extra
-
-
-_COLUMNS = 120  # where the output is not a terminal
 
 
 @contextlib.contextmanager
@@ -149,9 +155,6 @@ def json_line(value: object) -> str:
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, as in `1 joint` and `2 joints`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-_VARIABLE = "MUJOCO_GL"
 
 
 def import_mujoco() -> None:

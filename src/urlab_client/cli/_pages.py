@@ -22,7 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from urlab_client.aio.background import background_task
 from urlab_client.cli._common import in_background, sigterm_interrupts
-from urlab_client.web.route_group import JOB
+from urlab_client.web.endpoints import JOB
 
 log: logging.Logger = logging.getLogger("urlab_client.web")
 

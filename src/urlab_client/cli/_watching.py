@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING
+from argparse import Namespace
+from collections.abc import AsyncGenerator, Callable, Generator
+from typing import TYPE_CHECKING, Any
 
-from urlab_client.cli._common import CommandError, in_background
+from urlab_client.cli._arguments import cameras
+from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
 from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
+    from urlab_client.integrations.record import AsyncRecorder
 
 _LOOK_S = 0.05
 _AWAY_S = 5.0
@@ -70,6 +73,22 @@ async def run_session(
             else:
                 await asyncio.sleep(_LOOK_S)
                 watch.check()
+
+
+@contextlib.asynccontextmanager
+async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[AsyncRecorder | None]:
+    """Record while the block runs, if `--record` was given."""
+    if arguments.record is None:
+        yield None
+        return
+    from urlab_client.integrations.record import record
+
+    options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
+    recorder = record(client, arguments.record, cameras=cameras(arguments.camera), **options)
+    async with contextlib.AsyncExitStack() as stack:
+        with refusing(KeyError, option="--camera"):
+            await stack.enter_async_context(recorder)
+        yield recorder
 
 
 async def _step(client: URLabClient) -> None:

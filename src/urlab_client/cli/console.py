@@ -1,4 +1,8 @@
-"""`urlab console`: a page in the browser that shows a simulation and lets people interact with it."""
+"""`urlab console`: a page in the browser that shows a simulation and lets people interact with it.
+
+Serve a page that shows a simulation and lets you interact with it, only on this machine, and print a link that admits
+one browser. The page can create more links. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +27,6 @@ from urlab_client.cli._common import CommandError, import_mujoco
 _PORT = 8355
 
 
-DESCRIPTION = (
-    "Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
-    "print a link that admits one browser. The page can create more links. Exits with code 0 on SIGINT "
-    "(Ctrl-C) and SIGTERM."
-)
 EXAMPLES = (
     ("urlab console", "the server on this machine, at a link for your browser"),
     ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),

@@ -1,4 +1,9 @@
-"""`urlab convert`: convert a recording to a table, arrays, a video or a LeRobot dataset."""
+"""`urlab convert`: convert a recording to a table, arrays, a video or a LeRobot dataset.
+
+Convert a recording. CSV, Parquet and LeRobot files hold states with the actions taken at them, NumPy files all states,
+and MP4 files the pictures of one camera. Needs the extra 'urlab-client[mcap]', for Parquet also 'dataset', and for MP4
+also 'video'.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +22,6 @@ if TYPE_CHECKING:
 _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
 
 
-DESCRIPTION = (
-    "Convert a recording. CSV, Parquet and LeRobot files hold states with the actions taken at them, "
-    "NumPy files all states, and MP4 files the pictures of one camera. Needs the extra 'urlab-client[mcap]', for "
-    "Parquet also 'dataset', and for MP4 also 'video'."
-)
 EXAMPLES = (
     ("urlab convert run.mcap run.csv", "states as a table"),
     ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),

@@ -1,4 +1,8 @@
-"""`urlab demo`: drive a robot through both clients on a simulated server, and write the results to disk."""
+"""`urlab demo`: drive a robot through both clients on a simulated server, and write the results to disk.
+
+Start a simulated server, drive one robot through the blocking client and two robots through the async client, and write
+joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +46,6 @@ _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 
 
-DESCRIPTION = (
-    "Start a simulated server, drive one robot through the blocking client and two robots through the "
-    "async client, and write joints.png, last_state.png and run.json. Needs the extra 'urlab-client[demo]'."
-)
 EXAMPLES = (
     ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
     ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
@@ -305,14 +305,6 @@ class _Run:
         self._robots: list[Robot] = [one for one in client.articulations_by_id.values() if one.joints]  # no floor
         turns = _TURNS if len(self._robots) > 1 else (0.0,)
         self._controllers = [_controller(robot, turn) for robot, turn in zip(self._robots, turns, strict=True)]
-        self._lines: dict[str, list[tuple[str, int]]] = {}  # by axis label: name and index of each position
-        for joint in self._robots[0].joints.values():
-            place = joint.qpos_local_offset
-            if joint.jnt_type == _FREE:
-                base = self._lines.setdefault("base position (m)", [])
-                base += [(axis, place + index) for index, axis in enumerate("xyz")]
-            elif joint.jnt_type in _LABELS:
-                self._lines.setdefault(_LABELS[joint.jnt_type], []).append((joint.name, place))
         self._times: list[float] = []
         self._positions: list[Floats] = []
         self._began = time.perf_counter()
@@ -342,10 +334,17 @@ class _Run:
         """Draw the positions over simulation time."""
         from urlab_client.cli.plot import Curves, plot_curves
 
+        lines: dict[str, list[tuple[str, int]]] = {}  # by axis label: name and index of each position
+        for joint in self._robots[0].joints.values():
+            place = joint.qpos_local_offset
+            if joint.jnt_type == _FREE:
+                lines.setdefault("base position (m)", []).extend(zip("xyz", range(place, place + 3), strict=True))
+            elif joint.jnt_type in _LABELS:
+                lines.setdefault(_LABELS[joint.jnt_type], []).append((joint.name, place))
         positions = np.array(self._positions)
         curves = [
-            Curves(label, [name for name, _ in lines], positions[:, [place for _, place in lines]])
-            for label, lines in self._lines.items()
+            Curves(label, [name for name, _ in some], positions[:, [place for _, place in some]])
+            for label, some in lines.items()
         ]
         plot_curves(title, np.array(self._times), curves, file)
 
@@ -354,20 +353,11 @@ def _print_table(console: Console, name: str, outcomes: Sequence[Outcome]) -> No
     columns = "robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"
     runs = table(["client"], columns, f"{name}, direct mode")
     runs.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
-    for outcome in outcomes:
-        runs.add_row(
-            outcome.client,
-            str(outcome.robots),
-            str(outcome.steps),
-            f"{outcome.sim_time:.3f}",
-            f"{outcome.steps_per_second:.0f}",
-            f"{outcome.real_time_factor:.2f}",
-            "\n".join(
-                " ".join(f"{value:6.3f}" for value in values)
-                for pose in outcome.final_base_poses
-                for values in (pose[:3], pose[3:])
-            ),
-        )
+    for one in outcomes:
+        numbers = f"{one.robots} {one.steps} {one.sim_time:.3f} {one.steps_per_second:.0f} {one.real_time_factor:.2f}"
+        rows = [values for pose in one.final_base_poses for values in (pose[:3], pose[3:])]
+        poses = "\n".join(" ".join(f"{value:6.3f}" for value in values) for values in rows)
+        runs.add_row(one.client, *numbers.split(), poses)
     console.print(runs)
 
 

@@ -1,4 +1,9 @@
-"""`urlab doctor`: why is my robot not moving?"""
+"""`urlab doctor`: why is my robot not moving?
+
+Check a server from its sockets to the set-points, and show what keeps robots from moving. This opens a session, which
+takes the server over from the client that drives it, unless you pass --handshake; in your own program, client.explain()
+does the same. Exit code 0 if nothing is wrong, 1 if something is.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +25,6 @@ _UNHEALTHY = 1
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 
-DESCRIPTION = (
-    "Check a server from its sockets to the set-points, and show what keeps robots from moving. This "
-    "opens a session, which takes the server over from the client that drives it, unless you pass --handshake; in "
-    "your own program, client.explain() does the same. Exit code 0 if nothing is wrong, 1 if something is."
-)
 EXAMPLES = (
     ("urlab doctor", "the server on this machine"),
     ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),

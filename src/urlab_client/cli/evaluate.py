@@ -1,4 +1,12 @@
-"""`urlab evaluate`: measure a policy over many seeded episodes."""
+"""`urlab evaluate`: measure a policy over many seeded episodes.
+
+Run a policy for many episodes, each with its own seed, and print its success rate with Wilson's score interval, and its
+return with a bootstrap interval. With --task, the network maps observations of a registered task to actions, as
+learning libraries export it; if the task observes pictures, the network's inputs are named after the observations, such
+as 'arm/qpos' or 'cameras/arm/overview'. Without --task, a TOML file beside the network declares what it observes, as
+for run-policy, and an episode without a fall is a success. Needs the extra 'urlab-client[onnx]', and with --task also
+'urlab-client[gym]'.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +33,6 @@ _MODEST = ""
 _MOST_COPIES = 64
 
 
-DESCRIPTION = (
-    "Run a policy for many episodes, each with its own seed, and print its success rate with Wilson's "
-    "score interval, and its return with a bootstrap interval. With --task, the network maps observations of a "
-    "registered task to actions, as learning libraries export it; if the task observes pictures, the network's "
-    "inputs are named after the observations, such as 'arm/qpos' or 'cameras/arm/overview'. Without --task, a TOML "
-    "file beside the network declares what it observes, as for run-policy, and an episode without a fall is a "
-    "success. Needs the extra 'urlab-client[onnx]', and with --task also 'urlab-client[gym]'."
-)
 EXAMPLES = (
     ("urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100", "on a task, in a batch"),
     (

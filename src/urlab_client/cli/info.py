@@ -1,4 +1,8 @@
-"""`urlab info`: show what is in a recording."""
+"""`urlab info`: show what is in a recording.
+
+Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 if the file is unfinished or damaged, or states
+were dropped. Needs the extra 'urlab-client[mcap]'.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,6 @@ if TYPE_CHECKING:
 _UNFINISHED = 1
 
 
-DESCRIPTION = (
-    "Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 if the file is unfinished "
-    "or damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'."
-)
 EXAMPLES = (
     ("urlab info run.mcap", "duration, topics, rates and gaps"),
     ("urlab info run.mcap --json", "the same for programs"),

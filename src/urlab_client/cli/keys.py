@@ -1,4 +1,8 @@
-"""`urlab keys`: CURVE keys for servers that are open to a network, and for their clients."""
+"""`urlab keys`: CURVE keys for servers that are open to a network, and for their clients.
+
+Make and show CURVE keys. A server that is open to a network needs a key pair, by which clients recognise it, and the
+public key of each client that it admits.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,6 @@ from pathlib import Path
 from urlab_client.cli._arguments import Parser
 from urlab_client.keys import SECRET_SUFFIX, KeyPair, public_key
 
-DESCRIPTION = (
-    "Make and show CURVE keys. A server that is open to a network needs a key pair, by which clients "
-    "recognise it, and the public key of each client that it admits."
-)
 EXAMPLES = (
     ("urlab keys new server ada", "make keys for a server and for a client called ada"),
     ("urlab keys show server.key", "print a public key"),

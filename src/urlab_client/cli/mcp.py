@@ -1,8 +1,16 @@
-"""`urlab mcp`: tools for agents, over the Model Context Protocol."""
+"""`urlab mcp`: tools for agents, over the Model Context Protocol.
+
+Serve tools for agents over the Model Context Protocol, on standard input and output or, with --http, at an address on
+this machine. Without --allow-drive and --allow-edit, an agent can only look, and does not take a running server over
+from another client. The console shows what the agent does; a person who acts there takes the controls from the agent.
+Messages for you, such as the console's link, go to standard error. Exits with code 0 when its input ends, on SIGINT
+(Ctrl-C) and on SIGTERM.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import secrets
 import sys
@@ -25,12 +33,13 @@ from urlab_client.cli._arguments import (
     page_url,
     seconds,
 )
-from urlab_client.cli._common import CommandError, import_mujoco
+from urlab_client.cli._common import CommandError, import_mujoco, sigterm_interrupts
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
+    from urlab_client.console.session import ConsoleSession
     from urlab_client.mcp import Agent
     from urlab_client.web import Access
 
@@ -38,13 +47,6 @@ AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
 
-DESCRIPTION = (
-    "Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
-    "--http, at an address on this machine. Without --allow-drive and --allow-edit, an agent can only look, and "
-    "does not take a running server over from another client. The console shows what the agent does; a person who "
-    "acts there takes the controls from the agent. Messages for you, such as the console's link, go to standard "
-    "error. Exits with code 0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM."
-)
 EXAMPLES = (
     ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
     ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),
@@ -118,9 +120,7 @@ def run(arguments: Namespace) -> int:
     if arguments.models is not None and not arguments.models.is_dir():
         raise CommandError(f"--models {arguments.models}: no such folder")
     import_mujoco()
-    from urlab_client.cli._pages import graceful_exit
-
-    with graceful_exit():
+    with contextlib.suppress(KeyboardInterrupt), sigterm_interrupts():
         asyncio.run(_serve(arguments))
     return 0
 
@@ -142,42 +142,38 @@ def _check_permissions(arguments: Namespace) -> None:
 
 
 async def _serve(arguments: Namespace) -> None:
+    from urlab_client.console.session import ConsoleSession
     from urlab_client.mcp import Agent, Limits
-    from urlab_client.web import Access, app
+    from urlab_client.mcp.transports import serve_stdio
 
-    access = Access(hosts=host_names(arguments))
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
         if arguments.address.startswith("sim://"):  # a failure here is final, whereas a running server may start later
             await client.discover()
-        console = app(
-            client,
-            access=access,
-            handshake=None if arguments.handshake is None else arguments.handshake.read_bytes,
-            recordings=arguments.recordings,
-        )
+        handshake = None if arguments.handshake is None else arguments.handshake.read_bytes
+        session = ConsoleSession(client, recordings=arguments.recordings, handshake=handshake)
         limits = Limits(
             drive=arguments.allow_drive,
             edit=arguments.allow_edit,
             sim_seconds=arguments.max_seconds,
             wall_seconds=arguments.max_wall,
         )
-        agent = Agent(console, limits, models=_models(arguments.models))
-        async with console.router.lifespan_context(console):
+        agent = Agent(session, limits, models=_models(arguments.models))
+        async with session.open():
             if arguments.http:
-                await _serve_http(arguments, agent, console, access)
+                await _serve_http(arguments, agent, session)
+            elif arguments.console:
+                await _serve_stdio_and_console(arguments, agent, session)
             else:
-                await _serve_stdio(arguments, agent, console, access)
+                await serve_stdio(agent)
 
 
-async def _serve_stdio(arguments: Namespace, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_stdio_and_console(arguments: Namespace, agent: Agent, session: ConsoleSession) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import serve_stdio
 
-    if not arguments.console:
-        await serve_stdio(agent)
-        return
+    access, console = _console(arguments, session)
     with bound(arguments.host, _port(arguments)) as listener:
         served = asyncio.create_task(serve_stdio(agent))
         ended = asyncio.Event()
@@ -192,17 +188,26 @@ async def _serve_stdio(arguments: Namespace, agent: Agent, console: Starlette, a
         await served  # raises its failure
 
 
+def _console(arguments: Namespace, session: ConsoleSession) -> tuple[Access, Starlette]:
+    from urlab_client.web import Access
+    from urlab_client.web.application import application_of
+
+    access = Access(hosts=host_names(arguments))
+    return access, application_of(session, access)
+
+
 def _port(arguments: Namespace) -> int:
     if arguments.port is not None:
         return arguments.port
     return AGENT_PORT if arguments.http else 0  # a second agent on this machine serves a console, too
 
 
-async def _serve_http(arguments: Namespace, agent: Agent, console: Starlette, access: Access) -> None:
+async def _serve_http(arguments: Namespace, agent: Agent, session: ConsoleSession) -> None:
     from urlab_client.cli._pages import bound, serve
     from urlab_client.mcp.transports import http_application
     from urlab_client.web import Access
 
+    access, console = _console(arguments, session)
     given = os.environ.get(_TOKEN, "").split()
     tokens = given or [secrets.token_urlsafe(32) for _ in range(arguments.agents)]
     with bound(arguments.host, _port(arguments)) as listener:

@@ -1,4 +1,9 @@
-"""`urlab ping`: show which server answers at an address, and how fast."""
+"""`urlab ping`: show which server answers at an address, and how fast.
+
+Show which server answers at an address: versions, play state and step mode, articulations, and the round-trip times of
+`meta`. This opens a session, which takes the server over from the client that drives it. --no-session reads only the op
+list and the round-trip times, and does not disturb other clients.
+"""
 
 from __future__ import annotations
 
@@ -97,11 +102,6 @@ class RegisteredServer(Struct):
     answers: bool | None
 
 
-DESCRIPTION = (
-    "Show which server answers at an address: versions, play state and step mode, articulations, and "
-    "the round-trip times of `meta`. This opens a session, which takes the server over from the client that "
-    "drives it. --no-session reads only the op list and the round-trip times, and does not disturb other clients."
-)
 EXAMPLES = (
     ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
     ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),

@@ -1,4 +1,8 @@
-"""`urlab plot`: draw curves of a recording as a picture; `plot_trace` also draws those of `urlab demo`."""
+"""`urlab plot`: draw curves of a recording as a picture; `plot_curves` also draws those of `urlab demo`.
+
+Draw joint positions, or other values, of a recording over simulation time. Needs the extras 'urlab-client[mcap]' and
+'urlab-client[demo]'.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +33,6 @@ _PERIOD = 18.0  # of a dashed line, in line widths
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
 
-DESCRIPTION = (
-    "Draw joint positions, or other values, of a recording over simulation time. Needs the extras "
-    "'urlab-client[mcap]' and 'urlab-client[demo]'."
-)
 EXAMPLES = (
     ("urlab plot run.mcap", "all joint positions; the picture is run.png"),
     ("urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png", "velocities of some joints"),

@@ -1,4 +1,11 @@
-"""`urlab record`: record a run to a file."""
+"""`urlab record`: record a run to a file.
+
+Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, physics runs by itself
+and this command watches; in direct mode, this command resets and steps it, with all set-points zero or those of the
+keyframe. Opens a session, which takes the server over from the client that drives it; your own program can call
+record(client, FILE) instead. Ctrl-C ends the recording early. Exit code 1 if states were dropped or a camera sent no
+picture. Needs the extra 'urlab-client[mcap]'.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +35,6 @@ if TYPE_CHECKING:
 _INCOMPLETE = 1
 
 
-DESCRIPTION = (
-    "Record states, poses and pictures of a play session to a file that Foxglove opens. In live mode, "
-    "physics runs by itself and this command watches; in direct mode, this command resets and steps it, with all "
-    "set-points zero or those of the keyframe. Opens a session, which takes the server over from the client that "
-    "drives it; your own program can call record(client, FILE) instead. Ctrl-C ends the recording early. Exit code "
-    "1 if states were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'."
-)
 EXAMPLES = (
     ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
     (
@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> int:
     import_mujoco()
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    check_recording(arguments.output, overwrite=arguments.overwrite)
+    check_recording(arguments.output, arguments)
     if arguments.camera and arguments.address.startswith("sim://"):
         from urlab_client.simulation.opengl import need_backend
 

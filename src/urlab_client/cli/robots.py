@@ -1,4 +1,8 @@
-"""`urlab robots`: list the bundled robots."""
+"""`urlab robots`: list the bundled robots.
+
+List the bundled models and what each one contains. Every command that takes a model, and every sim:// address, accepts
+their names in place of an MJCF file.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +27,6 @@ class Robot(Struct):
     path: str
 
 
-DESCRIPTION = (
-    "List the bundled models and what each one contains. Every command that takes a model, and every "
-    "sim:// address, accepts their names in place of an MJCF file."
-)
 EXAMPLES = (
     ("urlab robots", "a table"),
     ("urlab serve arm --play", "serve one of them"),

@@ -1,11 +1,17 @@
-"""`urlab run-policy`: a network from an ONNX file drives a robot."""
+"""`urlab run-policy`: a network from an ONNX file drives a robot.
+
+Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network observes and what its
+outputs mean. Refuses to start if the robot, step mode, timestep or controller is not the one that the policy requires.
+Without an address it starts a simulated server; with one it opens a session, which takes the server over from the
+client that drives it. Exit code 1 if the robot fell. Needs the extra 'urlab-client[onnx]'.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from argparse import Namespace
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,16 +22,14 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import (
     Parser,
     add_address,
-    add_cameras,
     add_client,
     add_policy,
-    cameras,
+    add_record,
     make_client,
     one_of,
     seconds,
 )
 from urlab_client.cli._common import (
-    CommandError,
     check_recording,
     import_mujoco,
     json_line,
@@ -34,6 +38,7 @@ from urlab_client.cli._common import (
     refusing,
     table,
 )
+from urlab_client.cli._watching import recorded
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
@@ -44,13 +49,6 @@ _FELL = 1
 _SEED = 0
 
 
-DESCRIPTION = (
-    "Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network "
-    "observes and what its outputs mean. Refuses to start if the robot, step mode, timestep or controller is not "
-    "the one that the policy requires. Without an address it starts a simulated server; with one it opens a "
-    "session, which takes the server over from the client that drives it. Exit code 1 if the robot fell. Needs "
-    "the extra 'urlab-client[onnx]'."
-)
 EXAMPLES = (
     ("urlab run-policy walk.onnx", "simulates the robot that walk.toml beside it names"),
     (
@@ -97,11 +95,7 @@ def add_arguments(parser: Parser) -> None:
         help="direct or live (default: the first mode that the declaration allows)",
     )
     parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
-    parser.add_argument(
-        "--record", type=Path, metavar="FILE", help="record the policy's run into a .mcap file (extra 'mcap')"
-    )
-    add_cameras(parser, "with --record: a camera to record", hz=None)
-    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
+    add_record(parser, hz=None)
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_client(parser)
 
@@ -109,10 +103,7 @@ def add_arguments(parser: Parser) -> None:
 def run(arguments: Namespace) -> int:
     """Run the policy; return 1 if the robot fell, else 0."""
     import_mujoco()
-    if arguments.record is not None:
-        check_recording(arguments.record, overwrite=arguments.overwrite)
-    elif arguments.camera or arguments.overwrite:
-        raise CommandError("--camera and --overwrite require --record")
+    check_recording(arguments.record, arguments)
     from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
@@ -147,7 +138,7 @@ async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
                 def show(so_far: PolicyRun, progress: Callable[[float], None] = progress) -> None:
                     progress(so_far.sim_time)
 
-                async with _recorded(client, arguments if actor is policy else None):
+                async with recorded(client, arguments) if actor is policy else contextlib.nullcontext():
                     runs[name] = await run_policy(
                         client, actor, articulation=articulation, seconds=arguments.seconds, on_action=show
                     )
@@ -186,19 +177,6 @@ def _baselines(policy: Policy) -> dict[str, Policy]:
         if policy.spec.goal is not None:
             baseline.goal = policy.goal
     return baselines
-
-
-@contextlib.asynccontextmanager
-async def _recorded(client: URLabClient, arguments: Namespace | None) -> AsyncGenerator[None]:
-    """Record while the block runs, if `--record` was given."""
-    if arguments is None or arguments.record is None:
-        yield
-        return
-    from urlab_client.integrations.record import record
-
-    with refusing(KeyError, option="--camera"):
-        async with record(client, arguments.record, cameras=cameras(arguments.camera), overwrite=arguments.overwrite):
-            yield
 
 
 def _print(runs: dict[str, PolicyRun]) -> None:

@@ -1,4 +1,8 @@
-"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it."""
+"""`urlab serve`: run a simulated server until a signal or the end of standard input stops it.
+
+Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT (Ctrl-C) and SIGTERM, and with
+code 2 if it fails.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,6 @@ import threading
 from argparse import Namespace
 from collections.abc import Generator
 from enum import Enum
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -36,16 +39,19 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
 
+_PASSED_ON = (
+    *("play", "unpaused", "step_mode", "host", "insecure_no_auth", *(f"{name}_port" for name in _PORTS)),
+    *("camera_size", "render_quality", "mjcf_options", "randomise", "actor_names"),
+    *("shm_dir", "dialect", "instance_id", "instance_index"),
+)
+"""Options that the server has by the same name."""
+
 # Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.
 _WAIT_S = 0.1 if sys.platform == "win32" else None
 _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
 
-DESCRIPTION = (
-    "Run a simulated server that any URLab client can talk to. It exits with code 0 on SIGINT "
-    "(Ctrl-C) and SIGTERM, and with code 2 if it fails."
-)
 EXAMPLES = (
     ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
     (
@@ -228,20 +234,15 @@ def run(arguments: Namespace) -> int:
 
     with TemporaryFolder() as temporary:
         server = _server(arguments, arguments.saved_dir or temporary.path)
-        starter = Starter(server, events)
+        starting = start_aside(server, events)
         if next_event(events) is Event.STARTED:
-            if starter.error is not None:
-                raise starter.error
             with server, _metrics(server, arguments) as metrics_port:
-                server.add_failure_callback(lambda _: events.put(Event.FAILED))
+                server.add_failure_callback(lambda _: events.put(CommandError(str(server.failure))))
                 _announce(server, arguments, metrics_port)
-                while (event := next_event(events)) is Event.STARTED:
-                    pass
-                if event is Event.FAILED:
-                    raise CommandError(str(server.failure))
+                next_event(events)
             return 0
-        starter.thread.join(_START_GRACE_S)
-        stuck = starter.thread.is_alive()
+        starting.join(_START_GRACE_S)
+        stuck = starting.is_alive()
         if not stuck:
             server.close()
     if stuck:
@@ -254,34 +255,17 @@ def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
     from urlab_client.server.limits import Limits
     from urlab_client.server.simulated import SimulatedServer
 
+    options = {name: getattr(arguments, name) for name in _PASSED_ON}
     try:
         return SimulatedServer(
             *arguments.models,
-            play=arguments.play,
-            unpaused=arguments.unpaused,
-            step_mode=arguments.step_mode,
-            host=arguments.host,
+            **options,
             curve=_curve(arguments),
-            insecure_no_auth=arguments.insecure_no_auth,
-            step_port=arguments.step_port,
-            state_port=arguments.state_port,
-            ctrl_port=arguments.ctrl_port,
-            info_port=arguments.info_port,
-            camera_port=arguments.camera_port,
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
             controllers=dict(arguments.controller),
             camera_modes=dict(arguments.camera_mode),
-            camera_size=arguments.camera_size,
-            render_quality=arguments.render_quality,
-            mjcf_options=arguments.mjcf_options,
-            randomise=arguments.randomise,
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
-            actor_names=arguments.actor_names,
-            shm_dir=arguments.shm_dir,
-            dialect=arguments.dialect,
-            instance_id=arguments.instance_id,
-            instance_index=arguments.instance_index,
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
@@ -408,38 +392,32 @@ class Event(Enum):
 
     STARTED = "started"
     STOP = "stop"
-    FAILED = "failed"
 
 
-Events: TypeAlias = "queue.SimpleQueue[Event]"  # unlike a threading.Event, it may be used in signal handlers
+# Unlike a threading.Event, it may be used in signal handlers. Errors of other threads are raised in the main thread.
+Events: TypeAlias = "queue.SimpleQueue[Event | BaseException]"
 
 
-class Starter:
-    """Starts the server off the main thread, which can thus handle a signal while a model compiles.
+def start_aside(server: SimulatedServer, events: Events) -> threading.Thread:
+    """Start the server off the main thread, which can thus handle a signal while a model compiles."""
 
-    The thread queues `Event.STARTED` at its end; `error` is what went wrong.
-    """
-
-    def __init__(self, server: SimulatedServer, events: Events) -> None:
-        self.error: BaseException | None = None
-        fail = partial(self._fail, events)
-        self.thread: threading.Thread = daemon("urlab-start", self._start, server, events, failed=fail)
-        self.thread.start()
-
-    def _start(self, server: SimulatedServer, events: Events) -> None:
+    def start() -> None:
         server.start()
         events.put(Event.STARTED)
 
-    def _fail(self, events: Events, error: BaseException) -> None:
-        self.error = error  # raised again by the main thread
-        events.put(Event.STARTED)
+    thread = daemon("urlab-start", start, failed=events.put)
+    thread.start()
+    return thread
 
 
 def next_event(events: Events) -> Event:
-    """Wait for the next event; a signal interrupts the wait."""
+    """Wait for the next event, or raise an error of another thread; a signal interrupts the wait."""
     while True:
         with contextlib.suppress(queue.Empty):
-            return events.get(timeout=_WAIT_S)
+            event = events.get(timeout=_WAIT_S)
+            if isinstance(event, BaseException):
+                raise event
+            return event
 
 
 def stop_on_signals(events: Events, *, ignore_interrupt: bool) -> None:

@@ -1,4 +1,9 @@
-"""`urlab snapshot`: write a picture of a model, of a saved level, or of what a camera of a running server sees."""
+"""`urlab snapshot`: write a picture of a model, of a saved level, or of what a camera of a running server sees.
+
+Write a picture of models or of a saved level, which this command simulates itself, or of what a camera of a running
+server sees, in any mode and without a step. The latter opens a session, which takes the server over from the client
+that drives it, unless you pass --handshake. Needs the extra 'urlab-client[demo]'.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +28,6 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabTimeoutError
-from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient
@@ -35,12 +39,6 @@ _CHUNK = 100  # physics steps per request, for which the server allows 5 s
 _BEYOND_M = 1e5  # farther than any ray can hit
 
 
-DESCRIPTION = (
-    "Write a picture of models or of a saved level, which this command simulates itself, or of what a "
-    "camera of a running server sees, in any mode and without a step. The latter opens a session, which takes the "
-    "server over from the client that drives it, unless you pass --handshake. Needs the extra "
-    "'urlab-client[demo]'."
-)
 EXAMPLES = (
     ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
     (
@@ -146,7 +144,7 @@ def _of_models(arguments: Namespace) -> NDArray[np.uint8]:
     ) as server:
         with URLabClient(**server.client_options(), step_mode="direct") as client:
             client.discover()
-            view = _camera(client, camera) if camera else None
+            view = client.camera(camera) if camera else None
             if arguments.keyframe:
                 client.reset(arguments.keyframe)
             _simulate(client, arguments.seconds or 0.0)
@@ -178,36 +176,19 @@ def _of_running_server(arguments: Namespace) -> NDArray[np.uint8]:
     with make_client(URLabClient, address, arguments, rcv_timeout_ms=timeout_ms) as client:
         client.discover(handshake=handshake(arguments))
         if arguments.camera is None:
+            names = [f"{key}/{camera}" for key, robot in client.articulations.items() for camera in robot.cameras]
             raise CommandError(
                 f"{address}: the plugin has no op for the viewport's picture; give --camera, one of "
-                f"{', '.join(_camera_names(client)) or 'none (is play running?)'}"
+                f"{', '.join(names) or 'none (is play running?)'}"
             )
-        view = _camera(client, arguments.camera)
+        view = client.camera(arguments.camera)
         if arguments.mode not in (None, view.mode):
             raise CommandError(f"--mode {arguments.mode}: {arguments.camera} is a camera of mode {view.mode}")
         try:
-            if arguments.timeout is None:
-                view.capture()
-            else:
-                view.capture(timeout=arguments.timeout)
+            view.capture(**({} if arguments.timeout is None else {"timeout": arguments.timeout}))
         except URLabTimeoutError as error:
             raise CommandError(f"{address}: no picture of {arguments.camera}: {error}") from None
         return _pixels(view)
-
-
-def _camera(client: URLabClient, key: str) -> URLabCameraView:
-    articulation, _, camera = key.partition("/")
-    try:
-        return client.articulations[articulation].cameras[camera]
-    except KeyError:
-        names = _camera_names(client)
-        raise CommandError(
-            f"no camera '{key}'.{did_you_mean(key, names)} There are: {', '.join(names) or 'none (is play running?)'}"
-        ) from None
-
-
-def _camera_names(client: URLabClient) -> list[str]:
-    return [f"{key}/{camera}" for key, robot in client.articulations.items() for camera in robot.cameras]
 
 
 def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:

@@ -1,4 +1,11 @@
-"""`urlab teleop`: move a robot's hand with the keyboard, and record each episode."""
+"""`urlab teleop`: move a robot's hand with the keyboard, and record each episode.
+
+Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint limits. The simulation is
+stepped in real time; an episode begins with the first key. With --record, each episode is saved with the outcome that
+you mark with a key, and `urlab convert` makes a LeRobot dataset of the episodes that were not discarded. Opens a
+session, which takes the server over from the client that drives it. `urlab console` supports gamepads. Needs the extra
+'urlab-client[teleop]', and with --task also 'urlab-client[gym]'.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +17,7 @@ import os
 import select
 import sys
 from argparse import Namespace
-from collections.abc import AsyncGenerator, Callable, Generator
-from pathlib import Path
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,35 +27,25 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import (
     Parser,
     add_address,
-    add_cameras,
     add_client,
-    cameras,
+    add_record,
     count,
     hertz,
     make_client,
     seconds,
 )
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
-from urlab_client.cli._watching import interruptible
+from urlab_client.cli._watching import interruptible, recorded
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
-    from urlab_client.integrations.record import AsyncRecorder
     from urlab_client.integrations.teleop import TeleopCommand, TeleopTally, TeleopView
 
 _SHOWN_S = 0.1
 _MOST = 1024
 
 
-DESCRIPTION = (
-    "Move a robot's hand with the keys of this terminal, by inverse kinematics within its joint "
-    "limits. The simulation is stepped in real time; an episode begins with the first key. With --record, each "
-    "episode is saved with the outcome that you mark with a key, and `urlab convert` makes a LeRobot dataset of "
-    "the episodes that were not discarded. Opens a session, which takes the server over from the client that "
-    "drives it. `urlab console` supports gamepads. Needs the extra 'urlab-client[teleop]', and with --task also "
-    "'urlab-client[gym]'."
-)
 EXAMPLES = (
     ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
     ("urlab teleop sim://arm", "try it, without a recording"),
@@ -63,7 +59,6 @@ EXAMPLES = (
 def add_arguments(parser: Parser) -> None:
     """Add the options."""
     add_address(parser, default=None, otherwise="a simulated server for --task, else tcp://localhost")
-    parser.add_argument("--record", dest="output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
     parser.add_argument("--task", metavar="ID", help="a task of this package, such as urlab/Reach-v0")
     parser.add_argument("--robot", metavar="KEY", help="the articulation (default: the only one)")
     parser.add_argument("--site", metavar="NAME", help="the hand, a site of the robot (default: the only one)")
@@ -85,18 +80,14 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of initial states and goals (default: 0)"
     )
-    add_cameras(parser, "with --record: a camera to record")
-    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
+    add_record(parser)
     add_client(parser)
 
 
 def run(arguments: Namespace) -> int:
     """Teleoperate; return 0."""
     import_mujoco()
-    if arguments.output is not None:
-        check_recording(arguments.output, overwrite=arguments.overwrite)
-    elif arguments.camera or arguments.overwrite:
-        raise CommandError("--camera and --overwrite require --record")
+    check_recording(arguments.record, arguments)
     if arguments.seed < 0:
         raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
     import urlab_client.integrations.teleop  # noqa: F401  # pyright: ignore[reportUnusedImport]
@@ -104,7 +95,7 @@ def run(arguments: Namespace) -> int:
     task = None if arguments.task is None else _task(arguments.task)
     with refusing(KeyError, ValueError), terminal_keys() as keys:
         tally = asyncio.run(_teleoperate(arguments, task, keys))
-    where = "" if arguments.output is None else f"{arguments.output}  "
+    where = "" if arguments.record is None else f"{arguments.record}  "
     print(f"{where}{_counts(tally)}")
     return 0
 
@@ -145,7 +136,7 @@ async def _teleoperate(arguments: Namespace, task: Task | None, keys: Callable[[
                 status.show(view)
                 return TeleopCommand(verdict="quit") if stop.is_set() else operator(view)
 
-            async with _recorded(client, arguments) as recorder:
+            async with recorded(client, arguments) as recorder:
                 try:
                     return await teleoperate(
                         client,
@@ -160,19 +151,6 @@ async def _teleoperate(arguments: Namespace, task: Task | None, keys: Callable[[
                     )
                 finally:
                     status.end()
-
-
-@contextlib.asynccontextmanager
-async def _recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[AsyncRecorder | None]:
-    if arguments.output is None:
-        yield None
-        return
-    from urlab_client.integrations.record import record
-
-    wanted = cameras(arguments.camera)
-    options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
-    async with record(client, arguments.output, cameras=wanted, **options) as recorder:
-        yield recorder
 
 
 def _print_keys() -> None:

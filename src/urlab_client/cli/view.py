@@ -1,4 +1,10 @@
-"""`urlab view`: show a simulation in MuJoCo's window, in a browser, in Rerun or in Foxglove."""
+"""`urlab view`: show a simulation in MuJoCo's window, in a browser, in Rerun or in Foxglove.
+
+Show a play session while it runs. In live mode, physics runs by itself and this command watches; in direct mode, this
+command resets and steps it, with all set-points zero. Opens a session, which takes the server over from the client that
+drives it; your own program can call rerun_view(client) or one of its siblings instead. Ctrl-C ends it. --rerun needs
+the extra 'urlab-client[rerun]', --foxglove 'urlab-client[foxglove]', --web 'urlab-client[web]'.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +38,6 @@ _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
 
-DESCRIPTION = (
-    "Show a play session while it runs. In live mode, physics runs by itself and this command watches; "
-    "in direct mode, this command resets and steps it, with all set-points zero. Opens a session, which takes the "
-    "server over from the client that drives it; your own program can call rerun_view(client) or one of its "
-    "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
-    "'urlab-client[foxglove]', --web 'urlab-client[web]'."
-)
 EXAMPLES = (
     ("urlab view sim://quadruped", "MuJoCo's window"),
     ("urlab view --rerun --camera all", "the server on this machine in Rerun, with every camera"),
@@ -86,7 +85,7 @@ def run(arguments: Namespace) -> int:
     if arguments.where == "web":
         return _show_console(arguments)
     if arguments.where == "viewer":
-        from urlab_client.integrations.view.window import missing_for_window
+        from urlab_client.integrations.view.view import missing_for_window
 
         missing = missing_for_window()
         if missing:

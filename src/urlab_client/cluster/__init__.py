@@ -11,12 +11,10 @@ for _module in ("ray", "gymnasium"):
     if importlib.util.find_spec(_module) is None:
         raise ImportError(f"{_module} is not installed; run: {install_command('ray')}", name=_module)
 
-from urlab_client.cluster.episodes import Episode, Policy, RolloutError  # noqa: E402
+from urlab_client.cluster.episodes import Episode, Policy, RolloutError, run_episode  # noqa: E402
 from urlab_client.cluster.leases import Lease, LeaseLost, LeasePool  # noqa: E402
-from urlab_client.cluster.rollouts import Rollouts, rollouts  # noqa: E402
+from urlab_client.cluster.rollouts import Rollouts, WorkerPool, rollouts  # noqa: E402
 from urlab_client.cluster.saved import load_episodes, missing_ids, save_episode  # noqa: E402
-from urlab_client.cluster.worker import run_episode  # noqa: E402
-from urlab_client.cluster.worker_pool import WorkerPool  # noqa: E402
 
 __all__ = [
     "Episode",

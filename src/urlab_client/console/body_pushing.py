@@ -8,14 +8,14 @@ if the browser disappears.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from urlab_client.console.lease import DrivingLease, Viewer
-from urlab_client.console.mujoco_viewer import MujocoViewer, Shown
+from urlab_client.console.mujoco_viewer import MujocoViewer, Shown, no_model
 from urlab_client.console.replay import Replay
 from urlab_client.enums import StepMode
 
@@ -69,52 +69,30 @@ class Push(Struct):
     target: Vector
 
 
-class Console(Protocol):
-    """The part of the console session that pushing uses."""
-
-    client: URLabClient
-    lease: DrivingLease
-    mujoco_viewer: MujocoViewer
-    replay: Replay
-
-
 class BodyPushing:
-    """The bodies of one console, and at most one push at a time.
+    """The bodies of one console, and at most one push at a time."""
 
-    Args:
-        console: The console session.
-    """
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, client: URLabClient, lease: DrivingLease, viewer: MujocoViewer, replay: Replay) -> None:
+        self._client = client
+        self._lease = lease
+        self._viewer = viewer
+        self._replay = replay
         self._push: Push | None = None
         self._by: Viewer | None = None
         self._until = 0.0
 
     async def bodies(self) -> BodyList:
-        """Return the bodies and where they are.
-
-        Raises:
-            ValueError: The model or its first state has not arrived.
-        """
+        """Return the bodies and where they are."""
         shown = await self._now()
         return BodyList([_view(shown, body) for body in range(1, shown.model.nbody)], *_sphere(shown))
 
     async def body(self, body: int) -> BodyView:
-        """Return one body.
-
-        Raises:
-            ValueError: There is no such body, no model, or no state yet.
-        """
+        """Return one body."""
         shown = await self._now()
         return _view(shown, _checked(shown, body))
 
     async def pick(self, ray: Pick) -> Picked:
-        """Return the first hit of a ray.
-
-        Raises:
-            ValueError: The ray has no direction or is not finite, or no model or state has arrived.
-        """
+        """Return the first hit of a ray."""
         import mujoco
 
         shown = await self._now()
@@ -133,26 +111,20 @@ class BodyPushing:
         return Picked(_view(shown, body), local.tolist(), point.tolist())
 
     async def push(self, viewer: Viewer, push: Push) -> None:
-        """Start or renew a push.
-
-        Raises:
-            NotDriving: Another viewer has the controls.
-            ValueError: The body cannot be pushed, or not at present.
-            URLabError: As `step` raises.
-        """
+        """Start or renew a push."""
         shown = await self._now()
         robot = self._robot(shown, _checked(shown, push.body))
         if not np.isfinite([*push.local, *push.target]).all():
             raise ValueError("a push takes finite numbers")
-        if self._console.replay.open:
+        if self._replay.open:
             raise ValueError("A replay is shown. Go back to live to push.")
-        client = self._console.client
-        if client.step_mode is StepMode.LIVE:
+        mode = self._client.step_mode
+        if mode is StepMode.LIVE:
             raise ValueError(
                 "In live mode a force lasts one physics step at most. To push, choose direct mode and Play, or puppet."
             )
-        self._console.lease.use(viewer)
-        if client.step_mode is StepMode.PUPPET:
+        self._lease.use(viewer)
+        if mode is StepMode.PUPPET:
             await self._place(shown, push, robot)
             return
         self._push, self._by, self._until = push, viewer, time.monotonic() + _HELD_S
@@ -166,8 +138,7 @@ class BodyPushing:
         """Add the force of the push to the next step of direct mode."""
         import mujoco
 
-        viewer = self._console.mujoco_viewer
-        if self._push is None or time.monotonic() > self._until or (shown := viewer.latest()) is None:
+        if self._push is None or time.monotonic() > self._until or (shown := self._viewer.latest()) is None:
             self._push = self._by = None
             return
         push, model, data = self._push, shown.model, shown.data
@@ -186,25 +157,20 @@ class BodyPushing:
         robot.apply_xfrc(name, force=wrench[:3].tolist(), torque=wrench[3:].tolist())
 
     async def _now(self) -> Shown:
-        viewer = self._console.mujoco_viewer
-        if await viewer.shown() is None or (shown := viewer.latest()) is None:
-            raise ValueError(viewer.no_model or "No state has arrived yet.")
+        if await self._viewer.shown() is None or (shown := self._viewer.latest()) is None:
+            raise ValueError(no_model(self._client) or "No state has arrived yet.")
         return shown
 
     def _robot(self, shown: Shown, body: int) -> URLabArticulation:
-        """Return whose body it is.
-
-        Raises:
-            ValueError: The body does not belong to a robot.
-        """
-        robot = self._console.client.articulations.get(_owner(shown, body))
+        """Return whose body it is."""
+        robot = self._client.articulations.get(_owner(shown, body))
         if robot is None:
             raise ValueError(f"{_name(shown, body)} does not belong to a robot. Only bodies of robots can be pushed.")
         return robot
 
     async def _place(self, shown: Shown, push: Push, robot: URLabArticulation) -> None:
         """Move the robot so that the point is where the pointer is."""
-        model, data = shown.model, self._console.client.data
+        model, data = shown.model, self._client.data
         joint = int(model.body_jntadr[_root(model, push.body)])
         free = joint >= 0 and int(model.jnt_type[joint]) == 0
         if not free or data is None:
@@ -212,7 +178,7 @@ class BodyPushing:
         at = int(model.jnt_qposadr[joint])
         point = shown.data.xpos[push.body] + shown.data.xmat[push.body].reshape(3, 3) @ np.array(push.local)
         data.qpos[at : at + 3] = shown.data.qpos[at : at + 3] + np.array(push.target) - point
-        await self._console.client.step(0)
+        await self._client.step(0)
 
 
 def _checked(shown: Shown, body: int) -> int:

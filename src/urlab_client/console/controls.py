@@ -5,54 +5,67 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import anyio
+import msgspec
 import numpy as np
-from msgspec import structs
+from msgspec import Struct, structs
 
-from urlab_client.console.description import WorldDescription
 from urlab_client.console.lease import DrivingLease, Viewer
-from urlab_client.console.ops import encode, perform
+from urlab_client.console.messages import encode
+from urlab_client.console.pictures import Cameras
+from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
-from urlab_client.protocol.base import Effect, Request
-from urlab_client.protocol.codec import op_of
-from urlab_client.protocol.messages.runtime import SetControlSource, SetPaused, SetSimSpeed, SetTwist
-from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.protocol.messages.streams import (
-    StateSnapshot,
+from urlab_client.protocol.base import Effect, Op, Request
+from urlab_client.protocol.codec import from_wire_array, op_of
+from urlab_client.protocol.messages.cameras import (
+    SetCameraDelay,
+    SetCameraDelayOk,
+    SetCameraStreaming,
+    SetCameraStreamingOk,
 )
+from urlab_client.protocol.messages.runtime import (
+    ConfigureController,
+    ConfigureControllerOk,
+    SetControlSource,
+    SetMode,
+    SetModeOk,
+    SetPaused,
+    SetSimOptions,
+    SetSimOptionsOk,
+    SetSimSpeed,
+    SetTwist,
+)
+from urlab_client.protocol.messages.session import ArticulationCommand, Forward, Hello, Reset, Step
+from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, StopPieOk
+from urlab_client.protocol.registry import OPS
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
+SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is not Hello}
+"""The ops that viewers may perform, by name; the console itself holds the session."""
+
 _PERIOD_S = 1 / 60
 
 
-class Console(Protocol):
-    """The part of the console session that the controls use."""
+def parse(op: Op, body: bytes) -> Request[Any]:
+    """Decode a request from JSON."""
+    try:
+        request = msgspec.json.decode(body or b"{}", type=op.request, dec_hook=from_wire_array)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{op.name}: {error}") from None
+    request.session_id = ""
+    return request
 
-    client: URLabClient
-    lease: DrivingLease
-    snapshot: StateSnapshot | None
-    world: WorldDescription
 
-    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
-        """Add a line to the log."""
-        ...
+class SteppedTo(Struct):
+    """Simulation time in seconds, and number of physics steps, after a step."""
 
-    def tell(self) -> None:
-        """Notify all viewers of a change."""
-        ...
-
-    def redescribe(self) -> None:
-        """Describe the world again."""
-        ...
-
-    def watched_cameras(self) -> list[str]:
-        """Return the cameras that viewers watch."""
-        ...
+    time: float
+    step: int
 
 
 class Controls:
@@ -63,18 +76,25 @@ class Controls:
         speed: Pacing of live mode, percent, if a viewer has set it.
         source: The control source, if a viewer has chosen it.
         twists: Commanded velocities by articulation: x, y, yaw.
-        before_step: Callback invoked before each step that the console makes in direct mode.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(
+        self,
+        client: URLabClient,
+        lease: DrivingLease,
+        view: SharedView,
+        cameras: Cameras,
+        before_step: Callable[[], None],
+    ) -> None:
         self.running: bool = False
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
-        self.before_step: Callable[[], None] = lambda: None
-        self._console = console
-        self._client = console.client
-        self._lease = console.lease
+        self._client = client
+        self._lease = lease
+        self._view = view
+        self._cameras = cameras
+        self._before_step = before_step
         self._wake_runner = asyncio.Event()
         self._seeded: set[str] = set()
         self._pending: set[str] = set()
@@ -90,12 +110,7 @@ class Controls:
         return key in self._seeded
 
     async def do(self, viewer: Viewer, request: Request[Any]) -> object:
-        """Perform an op for a viewer.
-
-        Raises:
-            NotDriving: The op changes something, and another viewer has the controls.
-            URLabError: As the client raises.
-        """
+        """Perform an op for a viewer."""
         op = op_of(request)
         if isinstance(request, SetPaused) and request.paused:
             self._lease.interrupt(viewer)  # any viewer may stop
@@ -103,13 +118,13 @@ class Controls:
             self._lease.use(viewer)
         began = time.perf_counter()
         try:
-            reply = await perform(self._client, request)
+            reply = await _perform(self._client, request)
         except (URLabError, ValueError, TypeError, KeyError) as error:
-            self._console.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
+            self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
             raise
         if op.effect is not Effect.READ:
             arguments = encode(structs.asdict(request)).decode()
-            self._console.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
+            self._view.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
         self._follow(request, reply)
         return reply
 
@@ -122,18 +137,15 @@ class Controls:
                 self.source = reply.source
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
+            case ConfigureController():
+                self._view.describe_world()
             case _:
                 pass
-        if op_of(request).name == "configure_controller":
-            self._console.redescribe()
 
     def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
-        """Set set-points by articulation and actuator. In live mode the newest are sent immediately.
+        """Set set-points by articulation and actuator, or none if a name or a number is wrong.
 
-        Raises:
-            NotDriving: Another viewer has the controls.
-            KeyError: An articulation or actuator is unknown; nothing was set.
-            ValueError: A value is not a finite number; nothing was set.
+        In live mode the newest are sent immediately.
         """
         found = {key: (self._client.articulations[key], given) for key, given in values.items()}
         for art, given in found.values():
@@ -153,9 +165,9 @@ class Controls:
         if key in self._seeded:
             return
         self._seeded.add(key)
-        if self._console.snapshot is None or key not in self._console.snapshot.per_articulation or art.ctrl_array.any():
+        state = None if self._view.snapshot is None else self._view.snapshot.per_articulation.get(key)
+        if state is None or art.ctrl_array.any():
             return
-        state = self._console.snapshot.per_articulation[key]
         for actuator in art.actuators.values():
             at = actuator.ctrl_local
             if art.controller is not None and actuator.joint is not None:
@@ -180,34 +192,25 @@ class Controls:
                 await self._client.call(Step(n_steps=0, per_articulation=commands))  # refused by the client if it steps
             except (URLabError, ValueError) as error:
                 if self._client.step_mode is StepMode.LIVE:  # otherwise the next step takes them along
-                    self._console.note("error", "console", "set-points", str(error))
+                    self._view.note("error", "console", "set-points", str(error))
 
-    async def step(self, viewer: Viewer, n_steps: int) -> dict[str, Any]:
-        """Step in direct mode, with the set-points and pictures of the cameras that are watched.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: The mode is another one.
-        """
+    async def step(self, viewer: Viewer, n_steps: int) -> SteppedTo:
+        """Step in direct mode, with the set-points and pictures of the cameras that are watched."""
         if self._client.step_mode is not StepMode.DIRECT:
             raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
         return await self._step(n_steps)
 
-    async def _step(self, n_steps: int) -> dict[str, Any]:
+    async def _step(self, n_steps: int) -> SteppedTo:
         for key, art in self._client.articulations.items():
             self._seed(key, art)
-        self.before_step()
-        watched = dict.fromkeys(self._console.watched_cameras(), "latest")
+        self._before_step()
+        watched = dict.fromkeys(self._cameras.watched(), "latest")
         reply = await self._client.step(n_steps, include_cameras=watched or False)
-        return {"time": reply.time, "step": reply.step}
+        return SteppedTo(reply.time, reply.step)
 
     async def run(self, viewer: Viewer, running: bool) -> None:
-        """Run or stop physics in any mode; any viewer may stop it.
-
-        Raises:
-            NotDriving: It was to run, and somebody else has the controls.
-        """
+        """Run or stop physics in any mode; any viewer may stop it."""
         if running:
             self._lease.use(viewer)
         else:
@@ -216,9 +219,9 @@ class Controls:
             await self.do(viewer, SetPaused(paused=not running))
         else:
             self.running = running
-            self._console.note("call", viewer.name, "run" if running else "stop", "")
+            self._view.note("call", viewer.name, "run" if running else "stop", "")
             self._wake_runner.set()
-        self._console.tell()
+        self._view.notify()
 
     async def keep_stepping(self) -> None:
         """Step in real time in direct mode while `running`; missed steps are not made up for."""
@@ -230,10 +233,43 @@ class Controls:
             began = time.monotonic()
             stepped = False
             try:
-                await self._step(max(1, round(_PERIOD_S / (self._console.world.timestep or _PERIOD_S))))
+                await self._step(max(1, round(_PERIOD_S / (self._view.world.timestep or _PERIOD_S))))
                 stepped = True
             except (URLabError, ValueError, KeyError) as error:  # the program that mounts the console may write a NaN
-                self._console.note("error", "console", "step", str(error))
+                self._view.note("error", "console", "step", str(error))
             finally:
                 self.running = self.running and stepped
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
+
+
+async def _perform(client: URLabClient, request: Request[Any]) -> object:
+    """Send a request, through the client's own method if that also updates state from the reply."""
+    reply: object
+    match request:
+        case SetMode(mode=mode):
+            previous = client.step_mode
+            reply = SetModeOk(previous_mode=previous, current_mode=await client.runtime.set_mode(mode))
+        case SetCameraStreaming(cameras=wanted):
+            reply = SetCameraStreamingOk(cameras=await client.runtime.set_camera_streaming(wanted))
+        case SetCameraDelay(cameras=delays):
+            reply = SetCameraDelayOk(cameras=await client.runtime.set_camera_delay(delays))
+        case BeginPie(level_path=level, timeout_s=limit):
+            result = await client.sim.start(level, timeout_s=limit, raise_on_failure=False)
+            reply = BeginPieOk(state=result.state, compile_error=result.compile_error)
+        case StopPie():
+            await client.sim.stop()
+            reply = StopPieOk()
+        case ConfigureController(articulation=key, params=params) if (art := client.articulations.get(key)) and (
+            controller := art.controller
+        ):
+            reply = ConfigureControllerOk(articulation=key, params=await controller.configure(**params))
+        case SetSimOptions(options=options):
+            given = msgspec.to_builtins(options)
+            reply = SetSimOptionsOk(options=await client.runtime.set_sim_options(**given))
+        case Reset(keyframe_name=name, seed=seed, per_articulation_qpos=overrides):
+            reply = await client.reset(name, seed, overrides)
+        case Forward():
+            reply = await client.runtime.forward()
+        case _:
+            reply = await client.call(request)
+    return reply

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct, field
 
+from urlab_client.console.mujoco_viewer import no_view
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -94,7 +96,7 @@ class WorldDescription(Struct):
     entities: list[str] = field(default_factory=list[str])
 
 
-def describe(client: URLabClient, version: int, no_view: str) -> WorldDescription:
+def describe(client: URLabClient, version: int) -> WorldDescription:
     """Describe what the client knows."""
     model = client.model
     return WorldDescription(
@@ -102,7 +104,7 @@ def describe(client: URLabClient, version: int, no_view: str) -> WorldDescriptio
         urlab_version=client.urlab_version,
         mujoco_version=client.mujoco_version,
         playing=client.manager_present,
-        no_view=no_view,
+        no_view=no_view(client),
         timestep=None if model is None else float(model.opt.timestep),
         articulations=[_articulation(client, art) for art in client.articulations.values()]
         if client.manager_present
@@ -143,8 +145,7 @@ def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -
         limits = joint.limits
     home, model = 0.0, client.model
     if model is not None and said.takes == "position" and joint is not None:
-        at = int(model.jnt_qposadr[joint.id])
-        home = float(_home(model)[at])
+        home = float(_home(model)[int(model.jnt_qposadr[joint.id])])
     place = actuator.ctrl_local.start
     return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
 

@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import anyio
 import numpy as np
 
+from urlab_client.console.controls import Controls
 from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
 from urlab_client.console.messages import Hand
+from urlab_client.console.shared_view import SharedView
 from urlab_client.errors import URLabError
 
 if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.aio import URLabClient
-    from urlab_client.console.controls import Controls
     from urlab_client.integrations.teleop import HandControl
 
 _PERIOD_S = 0.02
@@ -28,27 +29,14 @@ _LASTS_S = 0.25
 _FAR_M = 0.15  # from the target: something else has moved the hand
 
 
-class Console(Protocol):
-    """The part of the console session that hand driving uses."""
-
-    client: URLabClient
-    lease: DrivingLease
-    controls: Controls
-
-    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
-        """Add a line to the log."""
-        ...
-
-
 class HandDriving:
-    """The hands of one console.
+    """The hands of one console."""
 
-    Args:
-        console: The session that all viewers share.
-    """
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, client: URLabClient, lease: DrivingLease, controls: Controls, view: SharedView) -> None:
+        self._client = client
+        self._lease = lease
+        self._controls = controls
+        self._view = view
         self._model: mujoco.MjModel | None = None
         self._hands: dict[str, HandControl] = {}
         self._orders: dict[str, tuple[float, Viewer, Hand]] = {}
@@ -56,18 +44,12 @@ class HandDriving:
         self._ordered = asyncio.Event()
 
     def command(self, viewer: Viewer, order: Hand) -> None:
-        """Move a hand for a moment.
-
-        Raises:
-            NotDriving: Another viewer has the controls.
-            KeyError: There is no such articulation or site.
-            ValueError: A number is not finite, the robot has no hand that can be moved, or the extra is missing.
-        """
+        """Move a hand for a moment."""
         for what, values in (("linear", order.linear), ("angular", order.angular), ("gripper", (order.gripper,))):
             if not np.isfinite(values).all():
                 raise ValueError(f"{what} takes finite numbers, not {list(values)}")
         if any((*order.linear, *order.angular, order.gripper)):
-            self._console.lease.use(viewer)
+            self._lease.use(viewer)
             self._hand(viewer, order.articulation, order.site)
             self._orders[order.articulation] = time.monotonic(), viewer, order
             self._ordered.set()
@@ -95,7 +77,7 @@ class HandDriving:
                     self._drive(viewer, order, passed)
                 except (NotDriving, URLabError, ValueError, KeyError) as error:
                     del self._orders[key]
-                    self._console.note("error", viewer.name, "hand", str(error))
+                    self._view.note("error", viewer.name, "hand", str(error))
 
     def _drive(self, viewer: Viewer, order: Hand, seconds: float) -> None:
         key = order.articulation
@@ -104,26 +86,25 @@ class HandDriving:
             hand.hold()
         self._moving.add(key)
         hand.drive(order.linear, order.angular, order.gripper, dt=seconds)
-        self._console.controls.set_points(viewer, {key: hand.set_points})
+        self._controls.set_points(viewer, {key: hand.set_points})
 
     def _elsewhere(self, hand: HandControl) -> bool:
         """Whether something else has moved the hand since, or set its set-points: a reset, a slider, a policy."""
-        present = self._console.client.articulations[hand.key].get_ctrl()
+        present = self._client.articulations[hand.key].get_ctrl()
         changed = any(abs(present[name] - value) > 1e-9 for name, value in hand.set_points.items())
         return changed or float(np.linalg.norm(hand.ik.pose()[0] - hand.target[0])) > _FAR_M
 
     def _hand(self, viewer: Viewer, key: str, site: str) -> HandControl:
-        client = self._console.client
-        if client.model is not self._model:
+        if self._client.model is not self._model:
             self._hands.clear()
-            self._model = client.model
+            self._model = self._client.model
         hand = self._hands.get(f"{key}/{site}")
         if hand is None:
             try:
                 from urlab_client.integrations.teleop import HandControl
 
-                self._console.controls.set_points(viewer, {key: {}})  # before it holds the joints: holds the others
-                hand = self._hands[f"{key}/{site}"] = HandControl(client, key, site=site or None)
+                self._controls.set_points(viewer, {key: {}})  # before it holds the joints: holds the others
+                hand = self._hands[f"{key}/{site}"] = HandControl(self._client, key, site=site or None)
             except (URLabError, ImportError) as error:
                 raise ValueError(str(error)) from error
         return hand

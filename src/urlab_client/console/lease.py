@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass
 
 import anyio
 
@@ -13,6 +14,7 @@ from urlab_client.aio.background import background_task
 _LOOK_S = 0.1
 
 
+@dataclass(eq=False)
 class Viewer:
     """A viewer: a person with a browser, or a program.
 
@@ -23,11 +25,10 @@ class Viewer:
         keeps: Seconds for which the viewer keeps the controls without acting; None for the lease's default.
     """
 
-    def __init__(self, key: str, name: str, *, yields: bool = False, keeps: float | None = None) -> None:
-        self.key = key
-        self.name = name
-        self.yields = yields
-        self.keeps = keeps
+    key: str
+    name: str
+    yields: bool = False
+    keeps: float | None = None
 
 
 class NotDriving(Exception):
@@ -35,12 +36,7 @@ class NotDriving(Exception):
 
 
 class DrivingLease:
-    """The controls. The first viewer who acts while they are free gets them, and loses them by not acting for a while.
-
-    Args:
-        seconds: How long a viewer keeps them without acting.
-        clock: Monotonic time, seconds.
-    """
+    """The controls. Whoever acts first while they are free gets them, and loses them after `seconds` without an act."""
 
     def __init__(self, seconds: float = 20.0, *, clock: Callable[[], float] = time.monotonic) -> None:
         self.seconds = seconds
@@ -65,11 +61,7 @@ class DrivingLease:
         return 0.0 if self._holder is None else max(0.0, self._until - self._clock())
 
     def use(self, viewer: Viewer) -> None:
-        """Take or keep the controls.
-
-        Raises:
-            NotDriving: Another viewer has them.
-        """
+        """Take or keep the controls."""
         holder = self.holder
         if holder is not None and holder.key != viewer.key and not _gives_way(holder, viewer):
             raise NotDriving(f"{holder.name} has the controls for another {self.left:.0f} s, unless they act again.")
@@ -85,10 +77,8 @@ class DrivingLease:
     async def hold(self, viewer: Viewer) -> AsyncGenerator[None]:
         """Keep the controls while the block runs, and cancel it if another viewer takes them.
 
-        One block runs at a time: it starts after an earlier one, of any viewer, has finished.
-
-        Raises:
-            NotDriving: Another viewer has the controls and the block did not run, or took them meanwhile.
+        One block runs at a time: it starts after an earlier one, of any viewer, has finished. Raises `NotDriving` if
+        another viewer has the controls, and the block did not run, or if another took them meanwhile.
         """
         self.use(viewer)
         async with self._one:

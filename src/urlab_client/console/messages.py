@@ -1,16 +1,15 @@
-"""Messages of the WebSockets: one declaration per message, from which the AsyncAPI document is also generated."""
+"""Messages to and from viewers: one declaration each, from which the AsyncAPI document is also generated."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, cast
 
+import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
 from urlab_client.console.description import WorldDescription
-from urlab_client.console.recordings import Conversion, RunningRecording
-from urlab_client.console.replay import ReplayView
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
 
@@ -76,6 +75,44 @@ class State(Struct, tag_field="type", tag="state"):
     made: float
     articulations: dict[str, ArticulationSample]
     entities: dict[str, EntitySample]
+
+
+class RunningRecording(Struct):
+    """The recording that is under way: its file's name, seconds of real time, states and pictures so far, bytes.
+
+    `failed` says that it can no longer be written.
+    """
+
+    name: str
+    seconds: float
+    states: int
+    pictures: int
+    bytes: int
+    failed: bool
+
+
+class Conversion(Struct):
+    """A recording that is being converted for download, and how much of it has been read, 0 to 1."""
+
+    name: str
+    kind: str
+    camera: str
+    share: float = 0.0
+
+
+class ReplayView(Struct):
+    """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
+
+    `cameras` lists the cameras whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+    """
+
+    name: str
+    time: float
+    seconds: float
+    playing: bool
+    rate: float
+    placing: bool
+    cameras: list[str]
 
 
 class Status(Struct, tag_field="type", tag="status"):
@@ -161,8 +198,16 @@ class Hand(Struct, tag_field="type", tag="hand"):
     site: str = ""
 
 
-FromViewer: TypeAlias = Ack | Ping | Name | Ctrl | Hand
+FromViewer: TypeAlias = Ack | Ctrl | Ping | Name | Hand
 """Messages from a viewer."""
+
+ToViewer: TypeAlias = You | World | State | Status | Log | Refused | Pong
+"""Messages to a viewer."""
+
+
+def tag_of(kind: type[Struct]) -> str:
+    """Return the `type` by which a message says what it is."""
+    return str(kind.__struct_config__.tag)
 
 
 class PictureHead(Struct):
@@ -209,3 +254,19 @@ def state_message(seq: int, snapshot: StateSnapshot, targets: Mapping[str, list[
 def rounded(values: Any) -> list[Any]:
     """Return numbers of as many digits as browsers are told."""
     return np.round(np.asarray(values, dtype=np.float64), _DIGITS).tolist()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return cast("np.ndarray[Any, Any]", value).tolist()
+    if isinstance(value, np.generic):
+        return cast("np.generic[Any]", value).item()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+_encoder = msgspec.json.Encoder(enc_hook=_plain)
+
+
+def encode(value: object) -> bytes:
+    """Return JSON; arrays become lists, and binary values base64 text."""
+    return _encoder.encode(value)

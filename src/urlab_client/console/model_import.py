@@ -18,7 +18,7 @@ import anyio.to_thread
 
 from urlab_client.aio.model.compilation import flatten_confined
 from urlab_client.aio.model.upload import FlatModel, upload
-from urlab_client.console.stoppable import stoppable
+from urlab_client.console.file_jobs import run_job, write_chunks
 from urlab_client.errors import ImportFailed
 from urlab_client.protocol.instances import import_directory
 from urlab_client.values.names import is_file_name
@@ -47,45 +47,21 @@ class WouldReplace(Exception):
         self.name = name
 
 
-async def received_model(name: str, chunks: AsyncIterator[bytes]) -> FlatModel:
-    """Receive a model, and check and compile it in a confined process.
-
-    Args:
-        name: The file's name, which ends with `.xml` or `.zip`.
-        chunks: Its bytes.
-
-    Raises:
-        ValueError: It is neither, exceeds a limit, names files that did not come with it, or MuJoCo rejects it.
-    """
+async def receive_model(name: str, chunks: AsyncIterator[bytes]) -> FlatModel:
+    """Receive a model, and check and compile it in a confined process."""
     if not is_file_name(name) or PurePosixPath(name).suffix.lower() not in {".xml", ".zip"}:
         raise ValueError(f"{name!r} is not the name of a model: send an .xml file, or a .zip archive with one")
     with tempfile.TemporaryDirectory(prefix=_PREFIX, ignore_cleanup_errors=True) as folder:
         file = Path(folder) / name
-        size = 0
-        with file.open("wb") as target:
-            async for chunk in chunks:
-                size += len(chunk)
-                if size > _LARGEST_FILE:
-                    raise ValueError(f"a model is at most {_LARGEST_FILE} bytes")
-                await anyio.to_thread.run_sync(target.write, chunk)
-        return await stoppable(lambda told: flatten_confined(file, told))
+        await write_chunks(file, chunks, _LARGEST_FILE, "a model")
+        return await run_job(lambda told: flatten_confined(file, told))
 
 
-async def import_model(client: URLabClient, name: str, model: FlatModel, replace: str) -> URLabBlueprint:
+async def make_blueprint(client: URLabClient, name: str, model: FlatModel, replace: str) -> URLabBlueprint:
     """Make a blueprint of a model.
 
     A server of this user on this machine imports it from the disk, under the name of its file. Another one receives it
     over the wire, if it accepts uploads.
-
-    Args:
-        client: The client.
-        name: The file's name.
-        model: The model.
-        replace: Name of the blueprint that may be replaced; empty for none.
-
-    Raises:
-        WouldReplace: Another blueprint would be replaced.
-        URLabError: The server rejects the model.
     """
     stem = re.sub(r"\W", "_", PurePosixPath(name).stem)[:_NAME_CHARACTERS]
     with tempfile.TemporaryDirectory(prefix=_PREFIX, dir=_import_folder(), ignore_cleanup_errors=True) as folder:

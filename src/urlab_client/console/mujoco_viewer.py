@@ -21,13 +21,14 @@ import anyio.to_thread
 import msgspec
 import numpy as np
 
-from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.protocol.messages.streams import StateSnapshot
 
 if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.aio import URLabClient
+    from urlab_client.console.shared_view import SharedView
 
 SPECTATOR = "viewers=1;role=spectator;queue_pos=0;queue_len=0;max_spectators=0"
 """Tells a page that it watches."""
@@ -102,45 +103,40 @@ class Shown(NamedTuple):
     data: mujoco.MjData
     bundle: bytes
     crc: int
-    addresses: Mapping[str, Any]
-    velocities: Mapping[str, Any]
+    robots: Mapping[str, ArticulationLayout]
     camera: Any
     flags: list[int]
     prefixes: Mapping[str, str]
     layout: str
 
 
+def no_view(client: URLabClient) -> str:
+    """Return why there is no 3-D view; empty if there is one."""
+    if files() is None:
+        import mujoco
+
+        return f"MuJoCo {mujoco.__version__} has no web viewer here. Wheels for Linux and macOS have one since 4.0."
+    return no_model(client)
+
+
+def no_model(client: URLabClient) -> str:
+    """Return why there is no model to show; empty if there is one."""
+    if client.model is not None:
+        return ""
+    if not client.manager_present:
+        return "Waiting for a play session: begin play to see the robots."
+    return "The 3-D view needs a compiled model, and the console has none."
+
+
 class MujocoViewer:
-    """The model and the newest state for browsers; each state is written once, however many watch.
+    """The model and the shown state for browsers; each state is written once, however many watch."""
 
-    Args:
-        client: The client.
-    """
-
-    def __init__(self, client: URLabClient) -> None:
+    def __init__(self, client: URLabClient, view: SharedView) -> None:
         self._client = client
+        self._view = view
         self._shown: Shown | None = None
         self._written: tuple[StateSnapshot, bytes] | None = None
-        self._snapshot: StateSnapshot | None = None
         self._placed: StateSnapshot | None = None
-
-    @property
-    def missing(self) -> str:
-        """The reason why there is no view; empty if there is one."""
-        if files() is None:
-            import mujoco
-
-            return f"MuJoCo {mujoco.__version__} has no web viewer here. Wheels for Linux and macOS have one since 4.0."
-        return self.no_model
-
-    @property
-    def no_model(self) -> str:
-        """The reason why there is no model to show; empty if there is one."""
-        if self._client.model is not None:
-            return ""
-        if not self._client.manager_present:
-            return "Waiting for a play session: begin play to see the robots."
-        return "The 3-D view needs a compiled model, and the console has none."
 
     async def shown(self) -> Shown | None:
         """Return the client's model, made ready for browsers where MuJoCo has a viewer for them, or None."""
@@ -153,15 +149,11 @@ class MujocoViewer:
             self._written = self._placed = None
         return self._shown
 
-    def follow(self, snapshot: StateSnapshot) -> None:
-        """Take the newest state; it costs nothing until a viewer asks for it."""
-        self._snapshot = snapshot
-
     def latest(self) -> Shown | None:
         """Return the model with the newest state in its data and bodies placed; None without one of them."""
         import mujoco
 
-        shown, snapshot = self._shown, self._snapshot
+        shown, snapshot = self._shown, self._view.snapshot
         if shown is None or snapshot is None or shown.model is not self._client.model:
             return None
         if self._placed is not snapshot:
@@ -174,7 +166,11 @@ class MujocoViewer:
     def write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
         """Return a state as the page reads it."""
         if self._written is None or self._written[0] is not snapshot:
-            self._written = snapshot, self._write(shown, snapshot)
+            import mujoco
+
+            self._place(shown, snapshot)
+            view = shown.camera, mujoco.MjvPerturb(), mujoco.MjvOption()
+            self._written = snapshot, _serialize(shown.model, shown.data, view, shown.flags, shown.crc)
         return self._written[1]
 
     def _place(self, shown: Shown, snapshot: StateSnapshot) -> None:
@@ -182,12 +178,11 @@ class MujocoViewer:
         model, data = shown.model, shown.data
         data.time = snapshot.time
         for key, state in snapshot.per_articulation.items():
-            addresses = shown.addresses.get(key)
-            if addresses is not None and len(state.qpos) == len(addresses):
-                data.qpos[addresses] = state.qpos
-                velocities = shown.velocities[key]
-                if len(state.qvel) == len(velocities):
-                    data.qvel[velocities] = state.qvel
+            robot = shown.robots.get(key)
+            if robot is not None and len(state.qpos) == len(robot.qpos_adr):
+                data.qpos[robot.qpos_adr] = state.qpos
+                if len(state.qvel) == len(robot.qvel_adr):
+                    data.qvel[robot.qvel_adr] = state.qvel
         for name, pose in snapshot.entities.items():
             entity = self._client.entities.get(name)
             if entity is None:
@@ -198,18 +193,6 @@ class MujocoViewer:
             elif pose.qpos is not None and entity.qpos_offset is not None:
                 data.qpos[entity.qpos_offset : entity.qpos_offset + 7] = pose.qpos
 
-    def _write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
-        import mujoco
-
-        self._place(shown, snapshot)
-        return _serialize(
-            shown.model,
-            shown.data,
-            (shown.camera, mujoco.MjvPerturb(), mujoco.MjvOption()),
-            shown.flags,
-            shown.crc,
-        )
-
 
 def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     import mujoco
@@ -218,12 +201,10 @@ def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     bundle: bytes = _payload().serialize_model_bundle(model) if viewed else b""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    layouts = articulation_layouts(model, prefixes)
-    addresses = {key: layout.qpos_adr for key, layout in layouts.items()}
-    velocities = {key: layout.qvel_adr for key, layout in layouts.items()}
+    robots = articulation_layouts(model, prefixes)
     flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
     data, layout = mujoco.MjData(model), _layout(model) if viewed else ""
-    return Shown(model, data, bundle, zlib.crc32(bundle), addresses, velocities, camera, flags, prefixes, layout)
+    return Shown(model, data, bundle, zlib.crc32(bundle), robots, camera, flags, prefixes, layout)
 
 
 def _serialize(
@@ -246,6 +227,16 @@ def _serialize(
 
 _MARK = 0x5A3C1E7B
 _PLACE = (12345.678, 23456.789, 34567.891)
+_MARKED: dict[str, tuple[int, str, Any]] = {
+    "camera": (0, "lookat", _PLACE),
+    "select": (1, "select", _MARK),
+    "active": (1, "active", _MARK),
+    "localpos": (1, "localpos", _PLACE),
+    "refselpos": (1, "refselpos", _PLACE),
+    "frame": (2, "frame", _MARK),
+    "flags": (2, "flags", 0x5A),
+}
+"""What the page changes in a state: in its camera (0), perturbation (1) or options (2), and a value to find it by."""
 
 
 def _layout(model: mujoco.MjModel) -> str:
@@ -257,30 +248,19 @@ def _layout(model: mujoco.MjModel) -> str:
 
     data = mujoco.MjData(model)
     places: dict[str, Any] = {"fovy": float(model.vis.global_.fovy)}
-
-    def find(name: str, mark: bytes, camera: Any = None, perturb: Any = None, option: Any = None) -> None:
-        parts = camera or mujoco.MjvCamera(), perturb or mujoco.MjvPerturb(), option or mujoco.MjvOption()
-        written = _serialize(model, data, parts, [0] * int(mujoco.mjtRndFlag.mjNRNDFLAG))
+    for name, (owner, attribute, value) in _MARKED.items():
+        view = mujoco.MjvCamera(), mujoco.MjvPerturb(), mujoco.MjvOption()
+        part = view[owner]
+        field: Any = getattr(part, attribute)
+        if isinstance(field, int):
+            setattr(part, attribute, value)
+            mark = struct.pack("<i", value)
+        else:
+            field[:] = value
+            mark = bytes(field)
+        written = _serialize(model, data, view, [0] * int(mujoco.mjtRndFlag.mjNRNDFLAG))
         if written.count(mark) == 1:
             places[name] = written.index(mark)
-
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = _PLACE
-    find("camera", struct.pack("<3d", *_PLACE), camera=camera)
-    for name in ("select", "active"):
-        perturb = mujoco.MjvPerturb()
-        setattr(perturb, name, _MARK)
-        find(name, struct.pack("<i", _MARK), perturb=perturb)
-    for name in ("localpos", "refselpos"):
-        perturb = mujoco.MjvPerturb()
-        getattr(perturb, name)[:] = _PLACE
-        find(name, struct.pack("<3d", *_PLACE), perturb=perturb)
-    option = mujoco.MjvOption()
-    option.frame = _MARK
-    find("frame", struct.pack("<i", _MARK), option=option)
-    option = mujoco.MjvOption()
-    option.flags[:] = 0x5A
-    find("flags", bytes(option.flags), option=option)
     if "flags" in places:
         shown = mujoco.mjtVisFlag
         places["contacts"] = [

@@ -12,19 +12,19 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio.to_thread
 from msgspec import Struct
 
 from urlab_client._installation import MissingExtra, need
-from urlab_client.console.stoppable import Progress, stoppable
+from urlab_client.console.file_jobs import Progress, run_job, write_chunks
+from urlab_client.console.messages import Conversion, RunningRecording
 from urlab_client.errors import URLabError
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
     from urlab_client.integrations._feed.messages import EpisodeOutcome
-    from urlab_client.integrations.record.reader import Run
     from urlab_client.integrations.record.recorder import AsyncRecorder
 
 KINDS = ("csv", "mp4", "npz")
@@ -36,20 +36,6 @@ _LARGEST_FILE = 4 << 30
 _CAMERA_HZ = 30.0
 
 
-class RunningRecording(Struct):
-    """The recording that is under way: its file's name, seconds of real time, states and pictures so far, bytes.
-
-    `failed` says that it can no longer be written.
-    """
-
-    name: str
-    seconds: float
-    states: int
-    pictures: int
-    bytes: int
-    failed: bool
-
-
 class RecordingView(Struct):
     """One recording of the folder; `at` is Unix time in seconds."""
 
@@ -58,22 +44,23 @@ class RecordingView(Struct):
     at: float
 
 
-class Conversion(Struct):
-    """A recording that is being converted for download, and how much of it has been read, 0 to 1."""
+class RecordingContents(RecordingView):
+    """A recording and what is in it: length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
-    name: str
-    kind: str
-    camera: str
-    share: float = 0.0
+    `lost` counts states and pictures that came too fast to be written. `unavailable` holds the formats that the
+    recording cannot be converted to here, each with what is missing.
+    """
+
+    seconds: float
+    robots: list[str]
+    cameras: list[str]
+    damage: str
+    lost: int
+    unavailable: dict[str, str]
 
 
 class Recordings:
-    """The recordings of one console.
-
-    Args:
-        client: The client.
-        folder: Folder of the files; created with the first one.
-    """
+    """The recordings of one console."""
 
     def __init__(self, client: URLabClient, folder: Path) -> None:
         self.folder = folder
@@ -83,7 +70,7 @@ class Recordings:
         self._began = 0.0
         self._task: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
-        self._described: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._described: dict[str, tuple[float, RecordingContents]] = {}
 
     @property
     def running(self) -> RunningRecording | None:
@@ -102,13 +89,7 @@ class Recordings:
         )
 
     async def start(self, *, cameras: bool) -> str:
-        """Start a recording and return its file's name.
-
-        Raises:
-            ValueError: A recording is running.
-            URLabError: The client has no session, or no play session is running.
-            OSError: The file cannot be created.
-        """
+        """Start a recording and return its file's name."""
         if self._task is not None:
             raise ValueError("a recording runs already: stop it first")
         from urlab_client.integrations.record import record
@@ -150,22 +131,13 @@ class Recordings:
             self._recorder = None
 
     async def mark(self, outcome: EpisodeOutcome) -> None:
-        """Record the outcome of the current episode.
-
-        Raises:
-            ValueError: No recording is running.
-        """
+        """Record the outcome of the current episode."""
         if self._recorder is None:
             raise ValueError("no recording runs, so the outcome of an episode cannot be recorded: start one first")
         await self._recorder.mark(outcome)
 
-    async def stop(self) -> dict[str, Any]:
-        """End the recording and describe it.
-
-        Raises:
-            ValueError: No recording is running.
-            URLabError: The recording could not be written.
-        """
+    async def stop(self) -> RecordingContents:
+        """End the recording and describe it."""
         recorder = self._recorder
         if recorder is None:
             raise ValueError("no recording runs")
@@ -197,24 +169,16 @@ class Recordings:
         return sorted(views, key=lambda view: view.at, reverse=True)
 
     def path(self, name: str) -> Path:
-        """Return the file of a recording.
-
-        Raises:
-            KeyError: There is none of that name.
-        """
+        """Return the file of a recording."""
         file = self.folder / name
         if not _NAME.fullmatch(name) or not file.is_file():
             raise KeyError(f"no recording is called {name!r}")
         return file
 
-    async def describe(self, name: str) -> dict[str, Any]:
+    async def describe(self, name: str) -> RecordingContents:
         """Return name, size, length in seconds, robots, cameras, and why the file is incomplete, if it is.
 
         `unavailable` holds the formats that it cannot be converted to here, each with what is missing.
-
-        Raises:
-            KeyError: There is none of that name.
-            URLabError: The file is not a recording.
         """
         file = self.path(name)
         changed = file.stat().st_mtime
@@ -225,13 +189,7 @@ class Recordings:
 
     @contextlib.asynccontextmanager
     async def converted(self, name: str, kind: str, camera: str = "") -> AsyncGenerator[Path]:
-        """Yield a recording as a file of another format, which is deleted afterwards.
-
-        Raises:
-            KeyError: There is no such recording, or no such camera in it.
-            ValueError: There is no such format.
-            URLabError: The file is not a recording, or a library for that format is not installed.
-        """
+        """Yield a recording as a file of another format, which is deleted afterwards."""
         file = self.path(name)
         if kind not in KINDS:
             raise ValueError(f"a recording is converted to {', '.join(KINDS)}, not {kind!r}")
@@ -246,18 +204,13 @@ class Recordings:
 
             self.conversions.append(conversion)
             try:
-                await stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
+                await run_job(lambda told: _convert(file, target, kind, camera, told), progress)
             finally:
                 self.conversions.remove(conversion)
             yield target
 
-    async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Add a recording that was made elsewhere, and describe it.
-
-        Raises:
-            ValueError: The name is not that of a recording or is taken, or the file is too large.
-            URLabError: The file is not a recording; it is not kept.
-        """
+    async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> RecordingContents:
+        """Add a recording that was made elsewhere, and describe it."""
         if not _NAME.fullmatch(name):
             raise ValueError(f"{name!r} is not a valid name of a recording: it must end in .mcap or .json")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -266,14 +219,8 @@ class Recordings:
             raise ValueError(f"there is a recording {name!r} already")
         partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # concurrent uploads may have the same name
         try:
-            size = 0
-            with partial.open("xb") as file:
-                async for chunk in chunks:
-                    size += len(chunk)
-                    if size > _LARGEST_FILE:
-                        raise ValueError(f"a recording is at most {_LARGEST_FILE} bytes")
-                    await anyio.to_thread.run_sync(file.write, chunk)
-            await stoppable(lambda told: _described(partial, told))
+            await write_chunks(partial, chunks, _LARGEST_FILE, "a recording")
+            await run_job(lambda told: _described(partial, told))
             if target.exists():  # by now
                 raise ValueError(f"there is a recording {name!r} already")
             partial.rename(target)
@@ -282,43 +229,29 @@ class Recordings:
         return await self.describe(name)
 
     def remove(self, name: str) -> None:
-        """Delete a recording.
-
-        Raises:
-            KeyError: There is none of that name.
-            ValueError: It is being recorded.
-        """
+        """Delete a recording."""
         if self._recorder is not None and self._recorder.path.name == name:
             raise ValueError(f"{name} is being recorded: stop that first")
         self.path(name).unlink()
         self._described.pop(name, None)
 
 
-def open_run(file: Path) -> Run:
-    """Open a recording.
-
-    Raises:
-        URLabError: The file is not a recording.
-    """
+def _described(file: Path, progress: Progress | None = None) -> RecordingContents:
     from urlab_client.integrations.record import read_run
 
-    return read_run(file)
-
-
-def _described(file: Path, progress: Progress | None = None) -> dict[str, Any]:
-    summary = open_run(file).summary(progress)
+    summary = read_run(file).summary(progress)
     cameras = [name.removeprefix("/camera/") for name in summary.topics if name.startswith("/camera/")]
-    return {
-        "name": file.name,
-        "bytes": file.stat().st_size,
-        "at": file.stat().st_mtime,
-        "seconds": round(summary.duration_s, 3),
-        "robots": [name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
-        "cameras": [name for name in cameras if not name.endswith("/calibration")],
-        "damage": summary.damage,
-        "lost": summary.dropped_states + summary.dropped_frames,
-        "unavailable": _unavailable(),
-    }
+    return RecordingContents(
+        name=file.name,
+        bytes=file.stat().st_size,
+        at=file.stat().st_mtime,
+        seconds=round(summary.duration_s, 3),
+        robots=[name.removeprefix("/state/") for name in summary.topics if name.startswith("/state/")],
+        cameras=[name for name in cameras if not name.endswith("/calibration")],
+        damage=summary.damage,
+        lost=summary.dropped_states + summary.dropped_frames,
+        unavailable=_unavailable(),
+    )
 
 
 def _unavailable() -> dict[str, str]:
@@ -330,16 +263,15 @@ def _unavailable() -> dict[str, str]:
 
 
 def _convert(file: Path, target: Path, kind: str, camera: str, progress: Progress) -> None:
-    from urlab_client.integrations.record import export
+    from urlab_client.integrations.record import export, read_run
 
-    run = open_run(file)
+    run = read_run(file)
     try:
-        match kind:
-            case "csv":
-                export.write_csv(run, target, progress)
-            case "npz":
-                export.write_npz(run, target, progress=progress)
-            case _:
-                export.write_mp4(run, target, camera, progress)
+        if kind == "csv":
+            export.write_csv(run, target, progress)
+        elif kind == "npz":
+            export.write_npz(run, target, progress=progress)
+        else:
+            export.write_mp4(run, target, camera, progress)
     except MissingExtra as error:
         raise URLabError(str(error)) from None

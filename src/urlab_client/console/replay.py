@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 import anyio.to_thread
@@ -20,7 +20,9 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.model.layout import articulation_layouts
-from urlab_client.console.recordings import open_run
+from urlab_client.console.messages import ReplayView
+from urlab_client.console.pictures import OF_SCENE, Cameras
+from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
@@ -31,54 +33,10 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record.contents import RecordedArticulation, RecordedPicture, RecordedState
     from urlab_client.integrations.record.reader import Run
 
-_T = TypeVar("_T")
-
 _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
-_OF_SCENE = "-/"
 _PAST_STATES = 200
 _ROUNDING_S = 1e-6  # of slider values in browsers; and a picture may be a nanosecond later than its state
-
-
-class ReplayView(Struct):
-    """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
-
-    `cameras` lists the cameras whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
-    """
-
-    name: str
-    time: float
-    seconds: float
-    playing: bool
-    rate: float
-    placing: bool
-    cameras: list[str]
-
-
-class Publisher(Protocol):
-    """The part of the console session that a replay uses."""
-
-    client: URLabClient
-
-    def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
-        """Show a state to all viewers in place of the server's."""
-        ...
-
-    async def renew_pictures(self) -> None:
-        """Switch the source of pictures between the recording and the simulation."""
-        ...
-
-    def watched_cameras(self) -> list[str]:
-        """Return the cameras that viewers watch, by the names that `step` takes."""
-        ...
-
-    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
-        """Add a line to the log."""
-        ...
-
-    def tell(self) -> None:
-        """Notify all viewers of a change."""
-        ...
 
 
 class _Before(Struct):
@@ -100,16 +58,17 @@ class _Robot(Struct):
 class Replay:
     """The replay of one console, at most one at a time.
 
-    Args:
-        console: What shows it.
+    Attributes:
+        cameras: Cameras of which the recording has pictures, as `ARTICULATION/CAMERA` or `-/CAMERA`.
     """
 
-    def __init__(self, console: Publisher) -> None:
-        self._console = console
-        self._client = console.client
+    def __init__(self, client: URLabClient, view: SharedView, cameras: Cameras) -> None:
+        self.cameras: frozenset[str] = frozenset()
+        self._client = client
+        self._view = view
+        self._shown_cameras = cameras
         self._run: Run | None = None
         self._robots: dict[str, _Robot] = {}
-        self._cameras: frozenset[str] = frozenset()
         self._start = self._seconds = 0.0
         self._at = 0.0
         self._playing = False
@@ -132,7 +91,7 @@ class Replay:
             self._playing,
             self._rate,
             self._before is not None,
-            [] if self._before is not None else sorted(self._cameras),
+            [] if self._before is not None else sorted(self.cameras),
         )
 
     @property
@@ -155,30 +114,16 @@ class Replay:
         """Position on the recording's clock, seconds, late enough for times that were rounded."""
         return self._start + self._at + _ROUNDING_S
 
-    def has_pictures(self, camera: str) -> bool:
-        """Return whether the pictures of a camera, `ARTICULATION/CAMERA` or `-/CAMERA`, come from the recording."""
-        return self._run is not None and self._before is None and camera in self._cameras
-
     async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
-        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start.
-
-        Raises:
-            URLabError: The file is damaged at this position.
-            OSError: The file cannot be read.
-        """
+        """Return a camera's picture at the replay's position, and its time in seconds from the recording's start."""
         run, at = self._run, self._moment
-        if run is None or not self.has_pictures(camera):
+        if run is None:
             return None
-        found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(_OF_SCENE), at))
+        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(camera.removeprefix(OF_SCENE), at))
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
-        """Return states of the last seconds before the replay's position, evenly spaced, oldest first.
-
-        Raises:
-            ValueError: No recording is replayed.
-            URLabError: The file is damaged at this position.
-        """
+        """Return states of the last seconds before the replay's position, evenly spaced, oldest first."""
         run, robots, start, at = self._run, self._robots, self._start, self._at
         if run is None:
             raise ValueError("no recording is replayed")
@@ -191,19 +136,11 @@ class Replay:
                     found[state.time] = _snapshot(state, _present(state, robots), state.time - start)
             return [*found.values()]
 
-        return await _read(read)
+        return await anyio.to_thread.run_sync(read)
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
-        """Show a recording from its start.
-
-        Args:
-            file: The recording.
-            placing: Whether to place the simulation's robots, too; its mode is puppet meanwhile.
-
-        Raises:
-            URLabError: The file is not a recording, or not one of the current robots; or as the client raises.
-        """
-        run, (start, end), names, cameras = await _read(lambda: _opened(file))
+        """Show a recording from its start."""
+        run, (start, end), names, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
         if not names:
             raise URLabError(f"{file.name} holds no states of robots.")
         robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
@@ -211,24 +148,20 @@ class Replay:
             there = ", ".join(self._client.articulations) or "none"
             raise URLabError(f"{file.name} is a recording of other robots than the current ones ({there}).")
         await self.end()
-        self._run, self._robots, self._cameras = run, robots, cameras
+        self._run, self._robots, self.cameras = run, robots, cameras
         self._start, self._seconds = start, end - start
         self._at, self._rate, self._state = 0.0, 1.0, None
         if placing:
             await self._take_over()
         self._playing = True
-        await self._console.renew_pictures()
+        await self._show_pictures()
         self._wake.set()
-        self._console.tell()
+        self._view.notify()
 
     async def change(
         self, *, at: float | None = None, playing: bool | None = None, rate: float | None = None
     ) -> ReplayView:
-        """Seek, play or pause, and set the pace; None leaves a value unchanged.
-
-        Raises:
-            ValueError: No recording is replayed, or a number is out of range.
-        """
+        """Seek, play or pause, and set the pace; None leaves a value unchanged."""
         if self._run is None:
             raise ValueError("no recording is replayed")
         if rate is not None:
@@ -244,7 +177,7 @@ class Replay:
         await self._show()
         await self._place()
         self._wake.set()
-        self._console.tell()
+        self._view.notify()
         return cast("ReplayView", self.view)
 
     async def end(self) -> None:
@@ -253,8 +186,8 @@ class Replay:
             return
         self._run, self._playing = None, False
         before, self._before = self._before, None
-        await self._console.renew_pictures()
-        self._console.tell()
+        await self._show_pictures()
+        self._view.notify()
         data = self._client.data
         if before is not None and data is not None and data.qpos.shape == before.qpos.shape:
             data.qpos[:], data.qvel[:] = before.qpos, before.qvel
@@ -279,28 +212,32 @@ class Replay:
                 await self._show()
                 shown = True
             except (URLabError, OSError) as error:
-                self._console.note("error", "console", "replay", str(error))
+                self._view.note("error", "console", "replay", str(error))
             finally:
                 self._playing = self._playing and shown
             try:
                 await self._place()
             except (URLabError, ValueError) as error:
                 self._before = None
-                await self._console.renew_pictures()
-                self._console.note("error", "console", "replay", str(error))
+                await self._show_pictures()
+                self._view.note("error", "console", "replay", str(error))
 
     async def _show(self) -> None:
         async with self._showing:  # one at a time, each of the present moment: none comes after a later one
             run, at = self._run, self._moment
             if run is None:
                 return
-            state = await _read(lambda: run.state_at(at))
+            state = await anyio.to_thread.run_sync(lambda: run.state_at(at))
             if state is None or self._run is not run:
                 return
             self._state = state
             robots = _present(state, self._robots)
             targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
-            self._console.show(_snapshot(state, robots, state.time - self._start), targets)
+            self._view.show(_snapshot(state, robots, state.time - self._start), targets)
+
+    async def _show_pictures(self) -> None:
+        """Show recorded pictures; those of the simulation while its robots are placed, too."""
+        await self._shown_cameras.show(self if self._run is not None and self._before is None else None)
 
     # The simulation
 
@@ -326,16 +263,14 @@ class Replay:
                 data.qpos[layout.qpos_adr] = values.qpos
         data.qvel[:] = 0.0
         # In mode puppet pictures come with replies alone.
-        await self._client.step(0, include_cameras=dict.fromkeys(self._console.watched_cameras(), "latest") or False)
-
-
-async def _read(job: Callable[[], _T]) -> _T:
-    return await anyio.to_thread.run_sync(job)
+        await self._client.step(0, include_cameras=dict.fromkeys(self._shown_cameras.watched(), "latest") or False)
 
 
 def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
-    run = open_run(file)
-    cameras = (name if "/" in name else _OF_SCENE + name for name in run.cameras())
+    from urlab_client.integrations.record import read_run
+
+    run = read_run(file)
+    cameras = (name if "/" in name else OF_SCENE + name for name in run.cameras())
     return run, run.time_range(), run.positions(), frozenset(cameras)
 
 

@@ -1,18 +1,17 @@
-"""The state that all viewers share: the session, the newest state, the log.
+"""The session that viewers and agents share: the connection to the server, and everything they see and do.
 
-Nothing is queued. A viewer is notified of changes and takes the newest state when it is ready.
+It keeps the client's session open, and receives the state. The rest is in its parts.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
+import secrets
 import time
-from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import anyio
 import anyio.to_thread
@@ -21,15 +20,14 @@ from msgspec import structs
 from urlab_client.aio.background import kept_running
 from urlab_client.console.body_pushing import BodyPushing
 from urlab_client.console.controls import Controls
-from urlab_client.console.description import WorldDescription, describe
 from urlab_client.console.hand_driving import HandDriving
 from urlab_client.console.lease import DrivingLease, Viewer
-from urlab_client.console.messages import Ctrl, Hand, Link, LogEntry, Status, World, rounded, state_message
+from urlab_client.console.messages import Link, Status, encode, rounded
 from urlab_client.console.mujoco_viewer import MujocoViewer
-from urlab_client.console.ops import encode
-from urlab_client.console.pictures import Feed
+from urlab_client.console.pictures import Cameras
 from urlab_client.console.recordings import Recordings
 from urlab_client.console.replay import Replay
+from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
 from urlab_client.events import (
@@ -43,97 +41,76 @@ from urlab_client.events import (
     SessionLost,
     SessionOpened,
 )
-from urlab_client.protocol.messages.streams import StateSnapshot
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabCameraView, URLabClient
-
-log: logging.Logger = logging.getLogger("urlab_client.web")
+    from urlab_client.aio import URLabClient
 
 _PERIOD_S = 1 / 60
 _RETRY_S = 1.0
 _PULSE_S = 0.5
 _CONNECT_S = 3.0
-_KEPT = 300
 _AGENT_NAME = 40
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
-
-
-class Audience:
-    """A viewer who is watching.
-
-    Attributes:
-        viewer: The viewer.
-        changed: Event that is set on each change.
-    """
-
-    def __init__(self, viewer: Viewer) -> None:
-        self.viewer = viewer
-        self.changed: asyncio.Event = asyncio.Event()
 
 
 class ConsoleSession:
     """See the module.
 
-    Args:
-        client: The client; the console opens its session and keeps it.
-        lease: The controls.
-        recordings: Folder for recordings.
-        handshake: Callback that returns the handshake of a read-only client; None for a client that opens the session.
+    A client that is not read-only opens the session itself. A read-only one adopts the session of another client, whose
+    handshake the callback returns.
+
+    Attributes:
+        link: The connection to the server.
+        viewers: Those who watch the page or the WebSocket, by key.
     """
 
     def __init__(
         self,
         client: URLabClient,
-        lease: DrivingLease,
+        *,
         recordings: Path,
+        lease_seconds: float = 20.0,
         handshake: Callable[[], bytes] | None = None,
     ) -> None:
         self.client = client
-        self.lease = lease
         self.link: Link = Link("connecting", since=time.time())
-        self.world: WorldDescription = WorldDescription()
-        self.world_json: bytes = encode(World(self.world))
-        self.state_json: bytes | None = None
-        self.state_seq: int = 0
-        self.entries: deque[LogEntry] = deque(maxlen=_KEPT)
-        self.audience: set[Audience] = set()
-        self.snapshot: StateSnapshot | None = None
-        self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
-        self.controls: Controls = Controls(self)
-        self.hands: HandDriving = HandDriving(self)
-        self.recordings: Recordings = Recordings(client, recordings)
-        self.replay: Replay = Replay(self)
-        self.body_pushing: BodyPushing = BodyPushing(self)
-        self.controls.before_step = self.body_pushing.apply
+        self.viewers: dict[str, Viewer] = {}
+        self.lease = lease = DrivingLease(lease_seconds)
+        self.view = view = SharedView(client)
+        self.mujoco_viewer = MujocoViewer(client, view)
+        self.cameras = Cameras(client, view)
+        self.recordings = Recordings(client, recordings)
+        self.replay = Replay(client, view, self.cameras)
+        self.body_pushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay)
+        self.controls = Controls(client, lease, view, self.cameras, self.body_pushing.apply)
+        self.hands = HandDriving(client, lease, self.controls, view)
         self._handshake = handshake
         self._adopted = b""
-        self._bells: set[asyncio.Event] = set()
-        self._n = 0
         self._agents = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._ready = asyncio.Event()
-        self._sim_time: float | None = None
-        self._moved_at = 0.0
-        self._rate = 0.0
-        self._rate_from: tuple[float, float] | None = None
-        self._feeds: dict[str, Feed] = {}
+        self._clock = _SimulationClock()
+        self._status: Status = self._present_status()
+        self._status_of = -1
+        self._status_json: dict[bool, str] = {}
 
     # Life
 
     @contextlib.asynccontextmanager
     async def open(self) -> AsyncGenerator[None]:
         """Keep the session and receive state while the block runs."""
+        jobs = (
+            self._keep,
+            self._receive,
+            self._pulse,
+            self.controls.send_set_points,
+            self.controls.keep_stepping,
+            self.hands.keep_driving,
+            self.replay.keep_playing,
+        )
         async with anyio.create_task_group() as tasks:
-            controls = self.controls
-            jobs = (
-                controls.send_set_points,
-                controls.keep_stepping,
-                self.hands.keep_driving,
-                self.replay.keep_playing,
-            )
-            for job in (self._keep, self._receive, self._pulse, *jobs):
+            for job in jobs:
                 tasks.start_soon(self._run, job)
             try:
                 yield
@@ -145,20 +122,31 @@ class ConsoleSession:
     async def _run(self, job: Callable[[], Awaitable[None]]) -> None:
         """Run a job for as long as the console is open. Its failure is not that of the application around it."""
         name = job.__name__.lstrip("_")
-        await kept_running(f"urlab-web-{name}", job, lambda error: self.note("error", "console", name, str(error)))
+        await kept_running(f"urlab-web-{name}", job, lambda error: self._note_error(name, error))
+
+    def _note_error(self, what: str, error: Exception) -> None:
+        self.view.note("error", "console", what, str(error))
+
+    async def _pulse(self) -> None:
+        while True:
+            await anyio.sleep(_PULSE_S)
+            self.view.notify()
+
+    # The connection
 
     async def opened(self) -> None:
-        """Wait until the session has been opened for the first time.
-
-        Raises:
-            ServerUnreachable: The server cannot be reached; nothing was sent.
-        """
-        with self.bell() as changed:
+        """Wait until the session has been opened for the first time."""
+        with self.view.watch() as changed:
             while not self._ready.is_set():
                 if self.link.reason:  # a first attempt has failed; each has its own deadline
                     raise ServerUnreachable(f"There is no session with the server: {self.link.reason}")
                 changed.clear()
                 await changed.wait()
+
+    def reconnect(self) -> None:
+        """Open a new session, for example after another program has taken the server over."""
+        self._want = "discover"
+        self._wake.set()
 
     async def _keep(self) -> None:
         """Open the session, and reopen it whenever necessary."""
@@ -166,21 +154,19 @@ class ConsoleSession:
         while True:
             if self._want is not None:
                 await self._connect()
-            waiting = asyncio.create_task(events.receive(timeout=None if self._want is None else _RETRY_S))
+            event = asyncio.create_task(events.receive(timeout=None if self._want is None else _RETRY_S))
             asked = asyncio.create_task(self._wake.wait())
             try:
-                await asyncio.wait((waiting, asked), return_when=asyncio.FIRST_COMPLETED)
-                if waiting.done():
-                    try:
-                        self._take(waiting.result())
-                    except URLabTimeoutError:
-                        pass
-                    except ClientClosed:
-                        return
+                await asyncio.wait((event, asked), return_when=asyncio.FIRST_COMPLETED)
+                if event.done():
+                    with contextlib.suppress(URLabTimeoutError):
+                        self._follow(event.result())
+            except ClientClosed:
+                return
             finally:
-                waiting.cancel()
+                event.cancel()
                 asked.cancel()
-                await asyncio.wait((waiting, asked))
+                await asyncio.wait((event, asked))
             self._wake.clear()
 
     async def _connect(self) -> None:
@@ -194,10 +180,10 @@ class ConsoleSession:
             else:
                 await self._discover()
         except Exception as error:  # noqa: BLE001 - whatever it is, the next attempt may do better
-            self._want = "discover" if want == "discover" else "resync"
+            self._want = want
             if self.link.reason != str(error):
                 self._set_link("lost" if self._ready.is_set() else "connecting", str(error))
-                self.note("error", "console", "connect", str(error))
+                self._note_error("connect", error)
             return
         self._set_link("connected")
         self._ready.set()
@@ -212,10 +198,9 @@ class ConsoleSession:
             await self.client.discover(handshake=given)
             self._adopted = given
 
-    def _take(self, event: ClientEvent) -> None:
+    def _follow(self, event: ClientEvent) -> None:
         """Handle an event of the connection."""
-        text = ", ".join(f"{name} {value}" for name, value in _said(event).items() if value)
-        self.note("event", "server", str(event.__struct_config__.tag), text)
+        self.view.note("event", "server", str(event.__struct_config__.tag), _text_of(event))
         match event:
             case ServerLost():
                 self._set_link("lost", event.reason or "the connection broke")
@@ -240,45 +225,16 @@ class ConsoleSession:
             case _:
                 pass
 
-    def drive(self, viewer: Viewer, order: Ctrl | Hand) -> None:
-        """Carry out a viewer's order.
-
-        Raises:
-            NotDriving: Another viewer has the controls.
-            KeyError: A name is unknown; nothing was set.
-            ValueError: The order cannot be carried out; nothing was set.
-        """
-        if isinstance(order, Hand):
-            self.hands.command(viewer, order)
-        else:
-            self.controls.set_points(viewer, order.values)
-
-    def new_agent_name(self, program: str) -> str:
-        """Return a name for a new agent, which people and other agents see."""
-        self._agents += 1
-        return f"agent {self._agents}" + (f" ({program[:_AGENT_NAME]})" if program else "")
-
-    def take_back(self) -> None:
-        """Open a new session after another program has taken the server over."""
-        self._want = "discover"
-        self._wake.set()
-
     def _set_link(self, state: str, reason: str = "") -> None:
         if self.link.state != state or self.link.reason != reason:
             self.link = Link(state, reason, time.time())
-            self.tell()
+            self.view.notify()
 
     def _begin_anew(self) -> None:
         """Discard the state of the previous play session."""
         self.controls.begin_anew()
-        self._feeds = {path: one for path, one in self._feeds.items() if one.watched or self.camera(path) is one.view}
-        self.redescribe()
-
-    def redescribe(self) -> None:
-        """Describe the world again after a change."""
-        self.world = describe(self.client, self.world.version + 1, self.mujoco_viewer.missing)
-        self.world_json = encode(World(self.world))
-        self.tell()
+        self.cameras.begin_anew()
+        self.view.describe_world()
 
     # State
 
@@ -290,44 +246,20 @@ class ConsoleSession:
                     due = time.monotonic()
                     while True:
                         snapshot = await states.receive(timeout=None)
-                        self._note_time(snapshot.time)
+                        self._clock.note(snapshot.time)
                         if self._handshake is not None and not self.client.matches(snapshot):
-                            self.take_back()  # play has restarted; the driver provides a new handshake
+                            self.reconnect()  # play has restarted; the driver provides a new handshake
                             await anyio.sleep(_RETRY_S)
                         elif not self.replay.open:
-                            self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
+                            self.view.show(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
                         # By the clock, not by the wake-up time: otherwise each late wake-up would lower the rate.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
                         await anyio.sleep(max(0.0, due - time.monotonic()))
             except ClientClosed:
                 return
             except URLabError as error:
-                self.note("error", "console", "state", str(error))
+                self._note_error("state", error)
                 await anyio.sleep(_RETRY_S)
-
-    def _note_time(self, sim_time: float) -> None:
-        """Track simulation time, also while a recording is shown."""
-        now = time.monotonic()
-        if sim_time == self._sim_time:
-            return
-        self._sim_time = sim_time
-        self._moved_at = now
-        if self._rate_from is None or not sim_time >= self._rate_from[1]:
-            self._rate_from, self._rate = (now, sim_time), 0.0
-        elif now - self._rate_from[0] > 1:
-            self._rate = (sim_time - self._rate_from[1]) / (now - self._rate_from[0])
-            self._rate_from = (now, sim_time)
-
-    def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
-        """Show a state to all viewers in place of the server's."""
-        self._publish(snapshot, targets)
-
-    def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
-        self.snapshot = snapshot
-        self.mujoco_viewer.follow(snapshot)
-        self.state_seq += 1
-        self.state_json = encode(state_message(self.state_seq, snapshot, targets))
-        self.tell()
 
     def _targets(self, key: str) -> list[float] | None:
         art = self.client.articulations.get(key)
@@ -336,95 +268,110 @@ class ConsoleSession:
     @property
     def moving(self) -> bool:
         """Whether simulation time advances."""
-        return self.link.state == "connected" and time.monotonic() - self._moved_at < _MOVING_S
+        return self.link.state == "connected" and self._clock.advances
+
+    # Viewers
+
+    @contextlib.contextmanager
+    def new_viewer(self) -> Generator[Viewer]:
+        """Yield a new viewer, who watches while the block runs."""
+        taken = {viewer.name for viewer in self.viewers.values()}
+        name = next(name for n in range(1, len(taken) + 2) if (name := f"Viewer {n}") not in taken)
+        viewer = Viewer(secrets.token_urlsafe(16), name)
+        self.viewers[viewer.key] = viewer
+        self.view.notify()
+        try:
+            yield viewer
+        finally:
+            del self.viewers[viewer.key]
+            self.lease.release(viewer)
+            self.view.notify()
+
+    def new_agent_name(self, program: str) -> str:
+        """Return a name for a new agent, which people and other agents see."""
+        self._agents += 1
+        return f"agent {self._agents}" + (f" ({program[:_AGENT_NAME]})" if program else "")
 
     def status(self, viewer: Viewer) -> Status:
         """Return the status message for one viewer."""
+        return structs.replace(self._present_status(), mine=self._is_driving(viewer))
+
+    def status_json(self, viewer: Viewer) -> str:
+        """Return the status message for one viewer as of the last change: the same object while it is the same.
+
+        It is made once per change, and encoded if it differs, however many watch.
+        """
+        if self._status_of != self.view.n_changes:
+            self._status_of = self.view.n_changes
+            status = self._present_status()
+            if status != self._status:
+                self._status = status
+                self._status_json.clear()
+        mine = self._is_driving(viewer)
+        if mine not in self._status_json:
+            self._status_json[mine] = encode(structs.replace(self._status, mine=mine)).decode()
+        return self._status_json[mine]
+
+    def _is_driving(self, viewer: Viewer) -> bool:
         holder = self.lease.holder
+        return holder is not None and holder.key == viewer.key
+
+    def _present_status(self) -> Status:
+        client, controls, replay, holder = self.client, self.controls, self.replay, self.lease.holder
+        live = client.step_mode is StepMode.LIVE
         return Status(
             link=self.link,
-            address=self.client.address,
-            playing=self.client.manager_present,
-            moving=self.replay.rate > 0 if self.replay.open else self.moving,
-            running=self.controls.running if self.client.step_mode is not StepMode.LIVE else self.moving,
-            rate=self.replay.rate if self.replay.open else round(self._rate, 3) if self.moving else 0.0,
-            mode=self.client.step_mode,
-            speed=self.controls.speed,
-            source=self.controls.source,
+            address=client.address,
+            playing=client.manager_present,
+            moving=replay.rate > 0 if replay.open else self.moving,
+            running=self.moving if live else controls.running,
+            rate=replay.rate if replay.open else round(self._clock.rate, 3) if self.moving else 0.0,
+            mode=client.step_mode,
+            speed=controls.speed,
+            source=controls.source,
             recording=self.recordings.running,
-            conversions=self.recordings.conversions,
-            replay=self.replay.view,
-            twists=self.controls.twists,
-            viewers=len(self.audience),
+            conversions=[structs.replace(conversion) for conversion in self.recordings.conversions],
+            replay=replay.view,
+            twists=dict(controls.twists),
+            viewers=len(self.viewers),
             driver=None if holder is None else holder.name,
-            mine=holder is not None and holder.key == viewer.key,
+            mine=False,
             lease_left=round(self.lease.left, 1),
             lease=self.lease.seconds,
         )
 
-    def tell(self) -> None:
-        """Notify all viewers of a change."""
-        for one in self.audience:
-            one.changed.set()
-        for bell in self._bells:
-            bell.set()
 
-    @contextlib.contextmanager
-    def bell(self) -> Generator[asyncio.Event]:
-        """Yield an event that is set on each change."""
-        bell = asyncio.Event()
-        bell.set()
-        self._bells.add(bell)
-        try:
-            yield bell
-        finally:
-            self._bells.discard(bell)
+class _SimulationClock:
+    """Simulation time as received, also while a recording is shown.
 
-    async def _pulse(self) -> None:
-        while True:
-            await anyio.sleep(_PULSE_S)
-            self.tell()
+    Attributes:
+        rate: Simulation time per real time, over about a second.
+    """
 
-    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
-        """Add a line to the log."""
-        if (kind, who) == ("error", "console"):
-            log.warning("%s: %s", what, text)
-        self._n += 1
-        self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
-        self.tell()
+    def __init__(self) -> None:
+        self.rate = 0.0
+        self._time: float | None = None
+        self._moved_at = 0.0
+        self._rate_from: tuple[float, float] | None = None
 
-    # Cameras
+    @property
+    def advances(self) -> bool:
+        return time.monotonic() - self._moved_at < _MOVING_S
 
-    def watched_cameras(self) -> list[str]:
-        """Return the cameras that viewers watch, by the names that `step` takes."""
-        return [path.removeprefix("-/") for path, feed in self._feeds.items() if feed.watched]
-
-    async def renew_pictures(self) -> None:
-        """Switch the source of pictures between a recording and the simulation."""
-        for feed in [*self._feeds.values()]:
-            await feed.renew()
-
-    def feed(self, path: str) -> Feed | None:
-        """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
-        view = self.camera(path)
-        if view is None:
-            return None
-        if path not in self._feeds or self._feeds[path].view is not view:
-            said = f"camera {path}"
-            self._feeds[path] = Feed(
-                self.client, view, path, self.replay, lambda error: self.note("error", "console", said, str(error))
-            )
-        return self._feeds[path]
-
-    def camera(self, path: str) -> URLabCameraView | None:
-        """Return the camera at `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
-        owner, _, name = path.partition("/")
-        if owner == "-":
-            return self.client.global_cameras.get(name)
-        art = self.client.articulations.get(owner)
-        return None if art is None else art.cameras.get(name)
+    def note(self, sim_time: float) -> None:
+        now = time.monotonic()
+        if sim_time == self._time:
+            return
+        self._time = sim_time
+        self._moved_at = now
+        if self._rate_from is None or not sim_time >= self._rate_from[1]:
+            self._rate_from, self.rate = (now, sim_time), 0.0
+        elif now - self._rate_from[0] > 1:
+            self.rate = (sim_time - self._rate_from[1]) / (now - self._rate_from[0])
+            self._rate_from = (now, sim_time)
 
 
-def _said(event: ClientEvent) -> dict[str, Any]:
+def _text_of(event: ClientEvent) -> str:
     hidden = {"seq", "dropped", "gap", "recv_wall_time_ns"}
-    return {name: value for name, value in structs.asdict(event).items() if name not in hidden}
+    said = {name: value for name, value in structs.asdict(event).items() if name not in hidden}
+    return ", ".join(f"{name} {value}" for name, value in said.items() if value)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from urlab_client.server import ServedRequest, SimulatedServer
 
+__all__ = ["OpenTelemetryObserver", "PrometheusObserver", "PrometheusServerMetrics"]
+
 _SCOPE: Final = "urlab_client"
 _SYSTEM: Final = "urlab"
 _DURATIONS_S: Final = (

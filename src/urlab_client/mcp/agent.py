@@ -20,10 +20,10 @@ from mcp.shared.exceptions import MCPError
 from msgspec import Struct
 
 from urlab_client.console.lease import NotDriving
-from urlab_client.console.ops import encode
+from urlab_client.console.messages import encode
 from urlab_client.console.session import ConsoleSession
 from urlab_client.errors import ServerRestarted, SessionTakenOver, URLabError
-from urlab_client.mcp import editing, looking, moving
+from urlab_client.mcp import tools
 from urlab_client.mcp.call import RESTARTED, TAKEN_OVER, Call, Caller, Limits, Stopped
 from urlab_client.mcp.declaration import Declared, Needs, declared
 from urlab_client.mcp.results import Moment
@@ -41,7 +41,7 @@ _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
 }
-_TOOLS = declared(looking, moving, editing)
+_TOOLS = declared(tools)
 _LARGE = 1e3
 _MOST_CALLERS = 100  # each client of the older protocol opens a session, and may not report its end
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError, RecursionError)
@@ -131,11 +131,11 @@ class Agent:
             text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
             if isinstance(error, SessionTakenOver):
                 text = RESTARTED if isinstance(error, ServerRestarted) else TAKEN_OVER
-            console.note("error", caller.name, params.name, text)
+            console.view.note("error", caller.name, params.name, text)
             return types.CallToolResult(content=[types.TextContent(text=text)], is_error=True)
         if found.drives:
             milliseconds = 1e3 * (time.perf_counter() - began)
-            console.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
+            console.view.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
 
     def _caller(self, context: ServerRequestContext[Any]) -> Caller:
@@ -199,7 +199,7 @@ class Agent:
             raise MCPError(
                 types.INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}."
             )
-        shown = self._console.client.describe() if uri == "urlab://model" else list(self._console.entries)
+        shown = self._console.client.describe() if uri == "urlab://model" else list(self._console.view.entries)
         contents = types.TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
         return types.ReadResourceResult(contents=[contents])
 

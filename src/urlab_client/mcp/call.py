@@ -59,24 +59,16 @@ class Caller(Viewer):
     """An agent. People take the controls from it by acting; other agents wait until it is idle.
 
     Attributes:
-        told: Number of the last log entry that it has read.
+        last_read: Number of the last log entry that it has read.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(f"agent:{secrets.token_urlsafe(16)}", name, yields=True, keeps=_THINKS_S)
-        self.told = 0
+        self.last_read = 0
 
 
 class Call:
-    """See the module.
-
-    Args:
-        console: The session, which people may watch.
-        caller: The caller.
-        limits: Permissions and limits of the agent.
-        models: Files that can be imported, by the names shown to the agent.
-        progress: Progress callback.
-    """
+    """See the module."""
 
     def __init__(
         self,
@@ -96,19 +88,11 @@ class Call:
         self._rests = True
 
     def robot(self, name: str) -> URLabArticulation:
-        """Return a robot.
-
-        Raises:
-            LookupError: No robot has this name; the message lists the robots.
-        """
+        """Return a robot."""
         return self.client.articulations[name]
 
     def within(self, seconds: float) -> float:
-        """Return a duration of simulation time that the call may take.
-
-        Raises:
-            ValueError: The duration exceeds the limit.
-        """
+        """Return a duration of simulation time that the call may take."""
         if seconds > self.limits.sim_seconds:
             raise ValueError(
                 f"A call may take up to {self.limits.sim_seconds:g} s of simulation time, got {seconds:g}. "
@@ -118,12 +102,8 @@ class Call:
         return seconds
 
     async def connected(self) -> None:
-        """Wait until the console's session is open.
-
-        Raises:
-            URLabConnectionError: The session did not open; the message says why.
-        """
-        with self.console.bell() as changed, anyio.move_on_after(_CONNECT_S):
+        """Wait until the console's session is open."""
+        with self.console.view.watch() as changed, anyio.move_on_after(_CONNECT_S):
             while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
                 changed.clear()
                 await changed.wait()
@@ -137,13 +117,7 @@ class Call:
             )
 
     async def drive(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Do something that changes the simulation, through the console's controls.
-
-        Raises:
-            NotDriving: Another caller has the controls; nothing was done.
-            Stopped: The controls were taken over during the call, or it took too long; the message says whether the
-                simulation is at rest.
-        """
+        """Do something that changes the simulation, through the console's controls."""
         began = False
         why = f"It took longer than {self.limits.wall_seconds:g} s on the wall."
         with anyio.move_on_after(self.limits.wall_seconds):
@@ -175,7 +149,7 @@ class Call:
             raise
         finally:
             reporting.cancel()
-            self.console.tell()
+            self.console.view.notify()
 
     async def _report(self) -> None:
         start = self.client.sim_time

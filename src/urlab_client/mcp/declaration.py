@@ -32,12 +32,6 @@ class Needs(Enum):
 class Declared:
     """One tool.
 
-    Args:
-        function: Implementation, called with a `Call` and the agent's arguments.
-        needs: Permission that it requires.
-        play: Whether a play session must be running.
-        hints: Annotations for hosts.
-
     Attributes:
         name: Name of the tool.
         drives: Whether it changes something, and therefore takes the controls.
@@ -82,11 +76,7 @@ class Declared:
         )
 
     def parse(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return the arguments of a call.
-
-        Raises:
-            ValueError: An argument is invalid; the message names it and lists the parameters.
-        """
+        """Return the arguments of a call."""
         plain = {name: _from_text(value) for name, value in given.items()}
         try:
             made = msgspec.convert(plain, self._arguments, strict=False)
@@ -99,14 +89,7 @@ class Declared:
 def tool(
     needs: Needs, *, play: bool = True, destructive: bool = False, idempotent: bool = False
 ) -> Callable[[_Function], Declared]:
-    """Declare a function as a tool.
-
-    Args:
-        needs: Permission that the tool requires.
-        play: Whether a play session must be running.
-        destructive: Whether it may destroy existing state.
-        idempotent: Whether a second call with the same arguments has no further effect.
-    """
+    """Declare a function as a tool."""
 
     def declare(function: _Function) -> Declared:
         hints = ToolAnnotations(
@@ -120,9 +103,9 @@ def tool(
     return declare
 
 
-def declared(*modules: ModuleType) -> dict[str, Declared]:
-    """Return the tools of modules by name, in their order."""
-    return {one.name: one for module in modules for one in vars(module).values() if isinstance(one, Declared)}
+def declared(module: ModuleType) -> dict[str, Declared]:
+    """Return the tools of a module by name, in their order."""
+    return {one.name: one for one in vars(module).values() if isinstance(one, Declared)}
 
 
 def _schema(struct: type[Struct]) -> dict[str, Any]:

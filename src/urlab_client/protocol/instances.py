@@ -21,9 +21,6 @@ from urlab_client.protocol.messages.session import InstanceInfo
 REWRITE_S: Final = 10.0
 """Seconds after which a server renews its file."""
 
-STALE_S: Final = 30.0
-"""Seconds after which a server whose file was not renewed is considered dead."""
-
 
 class RegisteredInstance(InstanceInfo, kw_only=True):
     """Contents of a server's file. In the plugin's files, `manager_present` is never true."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, Literal, Self, get_args
+from typing import Any, Final, Literal, Self
 
 import msgspec
 from msgspec import Struct
@@ -53,9 +54,12 @@ Quantity = Literal[
 _VECTORS: Final = frozenset(
     {"centre_of_mass", "gravity", "base_position", "light_position", "camera_position", "camera_rotation", "colour"}
 )
-_SCALE_ONLY: Final = frozenset({"inertia", "kp", "kv", "strength"})
-_ADD_ONLY: Final = frozenset({"camera_rotation"})
-_NO_SCALE: Final = frozenset({"position", "base_position", "base_yaw", "light_position", "camera_position"})
+_WAYS: Final[dict[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("inertia", "kp", "kv", "strength"), ("scale",)),
+    **dict.fromkeys(("position", "base_position", "base_yaw", "light_position", "camera_position"), ("add", "set")),
+    "camera_rotation": ("add",),
+}
+"""How quantities can vary that cannot vary in all ways."""
 
 
 def steps_range(steps: Steps) -> tuple[int, int]:
@@ -124,11 +128,7 @@ class Vary(_Declared, frozen=True, kw_only=True):
         given = [name for name in ("scale", "add", "set") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"{self.what} needs one of scale, add and set, not {' and '.join(given) or 'none'}")
-        allowed = {
-            **dict.fromkeys(_SCALE_ONLY, ("scale",)),
-            **dict.fromkeys(_ADD_ONLY, ("add",)),
-            **dict.fromkeys(_NO_SCALE, ("add", "set")),
-        }.get(self.what, ("scale", "add", "set"))
+        allowed = _WAYS.get(self.what, ("scale", "add", "set"))
         if self.by not in allowed:
             raise ValueError(f"{self.what} takes {' or '.join(allowed)}, not {self.by}")
         _check_range(f"{self.what}: {self.by}", self.range)
@@ -282,6 +282,11 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
         """Whether actions are delayed."""
         return steps_range(self.delay.action)[1] > 0
 
+    def latencies(self, cameras: Iterable[str]) -> dict[str, CameraLatency]:
+        """Return the latencies of the cameras that have one; the last entry that names a camera applies."""
+        names = [*cameras]
+        return {name: late for late in self.camera for name in names if fnmatch.fnmatchcase(name, late.camera)}
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a TOML file.
@@ -340,6 +345,3 @@ MODEST: Final = Randomisation(
     )
 )
 """A small default randomisation for robots with actuated joints."""
-
-QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
-"""All quantities that can vary."""

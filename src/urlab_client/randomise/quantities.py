@@ -18,45 +18,39 @@ Ints = NDArray[np.intp]
 Fields = Callable[[str], NDArray[Any]]
 """Returns the array of a model's field, to be written in place; options are called `opt.NAME`."""
 
-START: Final[frozenset[Quantity]] = frozenset({"position", "base_position", "base_yaw"})
-"""Quantities of the initial state of an episode."""
-
-FIELDS: Final[dict[Quantity, tuple[str, ...]]] = {
-    "friction": ("geom_friction",),
-    "mass": ("body_mass", "body_inertia"),
-    "inertia": ("body_inertia",),
-    "centre_of_mass": ("body_ipos",),
-    "armature": ("dof_armature",),
-    "damping": ("dof_damping",),
-    "friction_loss": ("dof_frictionloss",),
-    "stiffness": ("jnt_stiffness",),
-    "kp": ("actuator_gainprm", "actuator_biasprm"),
-    "kv": ("actuator_gainprm", "actuator_biasprm"),
-    "strength": ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
-    "gravity": ("opt.gravity",),
-    "light_position": ("light_pos",),
-    "light_colour": ("light_diffuse",),
-    "colour": ("geom_rgba",),
-    "camera_position": ("cam_pos",),
-    "camera_rotation": ("cam_quat",),
-    "camera_fovy": ("cam_fovy",),
+QUANTITIES: Final[dict[Quantity, tuple[str, tuple[str, ...]]]] = {
+    "friction": ("geom", ("geom_friction",)),
+    "mass": ("body", ("body_mass", "body_inertia")),
+    "inertia": ("body", ("body_inertia",)),
+    "centre_of_mass": ("body", ("body_ipos",)),
+    "armature": ("joint", ("dof_armature",)),
+    "damping": ("joint", ("dof_damping",)),
+    "friction_loss": ("joint", ("dof_frictionloss",)),
+    "stiffness": ("joint", ("jnt_stiffness",)),
+    "kp": ("actuator", ("actuator_gainprm", "actuator_biasprm")),
+    "kv": ("actuator", ("actuator_gainprm", "actuator_biasprm")),
+    "strength": ("actuator", ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")),
+    "gravity": ("scene", ("opt.gravity",)),
+    "position": ("joint", ()),
+    "base_position": ("free joint", ()),
+    "base_yaw": ("free joint", ()),
+    "light_position": ("light", ("light_pos",)),
+    "light_colour": ("light", ("light_diffuse",)),
+    "colour": ("geom", ("geom_rgba",)),
+    "camera_position": ("camera", ("cam_pos",)),
+    "camera_rotation": ("camera", ("cam_quat",)),
+    "camera_fovy": ("camera", ("cam_fovy",)),
 }
-"""Fields of the model for each quantity."""
+"""The kind of elements that have a quantity, and its fields in the model; a quantity of the initial state has none."""
+
+START: Final = frozenset(what for what, (_, fields) in QUANTITIES.items() if not fields)
+"""Quantities of the initial state of an episode."""
 
 DERIVED_FROM: Final = frozenset(
     {"body_mass", "body_inertia", "body_ipos", "dof_armature", "cam_pos", "cam_quat", "light_pos"}
 )
 """Fields from which `mj_setConst` computes others."""
 
-_KINDS: Final[dict[Quantity, str]] = {
-    **dict.fromkeys(("friction", "colour"), "geom"),
-    **dict.fromkeys(("mass", "inertia", "centre_of_mass"), "body"),
-    **dict.fromkeys(("armature", "damping", "friction_loss", "stiffness", "position"), "joint"),
-    **dict.fromkeys(("base_position", "base_yaw"), "free joint"),
-    **dict.fromkeys(("kp", "kv", "strength"), "actuator"),
-    **dict.fromkeys(("light_position", "light_colour"), "light"),
-    **dict.fromkeys(("camera_position", "camera_rotation", "camera_fovy"), "camera"),
-}
 _OBJECTS: Final = {
     "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
     "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -73,33 +67,21 @@ _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SL
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """Elements of a model that have a quantity.
-
-    Attributes:
-        ids: Their ids.
-        names: Their names in recordings, in the same order.
-    """
+    """Elements of a model that have a quantity, and their names in recordings, in the same order."""
 
     ids: Ints
     names: tuple[str, ...]
 
 
 def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -> Elements:
-    """Return the elements whose quantity varies.
+    """Return the elements whose quantity varies; there must be one.
 
-    A geom is found by its own name or its body's, a free joint likewise.
-
-    Args:
-        vary: What varies.
-        model: The compiled scene.
-        controlled: Actuators that a controller with gains drives.
-
-    Raises:
-        ValueError: No element matches.
+    A geom is found by its own name or its body's, a free joint likewise. `controlled` are the actuators that a
+    controller with gains drives.
     """
     if vary.what == "gravity":
         return Elements(np.zeros(1, dtype=np.intp), ("scene",))
-    kind = _KINDS[vary.what]
+    kind, _ = QUANTITIES[vary.what]
     names = _names(model, kind)
     aliases = _aliases(model, kind, names)
     having = [i for i in range(len(names)) if _has(vary.what, model, i, controlled)]
@@ -112,16 +94,11 @@ def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -
 
 
 def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, fields: Fields) -> None:
-    """Apply drawn numbers to the current fields of a model.
+    """Apply drawn numbers, shape (n elements, width), to the fields of a model.
 
-    Args:
-        vary: The entry, whose quantity is not in `START`.
-        elements: The elements to change.
-        drawn: The numbers, shape (n elements, width).
-        model: The compiled scene, for values that do not vary.
-        fields: Returns the fields by name.
+    The quantity is not in `START`. `model` has the values that do not vary.
     """
-    ids = elements.ids
+    ids, (_, names) = elements.ids, QUANTITIES[vary.what]
     match vary.what:
         case "friction":
             _change(vary, fields("geom_friction")[:, 0], ids, drawn[:, 0])
@@ -132,13 +109,13 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
             fields("body_inertia")[ids] *= (mass[ids] / before)[:, None]
         case "armature" | "damping" | "friction_loss":
             dofs, owners = _dofs(model, ids)
-            _change(vary, fields(FIELDS[vary.what][0]), dofs, drawn[owners, 0], least=0.0)
+            _change(vary, fields(names[0]), dofs, drawn[owners, 0], least=0.0)
         case "stiffness":
             _change(vary, fields("jnt_stiffness"), ids, drawn[:, 0], least=0.0)
         case "kp" | "kv":
             _write_gain(vary.what, ids, drawn[:, 0], model, fields)
         case "inertia" | "strength":
-            for name in FIELDS[vary.what]:
+            for name in names:
                 fields(name)[ids] *= drawn
         case "gravity":
             gravity = fields("opt.gravity")
@@ -151,7 +128,7 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
             for i, vector in zip(ids, drawn, strict=True):
                 turned[i] = _rotated(turned[i], vector)
         case _:
-            field = fields(FIELDS[vary.what][0])
+            field = fields(names[0])
             values = drawn if field.ndim > 1 else drawn[:, 0]
             field[ids] = _changed(vary, field[ids], values)
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation, Range, Vary
-from urlab_client.randomise.quantities import DERIVED_FROM, FIELDS, START, Elements, Fields, elements_of, write
+from urlab_client.randomise.quantities import DERIVED_FROM, QUANTITIES, START, Elements, Fields, elements_of, write
 
-MODEL_STREAM: Final = 0
-"""First part of the seed of the random streams for `Vary`; other parts of a declaration use other values."""
+MODEL_STREAM, NOISE_STREAM, PUSH_STREAM, DELAY_STREAM, DROP_STREAM = range(5)
+"""What follows the episode's seed in the seeds of the random streams, by part of the declaration."""
 
 _VISIBLE: Final = {
     "light_diffuse": (),
@@ -114,8 +114,9 @@ class Variation:
         self.declaration = declaration
         self._model = model
         self._elements = [elements_of(vary, model, controlled) for vary in declaration.vary]
-        model_entries = [vary for vary in declaration.vary if vary.what not in START]
-        self.fields: tuple[str, ...] = tuple(sorted({name for vary in model_entries for name in FIELDS[vary.what]}))
+        self.fields: tuple[str, ...] = tuple(
+            sorted({name for vary in declaration.vary for name in QUANTITIES[vary.what][1]})
+        )
         self.derives: bool = not DERIVED_FROM.isdisjoint(self.fields)
         self._nominal = {name: np.array(field_of(model, name)) for name in self.fields}
 
@@ -135,12 +136,7 @@ class Variation:
         return EpisodeDraws(seed, tuple(varied))
 
     def write(self, draws: EpisodeDraws, fields: Fields) -> None:
-        """Write the model of an episode: the original fields with the draws applied.
-
-        Args:
-            draws: Draws of this variation.
-            fields: Returns the arrays of the model to write, by the names in `fields`.
-        """
+        """Write the model of an episode: the original fields with the draws applied."""
         self.restore(fields)
         for vary, elements, drawn in draws.varied:
             if vary.what not in START:
@@ -152,12 +148,7 @@ class Variation:
             fields(name)[...] = values
 
     def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
-        """Vary the initial state of an episode in place. Joints stay within their ranges.
-
-        Args:
-            draws: Draws of this variation.
-            qpos: Positions of the whole scene, shape (nq,), after a reset.
-        """
+        """Vary the positions of the whole scene after a reset, shape (nq,), in place. Joints stay in their ranges."""
         model = self._model
         for vary, elements, drawn in draws.varied:
             address = model.jnt_qposadr[elements.ids] if vary.what in START else np.zeros(0, dtype=np.intp)

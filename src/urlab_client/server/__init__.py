@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from urlab_client.server.assets.bundled_robots import bundled_models
     from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
-    from urlab_client.server.initial_level import ModelError
     from urlab_client.server.limits import Limits
+    from urlab_client.server.open_server import ModelError
     from urlab_client.server.rpc.dispatch import ServedRequest
     from urlab_client.server.simulated import SimulatedServer
     from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
@@ -29,7 +29,7 @@ _HOMES = {
     "Fault": "urlab_client.server.faults",
     "Faults": "urlab_client.server.faults",
     "Refuse": "urlab_client.server.faults",
-    "ModelError": "urlab_client.server.initial_level",
+    "ModelError": "urlab_client.server.open_server",
     "Limits": "urlab_client.server.limits",
     "ControllerConfig": "urlab_client.simulation.controller_config",
     "RenderingUnavailable": "urlab_client.simulation.opengl",

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import copy
 import logging
+import threading
+import time
+import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +18,7 @@ from typing import Any, Final
 import mujoco
 
 from urlab_client._mujoco import copy_options
-from urlab_client.enums import CameraMode, PIEState, StepMode
+from urlab_client.enums import CameraMode, ObservationLevel, PIEState, StepMode
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
@@ -36,16 +39,104 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
-from urlab_client.server.refusal import CompileFailed
+from urlab_client.server.physics.variation import SceneVariation
+from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.session import DriverLease, ServerSession
 from urlab_client.server.system.allocator import trim
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.simulation.appearance import Appearance
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
+
+
+class ServerSession:
+    """State that the server keeps between requests, apart from the world.
+
+    Attributes:
+        id: Active session id, a lower-case GUID; empty before the first `hello`.
+        json: Whether replies are JSON instead of msgpack, for all clients.
+        level: Observation level of replies that carry state.
+    """
+
+    __slots__ = ("id", "json", "level")
+
+    def __init__(self) -> None:
+        self.id: str = ""
+        self.json: bool = False
+        self.level: ObservationLevel = ObservationLevel.STANDARD
+
+    def open(self, *, observations: str | None, encoding: str | None) -> str:
+        """Start a new session, which ends the previous one, and return its id.
+
+        Args:
+            observations: Level name, case-insensitive; an unknown name means standard, None keeps the level.
+            encoding: `json`, case-insensitive, for JSON replies; anything else means msgpack.
+        """
+        self.id = str(uuid.uuid4())
+        self.json = encoding is not None and encoding.lower() == "json"
+        if observations is not None:
+            self.level = _level(observations) or ObservationLevel.STANDARD
+        return self.id
+
+    def accepts(self, session_id: str) -> bool:
+        """Whether a request with this id belongs to the active session."""
+        return session_id != "" and session_id == self.id
+
+    def level_of(self, observations: str | None) -> ObservationLevel:
+        """Return the level that a step requests; the session's, if it requests none or an unknown one."""
+        return self.level if observations is None else _level(observations) or self.level
+
+
+def _level(name: str) -> ObservationLevel | None:
+    try:
+        return ObservationLevel(name.lower())
+    except ValueError:
+        return None
+
+
+class DriverLease:
+    """One lease at a time, which expires after some time without requests."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._id = ""
+        self._ttl_s = 0.0
+        self._touched = 0.0
+
+    @property
+    def held(self) -> bool:
+        """Whether it is held."""
+        with self._lock:
+            return self._holds()
+
+    def acquire(self, ttl_s: float) -> str:
+        """Take it and return its id."""
+        with self._lock:
+            if self._holds():
+                # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
+                raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
+            self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
+            return self._id
+
+    def release(self, lease_id: str) -> None:
+        """Give it back."""
+        with self._lock:
+            if not self._holds() or lease_id != self._id:
+                raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
+            self._id = ""
+
+    def touch(self) -> None:
+        """Renew the lease: the server is in use."""
+        if self._id:
+            with self._lock:
+                if self._holds():
+                    self._touched = self._clock()
+
+    def _holds(self) -> bool:
+        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
@@ -57,20 +148,11 @@ class ServerCore:
     """A server without its sockets.
 
     Attributes:
-        world: The level being edited.
-        config: Configuration of the server.
         camera_endpoint: Returns the endpoint of a camera, given articulation key and camera name.
         switch_camera: Starts or stops the streams of a camera, given as `ARTICULATION/CAMERA`.
         shm_directory: Directory of the shared-memory regions; None without shared memory.
-        session: The client's session.
-        play: The play session.
-        viewport: The viewport's camera.
-        drawings: Debug drawings.
         health: Whether the server's threads run.
         compiled: The level that the last play session was started with.
-        jobs: Editor ops that run in the background.
-        lease: The driver lease.
-        uploads: Models that clients upload in chunks.
         instance: Returns the identity of this server among several; None in dialects without one.
     """
 
@@ -147,9 +229,6 @@ class ServerCore:
     def begin_play_again(self, timeout: float) -> bool:
         """Restart play with the scene that was compiled last, and return when it is ready.
 
-        Args:
-            timeout: Longest time for stopping the current session, seconds.
-
         Returns:
             False if stopping took longer, or the level has changed since it was compiled.
         """
@@ -179,19 +258,21 @@ class ServerCore:
             if names_fit:
                 raise CompileFailed(problem)
             logger.warning("%s", problem)
-        try:
-            engine = Engine(
-                scene,
-                pinned_mode=config.step_mode,
-                paused=not config.unpaused,
-                controllers=controllers,
-                health=self.health,
-                dialect=self.dialect,
-                randomise=config.randomise,
-            )
-        except ValueError as error:
-            raise CompileFailed(f"what is to vary: {error}") from None
-        varied = () if engine.variation is None else engine.variation.visible_fields
+        engine = Engine(
+            scene,
+            pinned_mode=config.step_mode,
+            paused=not config.unpaused,
+            controllers=controllers,
+            health=self.health,
+            dialect=self.dialect,
+        )
+        varied: Sequence[str] = ()
+        if config.randomise is not None:
+            try:
+                engine.variation = SceneVariation(scene, config.randomise, engine.articulations)
+            except ValueError as error:
+                raise CompileFailed(f"what is to vary: {error}") from None
+            varied = engine.variation.visible_fields
         channels = UserChannels(config.user_channels)
         modes = {
             (index.key, camera.name): config.camera_mode(index, camera.name)

@@ -70,7 +70,7 @@ def _no_shapes() -> Mapping[str, Callable[[Any], Struct]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Dialect:
-    """How one generation of the plugin differs from the others.
+    """How one generation of the plugin differs from the others; what it does not do is left out of its table.
 
     Attributes:
         name: Its name.
@@ -104,27 +104,27 @@ class Dialect:
     name: DialectName
     urlab_version: str
     urlab_version_at_start: str
-    jobs: bool
-    claims: bool
-    cameras_on: bool
-    cameras_repeat: bool
-    camera_headers: bool
-    camera_forms: bool
-    draws_for_steps: bool
-    qualified_cameras: bool
-    public_names: bool
-    frame_ids: bool
-    steps_published: bool
-    rows_published: bool
-    live_commands: bool
-    late_steps: bool
-    level_sticks: bool
-    auto_mode: bool
-    controls_float32: bool
-    options_float32: bool
-    options_merged: bool
-    robots_attached: bool
-    instance: bool
+    jobs: bool = False
+    claims: bool = False
+    cameras_on: bool = False
+    cameras_repeat: bool = False
+    camera_headers: bool = False
+    camera_forms: bool = False
+    draws_for_steps: bool = False
+    qualified_cameras: bool = False
+    public_names: bool = False
+    frame_ids: bool = False
+    steps_published: bool = False
+    rows_published: bool = False
+    live_commands: bool = False
+    late_steps: bool = False
+    level_sticks: bool = False
+    auto_mode: bool = False
+    controls_float32: bool = False
+    options_float32: bool = False
+    options_merged: bool = False
+    robots_attached: bool = False
+    instance: bool = False
     first_camera_port: int
     shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
 
@@ -159,27 +159,16 @@ ALPHA: Final = Dialect(
     name="alpha",
     urlab_version="urlab/0.1",
     urlab_version_at_start="urlab/0.1",
-    jobs=False,
-    claims=False,
     cameras_on=True,
     cameras_repeat=True,
-    camera_headers=False,
-    camera_forms=False,
     draws_for_steps=True,
-    qualified_cameras=False,
-    public_names=False,
-    frame_ids=False,
     steps_published=True,
     rows_published=True,
-    live_commands=False,
     late_steps=True,
     level_sticks=True,
     auto_mode=True,
     controls_float32=True,
     options_float32=True,
-    options_merged=False,
-    robots_attached=False,
-    instance=False,
     first_camera_port=5558,
 )
 """The plugin's main branch of June 2026."""
@@ -190,22 +179,13 @@ BETA: Final = Dialect(
     urlab_version_at_start="urlab/0.1",
     jobs=True,
     claims=True,
-    cameras_on=False,
-    cameras_repeat=False,
     camera_headers=True,
     camera_forms=True,
     draws_for_steps=True,
     qualified_cameras=True,
     public_names=True,
     frame_ids=True,
-    steps_published=False,
-    rows_published=False,
     live_commands=True,
-    late_steps=False,
-    level_sticks=False,
-    auto_mode=False,
-    controls_float32=False,
-    options_float32=False,
     options_merged=True,
     robots_attached=True,
     instance=True,

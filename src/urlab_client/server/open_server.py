@@ -8,7 +8,7 @@ import socket
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -18,35 +18,35 @@ from numpy.typing import NDArray
 
 from urlab_client._sandbox.confinement import is_available
 from urlab_client.enums import PIEState, Transport
+from urlab_client.errors import URLabError
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo
+from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.config import ServerConfig
-from urlab_client.server.core import ServerCore
+from urlab_client.server.core import DriverLease, ServerCore, ServerSession
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
-from urlab_client.server.initial_level import ModelError, populate
-from urlab_client.server.refusal import Refusal
-from urlab_client.server.rpc.dispatch import Dispatcher
-from urlab_client.server.rpc.watchdog import Watchdog
-from urlab_client.server.session import DriverLease, ServerSession
-from urlab_client.server.snapshot import take_snapshot
+from urlab_client.server.handlers.viewport import look
+from urlab_client.server.refusal import CompileFailed, Refusal
+from urlab_client.server.render.viewport_picture import ViewportPicture
+from urlab_client.server.rpc.dispatch import Dispatcher, Watchdog
 from urlab_client.server.streams.camera_streams import CameraStreams
-from urlab_client.server.streams.control_messages import CameraEndpoint
+from urlab_client.server.streams.commands import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
 from urlab_client.server.streams.registration import Registration
-from urlab_client.server.system.health import Health
 from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.system.threads import Health
 from urlab_client.server.transport.curve_authentication import CurveKeys, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
+from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
-
 
 CLOSE_S: Final = 1.0
 """Longest time for closing the server."""
@@ -56,25 +56,26 @@ _NO_LIMIT: Final = float("inf")
 Served: TypeAlias = Watchdog | RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer
 """A part of a server with a thread that must live."""
 
+GAP_M: Final = 1.0
+"""Free space between the models placed side by side, metres."""
+
+LARGEST_PIXELS: Final = 16384
+"""Longest side in pixels, the maximum of common drivers."""
+
+IDLE_DEADLINE_S: Final = 10.0
+"""Longest wait for the request in progress."""
+
+_FRAMING_FOV: Final = 40.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class OpenServer:
     """The parts of an open server. Does not refer to its `SimulatedServer`, so that it can be collected.
 
     Attributes:
-        config: Its configuration.
-        host: Address of the interface, in numbers.
-        curve_keys: Keys, if the traffic is encrypted.
-        core: The state that handlers share.
-        dispatcher: Answers requests.
-        endpoint: The request socket.
-        streams: The sockets of state, controls and info.
-        cameras: The sockets of camera images.
-        memory: The shared memory, if any.
         served: All parts with a thread.
         authored: Result of `_mark` after the start.
         resources: Everything that `close` releases.
-        pid: The process that opened it.
     """
 
     config: ServerConfig
@@ -91,17 +92,6 @@ class OpenServer:
     resources: ExitStack
     pid: int
 
-    @property
-    def scene_warnings(self) -> tuple[str, ...]:
-        """Warnings from compiling the scene; empty outside play."""
-        return self.core.play.running().scene.warnings if self.core.world.pie_running else ()
-
-    @property
-    def sim_time(self) -> float | None:
-        """See `SimulatedServer.sim_time`."""
-        running = self.core.play.current
-        return None if running is None else running.engine.time
-
     def restore(self) -> bool:
         """Restore the state after the start, or return False if that requires a restart."""
         core = self.core
@@ -116,15 +106,11 @@ class OpenServer:
             core.session = ServerSession()
             core.viewport = Viewport()
             core.drawings = Drawings(limit=core.limits.markers)
-            core.world.selected = ""
+            core.world.actors.selected = ""
             if self.config.play:
                 return core.begin_play_again(CLOSE_S)
             core.stop_play()
             return True
-
-    def snapshot(self, size: tuple[int, int], *, frame_all: bool) -> NDArray[np.uint8]:
-        """Draw the viewport; see `SimulatedServer.snapshot`."""
-        return take_snapshot(self.core, self.dispatcher, size, frame_all=frame_all)
 
     def close(self) -> None:
         """Release everything. Idempotent; does nothing in a forked child, which does not own the resources."""
@@ -311,3 +297,96 @@ def _end(parts: Sequence[Served | ServerCore | Registration]) -> None:
     ended = [part.join(max(0.0, deadline - time.monotonic())) for part in reversed(parts)]
     if not all(ended):
         logger.warning("a request was still running when the server closed; its thread ends after it")
+
+
+class ModelError(URLabError, ValueError):
+    """A model or level given at the start is missing or cannot be used."""
+
+
+def is_level(model: str) -> bool:
+    """Whether a name given at the start is that of a saved level."""
+    return model.lower().endswith(".json")
+
+
+def populate(world: EditorWorld, models: Sequence[str]) -> None:
+    """Open the level among `models`, place the other models, and add a manager if there is none."""
+    for level in filter(is_level, models):
+        world.levels.load_file(Path(level))
+    names = [row.name for row in list(world.actors)]
+    edge: float | None = None
+    sources: dict[str, str] = {}
+    for model in models:
+        if is_level(model):
+            continue
+        for name in names:  # only if another model follows, because the bounding box may require compilation
+            edge = _beyond(world, name, edge)
+        names = [_place(world, model, sources, edge)]
+    world.ensure_manager()
+
+
+def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> str:
+    """Import a model, place it beyond `edge`, the largest y in use, if any, and return the actor's name.
+
+    `sources` holds the files imported so far by blueprint.
+    """
+    bundled = bundled_models()
+    if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
+        raise ModelError(unknown_model(model))
+    path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
+    # Files named on the command line are imported anew, even if an earlier run imported them.
+    blueprint, _ = world.blueprints.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
+    other = sources.setdefault(blueprint.stem, path)
+    if other != path:
+        raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
+    actor = world.spawn_actor(blueprint.class_path, world.actors.unused_id(Path(path).stem)).actor
+    if edge is not None:
+        bounds = world.get_actor_bounds(actor.name, components_only=True)
+        if bounds.extents != (0.0, 0.0, 0.0):
+            world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return actor.name
+
+
+def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | None:
+    """Return the larger of `edge` and the actor's largest y; an actor without a bounding box has none."""
+    bounds = world.get_actor_bounds(actor_name, components_only=True)
+    if bounds.extents == (0.0, 0.0, 0.0):
+        return edge
+    return bounds.max[1] if edge is None else max(edge, bounds.max[1])
+
+
+def take_snapshot(
+    server: ServerCore, dispatcher: Dispatcher, size: tuple[int, int], *, frame_all: bool
+) -> NDArray[np.uint8]:
+    """Draw the viewport; see `SimulatedServer.snapshot`. Requests are not answered while the state is read."""
+    need_backend()
+    with dispatcher.standstill(IDLE_DEADLINE_S) as idle:
+        if not idle:
+            raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
+        view = look(server)
+        picture = ViewportPicture(
+            size=size,
+            view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
+            fit=frame_all,
+            mode=server.viewport.mode,
+            primitives=server.drawings.take_frame(in_play=server.world.pie_running),
+            overlay=server.drawings.overlay,
+            selected=server.world.actors.selected,
+        )
+        running = server.play.current
+        try:
+            if running is not None:
+                with running.engine.lock:
+                    job = running.cameras.capture_viewport(picture)
+                renderer = running.cameras
+            else:
+                renderer = server.authored_renderer()
+                job = renderer.capture_viewport(picture)
+        except Refusal as refusal:
+            raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
+        except CompileFailed as error:
+            raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
+    try:
+        return renderer.paint(job)
+    finally:
+        if running is None:
+            renderer.close()

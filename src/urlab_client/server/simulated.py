@@ -23,12 +23,10 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.config import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
-from urlab_client.server.initial_level import is_level
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import OpenServer, open_server
+from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, open_server, take_snapshot
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
-from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
 from urlab_client.simulation.appearance import RenderQuality
@@ -281,7 +279,8 @@ class SimulatedServer:
         """
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
             raise ValueError(f"size must be a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
-        return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
+        opened = self._running
+        return take_snapshot(opened.core, opened.dispatcher, (int(size[0]), int(size[1])), frame_all=frame_all)
 
     @property
     def failure(self) -> str | None:
@@ -317,7 +316,8 @@ class SimulatedServer:
     def sim_time(self) -> float | None:
         """Simulation time of the play session, seconds; None without one."""
         opened = self._opened
-        return None if opened is None else opened.sim_time
+        running = None if opened is None else opened.core.play.current
+        return None if running is None else running.engine.time
 
     @property
     def can_render(self) -> bool:
@@ -390,7 +390,8 @@ class SimulatedServer:
     @property
     def scene_warnings(self) -> tuple[str, ...]:
         """Warnings from compiling the current scene, for example about options of a model that have no effect."""
-        return self._running.scene_warnings
+        core = self._running.core
+        return core.play.running().scene.warnings if core.world.pie_running else ()
 
     @property
     def saved_dir(self) -> Path:

@@ -1,7 +1,7 @@
-"""Cameras that show what they saw some time ago.
+"""Cameras of a scene, and their latency.
 
-For `CameraRenderer`. Such a camera keeps past states of the simulation rather than pictures. Its frames therefore have
-the right age however rarely a client asks, and only requested frames are drawn.
+A delayed camera keeps past states of the simulation rather than pictures. Its frames therefore have the right age
+however rarely somebody asks, and only requested frames are drawn.
 """
 
 from __future__ import annotations

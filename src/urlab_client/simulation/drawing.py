@@ -1,4 +1,4 @@
-"""The OpenGL context, and how a camera's image and the viewport's picture are drawn with it."""
+"""Drawing what a camera sees, in an OpenGL context."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame
-from urlab_client.simulation.appearance import RenderQuality
+from urlab_client.simulation.appearance import RenderQuality, Tints
 from urlab_client.simulation.cameras import SceneCamera
 from urlab_client.simulation.opengl import Backend, free_context, make_context
-from urlab_client.simulation.sunlight import follow_subject, moving_geoms, shadow_clip
-from urlab_client.simulation.tints import Tints
 
 Bytes = NDArray[np.uint8]
 
@@ -34,6 +32,14 @@ _STACKS: Final = 8
 """Slices and stacks of round shapes in `fast` quality; MuJoCo's own numbers are 28 and 16."""
 
 _OPAQUE: Final = np.array(0xFF000000, "<u4")
+
+# A directional light shines everywhere, but its shadows are drawn around its position only, as far as
+# `vis.map.shadowclip` times the model's extent. A robot that walks away from there loses its shadow, or parts of it.
+_WIDER: Final = 8.0
+_WIDE_M: Final = 5.0
+
+_SEEN_COSINE: Final = 0.5
+"""Half the cone, 60 degrees, in which a geom counts as seen."""
 
 
 class Stage:
@@ -203,3 +209,39 @@ def _centimetres(depth: NDArray[np.float32], camera: Any) -> NDArray[np.float32]
         scale = np.float32(0.5) * (far + near) / (far - near) - np.float32(0.5)
         metres = np.float32(2.0) * far * near / (far - near) * np.float32(0.5) / (depth.astype(np.float64) + scale)
     return np.where(depth > 0.0, metres * 100.0, NO_HIT_CM).astype("<f4")
+
+
+def shadow_clip(own: float) -> float:
+    """Return how far shadows should reach, metres, if MuJoCo would draw them up to `own`.
+
+    The ground is speckled where they end, so that small scenes have them end outside the picture.
+    """
+    return max(own, min(_WIDER * own, _WIDE_M))
+
+
+def moving_geoms(model: mujoco.MjModel) -> NDArray[np.intp]:
+    """Return the geoms of bodies that are not welded to the world; of a scene without them, all but planes."""
+    bounded = model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE)
+    moving = bounded & (model.body_weldid[model.geom_bodyid] != 0)
+    return np.flatnonzero(moving if moving.any() else bounded)
+
+
+def follow_subject(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.intp]) -> None:
+    """Move the suns of a scene along the ground to a place above what the camera sees; their light does not change.
+
+    The positions in `data` are computed. `geoms` are those of `moving_geoms`.
+    """
+    if not geoms.size:
+        return
+    camera: Any = scene.camera[0]
+    places = data.geom_xpos[geoms]
+    away = places - camera.pos
+    seen = away @ camera.forward > _SEEN_COSINE * np.linalg.norm(away, axis=1)
+    if not seen.any():
+        return
+    far = float(np.linalg.norm(np.ptp(places[seen], axis=0)))
+    middle = (places[seen].min(axis=0) + places[seen].max(axis=0)) / 2.0
+    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    for light in scene.lights[: scene.nlight]:
+        if light.type == directional and light.castshadow and not light.headlight:
+            light.pos[:] = middle - max(model.stat.extent, far) * light.dir

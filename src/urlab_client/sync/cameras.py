@@ -30,6 +30,11 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
     _aio: aio.URLabCameraView
 
     @property
+    def delivered(self) -> bool:
+        """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
+        return self._aio.delivered
+
+    @property
     def name(self) -> str:
         """Name without the articulation's prefix."""
         return self._aio.name
@@ -38,11 +43,6 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
     def info(self) -> CameraInfo:
         """Description from the handshake."""
         return self._aio.info
-
-    @property
-    def delivered(self) -> bool:
-        """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
-        return self._aio.delivered
 
     @property
     def latest_frame(self) -> Pixels | None:

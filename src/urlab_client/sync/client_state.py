@@ -8,8 +8,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import client_state as aio
-from urlab_client.aio.client_types import ClientConfig, ServerInfo
-from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.client_types import ClientConfig, ClientObserver, ServerInfo
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot

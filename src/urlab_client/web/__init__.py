@@ -14,8 +14,7 @@ except ImportError as error:
     ) from error
 
 from urlab_client.web.access import Access
-from urlab_client.web.application import app
-from urlab_client.web.several import apps
+from urlab_client.web.application import app, apps
 
 __all__ = ["Access", "app", "apps"]
 

@@ -131,22 +131,22 @@ class Guarded:
             return
         refused = self._access.refusal(scope)
         if refused is None and self._access.tokens:
-            entered = self._enter(scope)
-            if entered is not None:
-                await entered(scope, receive, _with_headers(send))
+            admitted = self._exchange_token(scope)
+            if admitted is not None:
+                await admitted(scope, receive, _with_headers(send))
                 return
             key = self._access.key_of(Headers(scope=scope))
             scope["urlab_key"] = key
-            if key is None and not _is_entrance(scope):
+            if key is None and not _is_login(scope):
                 refused = 401, "no_key", self._advice
         if refused is None:
             await self._app(scope, receive, _with_headers(send))
         elif scope["type"] == "websocket":
             await _close(receive, send)
         else:
-            await _said(scope, refused)(scope, receive, _with_headers(send))
+            await _denied(scope, refused)(scope, receive, _with_headers(send))
 
-    def _enter(self, scope: Scope) -> Response | None:
+    def _exchange_token(self, scope: Scope) -> Response | None:
         """Return the response to a browser that presents a token, or None for any other request."""
         if scope["type"] != "http" or scope["method"] != "GET" or _path(scope) not in {"", "/"}:
             return None
@@ -155,7 +155,7 @@ class Guarded:
             return None
         key = self._access.admit(token[0])
         if key is None and self._access.key_of(Headers(scope=scope)) is None:
-            return _said(scope, (401, "bad_token", "This link has been used. Ask for another one."))
+            return _denied(scope, (401, "bad_token", "This link has been used. Ask for another one."))
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(
@@ -188,11 +188,11 @@ def _path(scope: Scope) -> str:
     return str(scope["path"]).removeprefix(scope.get("root_path", ""))
 
 
-def _is_entrance(scope: Scope) -> bool:
+def _is_login(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] == "POST" and _path(scope) == "/api/session"
 
 
-def _said(scope: Scope, refusal: _Refusal) -> Response:
+def _denied(scope: Scope, refusal: _Refusal) -> Response:
     status, code, text = refusal
     if "text/html" in Headers(scope=scope).get("accept", ""):
         return HTMLResponse(_PAGE.format(title="Access denied", text=html.escape(text)), status)

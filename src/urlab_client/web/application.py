@@ -1,41 +1,30 @@
-"""The Starlette application: the page, the HTTP API and the WebSockets."""
+"""The Starlette application: the page, the HTTP API and the WebSockets, for one server or for several."""
 
 from __future__ import annotations
 
 import contextlib
+import html
 import os
-import secrets
-import time
-from collections.abc import AsyncGenerator, Callable
+import re
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import anyio
-import anyio.to_thread
-import msgspec
-from msgspec import Struct
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import ClientDisconnect, HTTPConnection, Request
-from starlette.responses import FileResponse, Response
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from urlab_client.console import mujoco_viewer
-from urlab_client.console.lease import DrivingLease, NotDriving, Viewer
-from urlab_client.console.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
-from urlab_client.console.ops import SERVED, encode, parse
-from urlab_client.console.session import Audience, ConsoleSession
-from urlab_client.errors import URLabError
+from urlab_client.console.session import ConsoleSession
+from urlab_client.web import file_routes, live
+from urlab_client.web import routes as api
 from urlab_client.web.access import Access, Guarded
-from urlab_client.web.body_routes import BodyRoutes
-from urlab_client.web.explained_errors import explain_error
-from urlab_client.web.model_routes import ModelRoutes
-from urlab_client.web.openapi import openapi
-from urlab_client.web.reading_routes import ReadingRoutes
-from urlab_client.web.recording_routes import RecordingRoutes
-from urlab_client.web.route_group import Handler
+from urlab_client.web.documents import openapi
+from urlab_client.web.endpoints import BYTES, JSON, Call, Endpoint, Site, json_response, refusal, routes
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -43,10 +32,11 @@ if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
 
 _STATIC = Path(__file__).parent / "static"
-_LARGEST_BODY = 1024 * 1024
-_AHEAD = 2  # states or pictures sent to a browser that it has not acknowledged
-_VIEWER = "x-urlab-viewer"
-_GONE = 499  # what servers log if a client closes its request
+_ENDPOINTS = tuple(one for module in (api, file_routes) for one in vars(module).values() if isinstance(one, Endpoint))
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_TAKEN = frozenset({"api", "metrics"})
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>URLab consoles</title><body><h1>Servers</h1><ul>{items}</ul></body></html>"""
 
 
 def app(
@@ -80,411 +70,182 @@ def app(
     """
     if client.config.read_only != (handshake is not None):
         raise ValueError("app: pass `handshake` for a client with read_only=True, and for no other client")
-    access = access or Access()
-    session = ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings), handshake)
-    site = _Site(session, access, metrics)
+    session = ConsoleSession(client, recordings=Path(recordings), lease_seconds=lease_seconds, handshake=handshake)
+    return application_of(session, access or Access(), metrics)
+
+
+def application_of(session: ConsoleSession, access: Access, metrics: CollectorRegistry | None = None) -> Starlette:
+    """Make the application of a session, which is open during its lifespan."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
-        async with site.console.open():
+        async with session.open():
             yield
 
-    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    site = Site(session, access, metrics)
+    application = Starlette(routes=_routes(site), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
-    application.state.console = site.console
+    application.state.console = session
     return application
 
 
-def entrance(access: Access) -> Handler:
-    """Return the handler of `POST /api/session`, which exchanges a token for a key."""
+def apps(
+    clients: Mapping[str, URLabClient],
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
+    recordings: str | os.PathLike[str] = "recordings",
+) -> Starlette:
+    """Make one application with a console for each of several servers.
 
-    async def enter(request: Request) -> Response:
-        key = access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
-        if key is None:
-            return _error(401, "bad_token", "This token is unknown or has been used.")
-        return _json(encode({"key": key}))
+    Each console is at `/NAME/`, with its own controls, and `/` links to them; `GET /api/servers` lists them with the
+    state of their connections. A token or key of `access` is valid for all. As with `app`, enter the lifespan of the
+    application when you mount it, and close the clients yourself.
 
-    return _answering(enter)
+    Args:
+        clients: An async client of the serving event loop for each server, by the name in its path: letters, digits,
+            `_` and `-`.
+        access: Access rules. By default, requests reach the application on this machine, with a token of
+            `site.state.access.invite()`.
+        lease_seconds: How long a viewer keeps the controls of a server without using them.
+        metrics: Registry that `/metrics` serves to Prometheus, behind the same access rules; None leaves the path out.
+        recordings: Folder of the recordings, with a folder in it for each server.
+
+    Raises:
+        ValueError: There is no client, or a name cannot be part of a path.
+    """
+    for name in clients:
+        if not _NAME.fullmatch(name) or name in _TAKEN:
+            raise ValueError(
+                f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not 'api' or 'metrics'"
+            )
+    if not clients:
+        raise ValueError("apps: pass at least one client")
+    access = access or Access()
+    consoles = {
+        name: app(client, access=access, lease_seconds=lease_seconds, recordings=Path(recordings) / name)
+        for name, client in clients.items()
+    }
+    sessions: dict[str, ConsoleSession] = {name: console.state.console for name, console in consoles.items()}
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        async with contextlib.AsyncExitStack() as stack:
+            for session in sessions.values():
+                await stack.enter_async_context(session.open())
+            yield
+
+    # Access is checked once for each path: here, and by each console for its own paths.
+    index = Starlette(routes=_index(sessions, access, metrics), middleware=[Middleware(Guarded, access=access)])
+    application = Starlette(
+        routes=[*(Mount(f"/{name}", console) for name, console in consoles.items()), Mount("/", index)],
+        lifespan=lifespan,
+    )
+    application.state.access = access
+    application.state.consoles = sessions
+    return application
 
 
-class _RunRequest(Struct):
-    running: bool
+def _index(sessions: Mapping[str, ConsoleSession], access: Access, metrics: CollectorRegistry | None) -> list[Route]:
+    """Return the routes above those of the consoles."""
 
+    async def page(_: Request) -> Response:
+        items = "".join(
+            f'<li><a href="{name}/">{name}</a> {html.escape(session.client.address)}</li>'
+            for name, session in sessions.items()
+        )
+        return HTMLResponse(_PAGE.format(items=items))
 
-class _StepRequest(Struct):
-    n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
-
-
-class _LoginRequest(Struct):
-    token: str
-
-
-class _Site:
-    def __init__(self, console: ConsoleSession, access: Access, metrics: CollectorRegistry | None) -> None:
-        self.console = console
-        self._access = access
-        self._metrics = metrics
-        self._viewers: dict[str, Viewer] = {}
-        self._reading = ReadingRoutes(console, self._viewer)
-        self._recordings = RecordingRoutes(console, self._viewer)
-        self._models = ModelRoutes(console, self._viewer)
-        self._body_pushing = BodyRoutes(console.body_pushing, self._viewer, _body)
-
-    def routes(self) -> list[Route | WebSocketRoute | Mount]:
-        def route(path: str, handler: Handler, *methods: str) -> Route:
-            return Route(path, _answering(handler), methods=list(methods or ["GET"]))
-
-        return [
-            route("/", self._page),
-            route("/api/openapi.json", self._openapi),
-            route("/api/handshake", self._handshake),
-            route("/api/world", self._world),
-            route("/api/status", self._status),
-            route("/api/state", self._state),
-            route("/api/log", self._log),
-            *(route(path, handler, *methods) for path, handler, methods in self._reading.routes()),
-            route("/api/ops/{op}", self._op, "POST"),
-            route("/api/ctrl", self._ctrl, "POST"),
-            route("/api/run", self._run, "POST"),
-            route("/api/step", self._step, "POST"),
-            *(
-                route(path, handler, *methods)
-                for path, handler, methods in (
-                    *self._recordings.routes(),
-                    *self._models.routes(),
-                    *self._body_pushing.routes(),
-                )
-            ),
-            route("/api/lease", self._lease, "POST", "DELETE"),
-            route("/api/connection", self._connection, "POST"),
-            route("/api/invitations", self._invite, "POST"),
-            Route("/api/session", entrance(self._access), methods=["POST"]),
-            WebSocketRoute("/api/live", self._live),
-            WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
-            Mount("/static", StaticFiles(directory=_STATIC)),
-            *([] if self._metrics is None else [Route("/metrics", showing(self._metrics))]),
-            *self._studio_routes(),
+    async def servers(request: Request) -> Response:
+        root = request.scope.get("root_path", "")
+        found = [
+            {
+                "name": name,
+                "path": f"{root}/{name}/",
+                "address": session.client.address,
+                "link": session.link,
+                "playing": session.client.manager_present,
+            }
+            for name, session in sessions.items()
         ]
+        return json_response(found)
 
-    def _studio_routes(self) -> list[Route | WebSocketRoute | Mount]:
-        shipped = mujoco_viewer.files()
-        if shipped is None:
-            return []
+    site = Site(next(iter(sessions.values())), access, metrics)
+    shared = [api.enter, *([] if metrics is None else [api.metrics])]
+    return [Route("/", page), Route("/api/servers", servers), *routes(shared, site)]
 
-        async def page(request: Request) -> Response:
-            return Response(shipped.page, media_type="text/html", headers={"content-security-policy": shipped.policy})
 
-        return [
-            Route("/viewer/", page),
-            Route("/viewer/model", _answering(self._model)),
-            WebSocketRoute("/viewer/state", self._poses),
-            WebSocketRoute("/viewer/ui", self._taken),
-            Mount("/viewer/assets", _Checked(directory=shipped.assets)),
-            Mount("/viewer", _Checked(directory=shipped.dist)),
-        ]
+def _routes(site: Site) -> list[Route | WebSocketRoute | Mount]:
+    documented = tuple(one for one in _ENDPOINTS if one is not api.metrics or site.metrics is not None)
 
-    async def _page(self, request: Request) -> Response:
+    async def page(_: Request) -> Response:
         return FileResponse(_STATIC / "index.html")
 
-    async def _openapi(self, request: Request) -> Response:
-        return _json(openapi(request.scope.get("root_path", ""), metrics=self._metrics is not None))
+    async def openapi_document(call: Call) -> Response:
+        return Response(openapi(documented, call.root), media_type=JSON)
 
-    async def _handshake(self, request: Request) -> Response:
-        shared = await anyio.to_thread.run_sync(self.console.client.handshake)
-        return Response(shared, media_type="application/octet-stream")
-
-    async def _world(self, request: Request) -> Response:
-        return _json(encode(self.console.world))
-
-    async def _status(self, request: Request) -> Response:
-        return _json(encode(self.console.status(self._viewer(request))))
-
-    async def _state(self, request: Request) -> Response:
-        if self.console.state_json is None:
-            return _error(503, "no_state", "No state has arrived yet.", "Is play running?")
-        return _json(self.console.state_json)
-
-    async def _log(self, request: Request) -> Response:
-        return _json(encode(list(self.console.entries)))
-
-    async def _op(self, request: Request) -> Response:
-        op = SERVED.get(request.path_params["op"])
-        if op is None:
-            return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
-        body = await _body(request)
-        return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
-
-    async def _ctrl(self, request: Request) -> Response:
-        values = msgspec.json.decode(await _body(request), type=dict[str, dict[str, float]])
-        self.console.controls.set_points(self._viewer(request), values)
-        return _json(b"{}")
-
-    async def _run(self, request: Request) -> Response:
-        await self.console.controls.run(
-            self._viewer(request), msgspec.json.decode(await _body(request), type=_RunRequest).running
-        )
-        return _json(b"{}")
-
-    async def _step(self, request: Request) -> Response:
-        steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
-        return _json(encode(await self.console.controls.step(self._viewer(request), steps.n_steps)))
-
-    async def _lease(self, request: Request) -> Response:
-        viewer = self._viewer(request)
-        if request.method == "POST":
-            self.console.lease.use(viewer)
-        else:
-            self.console.lease.release(viewer)
-        self.console.tell()
-        return _json(encode(self.console.status(viewer)))
-
-    async def _connection(self, request: Request) -> Response:
-        self.console.lease.use(self._viewer(request))
-        self.console.take_back()
-        return _json(b"{}")
-
-    async def _invite(self, request: Request) -> Response:
-        token = self._access.invite()
-        return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
-
-    # WebSockets
-
-    async def _live(self, socket: WebSocket) -> None:
-        await socket.accept()
-        viewer = Viewer(secrets.token_urlsafe(16), self._new_name())
-        self._viewers[viewer.key] = viewer
-        one = Audience(viewer)
-        flow = _Flow()
-        self.console.audience.add(one)
-        self.console.tell()
-        try:
-            await socket.send_text(encode(You(viewer.key, viewer.name)).decode())
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(self._send, socket, one, flow)
-                with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, perhaps during a reply
-                    await self._listen(socket, one, flow)
-                tasks.cancel_scope.cancel()
-        finally:
-            self.console.audience.discard(one)
-            self.console.lease.release(viewer)
-            del self._viewers[viewer.key]
-            self.console.tell()
-
-    async def _send(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
-        console = self.console
-        world = state = line = -1
-        status = b""
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone; the listener ends the rest
-            while True:
-                one.changed.clear()
-                if world != console.world.version:
-                    world = console.world.version
-                    await socket.send_text(console.world_json.decode())
-                now = encode(console.status(one.viewer))
-                if now != status:
-                    status = now
-                    await socket.send_text(now.decode())
-                if console.entries and console.entries[-1].n > line:
-                    news = [entry for entry in console.entries if entry.n > line]
-                    line = news[-1].n
-                    await socket.send_text(encode(Log(news)).decode())
-                if (
-                    console.state_json is not None
-                    and state != console.state_seq
-                    and flow.sent - flow.acknowledged < _AHEAD
-                ):
-                    state = console.state_seq
-                    flow.sent += 1
-                    await socket.send_text(console.state_json.decode())
-                await one.changed.wait()
-
-    async def _listen(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
-        while True:
-            text = await _said(socket)
-            try:
-                message: FromViewer = msgspec.json.decode(text, type=FromViewer)
-                match message:
-                    case Ack():
-                        flow.acknowledged += 1
-                        one.changed.set()
-                    case Ping(at=at):
-                        await socket.send_text(encode(Pong(at, _now_ms())).decode())
-                    case Name(name=name):
-                        one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
-                        self.console.tell()
-                    case Ctrl() | Hand():
-                        self.console.drive(one.viewer, message)
-            except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
-                await socket.send_text(encode(Refused(explain_error(error)[1])).decode())
-
-    async def _pictures(self, socket: WebSocket) -> None:
-        feed = self.console.feed(socket.path_params["path"])
-        await socket.accept()
-        if feed is None:
-            await socket.close(4404, "no such camera")
-            return
-        flow = _Flow()
-        async with feed.watch(), anyio.create_task_group() as tasks:
-
-            async def send() -> None:
-                seq = 0
-                with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-                    while True:
-                        while flow.sent - flow.acknowledged >= _AHEAD:
-                            flow.changed = anyio.Event()
-                            await flow.changed.wait()
-                        picture = await feed.after(seq)
-                        seq = picture.seq
-                        flow.sent += 1
-                        await socket.send_bytes(picture.frame())
-
-            tasks.start_soon(send)
-            with contextlib.suppress(WebSocketDisconnect):
-                while True:
-                    await _said(socket)
-                    flow.acknowledged += 1
-                    flow.changed.set()
-            tasks.cancel_scope.cancel()
-
-    # The 3-D view
-
-    async def _model(self, request: Request) -> Response:
-        """Return the model, its size, or a part of it, as the viewer's page requests."""
-        shown = await self.console.mujoco_viewer.shown()
-        query = request.query_params
-        if shown is None or query.get("crc32", str(shown.crc)) != str(shown.crc):
-            return _error(404, "no_model", self.console.mujoco_viewer.missing or "The model has changed.")
-        if "total_bytes" in query:
-            return _json(encode({"total_bytes": len(shown.bundle)}))
-        start = int(query.get("offset_bytes", 0))
-        length = int(query.get("size_bytes", len(shown.bundle)))
-        if start < 0 or length < 0:
-            return _error(400, "bad_request", "The offset and the size of a part must not be negative.")
-        return Response(shown.bundle[start : start + length], media_type="application/octet-stream")
-
-    async def _poses(self, socket: WebSocket) -> None:
-        await socket.accept()
-        await socket.send_text(mujoco_viewer.SPECTATOR)
-        flow = _Flow()
-        with self.console.bell() as changed:
-
-            async def send() -> None:
-                sent = told = None
-                with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-                    while True:
-                        changed.clear()
-                        snapshot = self.console.snapshot
-                        shown = await self.console.mujoco_viewer.shown()
-                        if shown and shown is not told:
-                            told = shown
-                            await socket.send_text(mujoco_viewer.LAYOUT + shown.layout)
-                        if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
-                            sent = snapshot
-                            flow.sent += 1
-                            await socket.send_bytes(self.console.mujoco_viewer.write(shown, snapshot))
-                        await changed.wait()
-
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(send)
-                while (said := await socket.receive())["type"] == "websocket.receive":
-                    # The page also asks for control of MuJoCo's own panels, which the console does not have.
-                    if said.get("text") == mujoco_viewer.SHOWN:
-                        flow.acknowledged += 1
-                        changed.set()
-                tasks.cancel_scope.cancel()
-
-    async def _taken(self, socket: WebSocket) -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone already
-            await socket.accept()
-            await socket.close(mujoco_viewer.TAKEN, "this page watches")
-
-    # Viewers
-
-    def _viewer(self, request: HTTPConnection) -> Viewer:
-        """Return the viewer that sent a request: a page that watches, or a program with a key."""
-        found = self._viewers.get(request.headers.get(_VIEWER, ""))
-        return found or Viewer(f"key:{request.scope.get('urlab_key')}", "a program")
-
-    def _new_name(self) -> str:
-        taken = {viewer.name for viewer in self._viewers.values()}
-        return next(name for n in range(1, len(taken) + 2) if (name := f"Viewer {n}") not in taken)
+    undocumented = [
+        Endpoint("GET", "/api/openapi.json", openapi_document),
+        Endpoint("POST", "/api/ops/{op}", api.perform_op),
+    ]
+    return [
+        Route("/", page),
+        *routes([*documented, *undocumented], site),
+        *(_socket(one.path, one.serve, site) for one in live.SOCKETS),
+        Mount("/static", StaticFiles(directory=_STATIC)),
+        *_viewer_routes(site),
+    ]
 
 
-class _Checked(StaticFiles):
+def _socket(path: str, serve: Callable[[ConsoleSession, WebSocket], Awaitable[None]], site: Site) -> WebSocketRoute:
+    async def serve_one(socket: WebSocket) -> None:
+        await serve(site.console, socket)
+
+    return WebSocketRoute(path, serve_one)
+
+
+# The 3-D view
+
+
+def _viewer_routes(site: Site) -> list[Route | WebSocketRoute | Mount]:
+    shipped = mujoco_viewer.files()
+    if shipped is None:
+        return []
+
+    async def page(_: Request) -> Response:
+        return Response(shipped.page, media_type="text/html", headers={"content-security-policy": shipped.policy})
+
+    return [
+        Route("/viewer/", page),
+        *routes([Endpoint("GET", "/viewer/model", _model)], site),
+        _socket("/viewer/state", live.poses, site),
+        _socket("/viewer/ui", live.refuse_panels, site),
+        Mount("/viewer/assets", _RevalidatedFiles(directory=shipped.assets)),
+        Mount("/viewer", _RevalidatedFiles(directory=shipped.dist)),
+    ]
+
+
+async def _model(call: Call) -> Response:
+    """Return the model, its size, or a part of it, as the viewer's page requests."""
+    shown = await call.console.mujoco_viewer.shown()
+    query = call.request.query_params
+    if shown is None or query.get("crc32", str(shown.crc)) != str(shown.crc):
+        missing = mujoco_viewer.no_view(call.console.client)
+        return refusal(404, "no_model", missing or "The model has changed.")
+    if "total_bytes" in query:
+        return json_response({"total_bytes": len(shown.bundle)})
+    start = int(query.get("offset_bytes", 0))
+    length = int(query.get("size_bytes", len(shown.bundle)))
+    if start < 0 or length < 0:
+        return refusal(400, "bad_request", "The offset and the size of a part must not be negative.")
+    return Response(shown.bundle[start : start + length], media_type=BYTES)
+
+
+class _RevalidatedFiles(StaticFiles):
     """Large files that a browser caches and revalidates on each use."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)
         response.headers["cache-control"] = "no-cache"
         return response
-
-
-async def _said(socket: WebSocket) -> str:
-    """Return the next text that a browser sends.
-
-    Raises:
-        WebSocketDisconnect: The browser is gone, or it sent a binary frame, for which the socket is closed.
-    """
-    message = await socket.receive()
-    if message["type"] == "websocket.disconnect":
-        raise WebSocketDisconnect(message["code"], message.get("reason"))
-    text: str | None = message.get("text")
-    if text is None:
-        await socket.close(1003, "this socket takes text")
-        raise WebSocketDisconnect(1003)
-    return text
-
-
-class _Flow:
-    """Counts messages that a browser has not acknowledged."""
-
-    def __init__(self) -> None:
-        self.sent = self.acknowledged = 0
-        self.changed = anyio.Event()
-
-
-def _now_ms() -> float:
-    return time.time() * 1e3
-
-
-def _answering(handler: Handler) -> Handler:
-    """Turn a handler's exceptions into responses."""
-
-    async def answer(request: Request) -> Response:
-        try:
-            return await handler(request)
-        except ClientDisconnect:
-            return Response(status_code=_GONE)  # the client is gone
-        except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            status, said = explain_error(error)
-            return _json(encode({"error": said}), status)
-
-    return answer
-
-
-async def _body(request: Request) -> bytes:
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > _LARGEST_BODY:
-            raise ValueError(f"a body is at most {_LARGEST_BODY} bytes")
-    return bytes(body)
-
-
-def _json(body: bytes, status: int = 200) -> Response:
-    return Response(body, status, media_type="application/json")
-
-
-def _error(status: int, code: str, message: str, hint: str = "") -> Response:
-    return _json(encode({"error": {"code": code, "message": message, "hint": hint}}), status)
-
-
-def showing(registry: CollectorRegistry) -> Callable[[Request], Response]:
-    """Return a handler that serves the metrics of a registry in the requested format."""
-    from prometheus_client.exposition import choose_encoder
-
-    def show(request: Request) -> Response:
-        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode_all(registry), headers={"content-type": media_type})
-
-    return show

@@ -188,13 +188,7 @@ class MirroredArticulation(MirroredEntity):
         self.bind(info, layout, keep=False)
 
     def bind(self, info: ArticulationInfo, layout: ArticulationLayout, *, keep: bool) -> None:
-        """Adopt the description from a handshake. Keep set-points and control mode if they still fit.
-
-        Args:
-            info: The description.
-            layout: Addresses of its values in the model.
-            keep: Whether to keep the state, too.
-        """
+        """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
@@ -467,12 +461,12 @@ class MirroredArticulation(MirroredEntity):
             return None if pair is None else (pair[1].xpos[body_id].copy(), pair[1].xquat[body_id].copy())
 
 
-Carried = dict[MirroredEntity, Wrenches]
-"""The wrenches that a step carries, by the record that they were applied to."""
+SentWrenches = dict[MirroredEntity, Wrenches]
+"""The wrenches of one step, by the record that they were applied to."""
 
 
-def give_back(carried: Carried) -> None:
+def restore_wrenches(sent: SentWrenches) -> None:
     """Buffer the wrenches of a step that was not executed again, unless newer ones were applied."""
-    for record, wrenches in carried.items():
+    for record, wrenches in sent.items():
         with record.mirror.lock:
             record.wrenches = {**wrenches, **record.wrenches}

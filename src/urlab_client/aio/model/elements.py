@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from urlab_client._mujoco import acting_kind, control_counts, control_starts, force_counts, servo_damping
+from urlab_client.aio.arguments import finite, finite_array, is_array
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
-from urlab_client.aio.model.numbers import finite, finite_array, is_array
 from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
 from urlab_client.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.base import Floats

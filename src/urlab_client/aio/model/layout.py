@@ -58,12 +58,7 @@ class ArticulationLayout:
 
 
 def articulation_layouts(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> dict[str, ArticulationLayout]:
-    """Return the layout of each articulation; an element belongs to the longest prefix of its name.
-
-    Args:
-        model: The compiled model.
-        prefixes: Prefix of the element names, without the underscore, by key of the articulation.
-    """
+    """Return the layout of each articulation; an element belongs to the longest prefix of its name."""
     keys = list(prefixes.values())
     bodies = _by_owner(model, "body", keys)
     joints = _by_owner(model, "joint", keys)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from urlab_client._mujoco import forget_last_document, without_newer_attributes
-from urlab_client.aio.model.numbers import first_not_finite
+from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
@@ -179,10 +179,6 @@ class Mirror:
     def load(cls, hello: HelloOk, *, trusted: bool) -> Loaded | None:
         """Load the model from the handshake; None if it has none. Blocks and changes no state: run in a thread.
 
-        Args:
-            hello: The handshake.
-            trusted: Whether this process may compile the server's XML.
-
         Raises:
             ProtocolError: This MuJoCo cannot load the model.
         """
@@ -229,9 +225,7 @@ class Mirror:
     def use(self, loaded: Loaded | None, *, keep: bool = False) -> None:
         """Switch to a loaded model, or to none. Call under the lock.
 
-        Args:
-            loaded: The model and its initial data.
-            keep: Whether to keep the state; `holds` must have been true.
+        `keep` keeps the state; `holds` must have been true.
         """
         if keep and loaded is not None and self.model is not None and self.data is not None:
             import mujoco
@@ -259,11 +253,7 @@ class Mirror:
         )
 
     def reset(self, keyframe: str | None) -> None:
-        """Reset the data as the server does, because replies carry only part of the state. Call under the lock.
-
-        Args:
-            keyframe: Compiled keyframe name, or None.
-        """
+        """Reset the data as the server does, because replies carry only part of the state. Call under the lock."""
         if self.model is None or self.data is None:
             return
         import mujoco

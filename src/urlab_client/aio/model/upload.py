@@ -13,10 +13,10 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from urlab_client.errors import OutcomeUnknown, UnknownUpload
-from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.base import Request
 from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
@@ -27,22 +27,19 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelCommit,
     UploadModelCommitOk,
     UploadModelManifest,
+    UploadModelManifestOk,
 )
 from urlab_client.values.types import UploadProgress
 
 if TYPE_CHECKING:
     import mujoco
 
-R = TypeVar("R", bound=Reply)
-
 OnUpload = Callable[[UploadProgress], object]
 """Callback invoked with the progress of an upload on the client's event loop."""
 
+Call = Callable[[Request[Any]], Awaitable[Any]]
+
 _ATTEMPTS: Final = 3
-
-
-class _Call(Protocol):
-    def __call__(self, request: Request[R]) -> Awaitable[R]: ...
 
 
 @dataclass(frozen=True)
@@ -108,16 +105,11 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     return flat
 
 
-async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
+async def upload(model: FlatModel, call: Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
     """Send the parts of a model that the server lacks, and import the model.
 
     A chunk whose reply was lost is not sent again, because the server counts bytes. A new manifest then shows what is
     missing. The commit is sent once.
-
-    Args:
-        model: The model.
-        call: Callback that sends a request within the caller's deadline.
-        on_progress: Callback invoked after each chunk.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -128,11 +120,12 @@ async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) ->
                 raise
     else:
         raise AssertionError("the last attempt returns or raises")
-    return await call(UploadModelCommit(upload_id=upload_id))
+    imported: UploadModelCommitOk = await call(UploadModelCommit(upload_id=upload_id))
+    return imported
 
 
-async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> str:
-    opened = await call(model.manifest)
+async def _send_files(model: FlatModel, call: Call, on_progress: OnUpload | None) -> str:
+    opened: UploadModelManifestOk = await call(model.manifest)
     missing = [("asset", name, model.files[name]) for name in dict.fromkeys(opened.need_assets)]
     if opened.need_xml:
         missing.insert(0, ("xml", "", model.xml))
@@ -141,11 +134,10 @@ async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | Non
     for kind, name, data in missing:
         for offset in range(0, max(1, len(data)), MAX_CHUNK_BYTES):
             chunk = data[offset : offset + MAX_CHUNK_BYTES]
-            await call(
-                UploadModelChunk(
-                    upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
-                )
+            request = UploadModelChunk(
+                upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=chunk
             )
+            await call(request)
             sent += len(chunk)
             if on_progress is not None:
                 on_progress(UploadProgress(file=name or "model.xml", sent_bytes=sent, total_bytes=total))

@@ -193,7 +193,7 @@ class ReplayNamespace(ReplayOps):
     async def _note_start(self, turn: Turn) -> None:
         """A replay ends recording and resumes physics. To start it again would begin it again."""
         del turn
-        self._state.paused = self._state.recording = False
+        self._state.mode.paused = self._state.recording = False
         self._session.unsettled.pop("pause", None)
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:

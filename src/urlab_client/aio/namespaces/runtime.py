@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from msgspec.structs import asdict, replace
+
+from urlab_client.aio.state.scene_objects import SceneObjects
+from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.messages.runtime import (
+    GetContacts,
+    GetContactsOk,
+    MocapReply,
+    ReadMocapPose,
+    SetControlSource,
+    SetMocapPose,
+    SetTwist,
+)
+from urlab_client.values.names import UnknownName, compiled_names
+
+if TYPE_CHECKING:
+    import mujoco
+
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import cast
 
 import msgspec
 import numpy as np
 
-from urlab_client.aio.arguments import mapping, require
+from urlab_client.aio.arguments import finite, is_array, mapping, require
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session.jobs import OnProgress
 from urlab_client.aio.session.session import Session, Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.aio.state.wire_names import as_written, for_the_server
 from urlab_client.enums import StepMode
 from urlab_client.errors import UnknownOp
-from urlab_client.protocol.base import Floats, Reply, Request
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,
@@ -32,7 +49,6 @@ from urlab_client.protocol.messages.cameras import (
 )
 from urlab_client.protocol.messages.runtime import (
     ContactFilter,
-    GetContacts,
     SetMode,
     SetPaused,
     SetQpos,
@@ -44,6 +60,7 @@ from urlab_client.protocol.sim_options import check_sim_options, in_small_letter
 from urlab_client.values.types import ContactsResult, SimOptions
 
 R = TypeVar("R", bound=Reply)
+Q = TypeVar("Q", bound=Request[Any])
 
 _NUMPY = (np.ndarray, np.generic)
 
@@ -68,12 +85,12 @@ class RuntimeNamespace(RuntimeOps):
         """
         async with self._session.turn(SetPaused, timeout=timeout) as turn:
             await self._pause(paused, turn)
-            return self._state.paused
+            return self._state.mode.paused
 
     async def _pause(self, paused: bool, turn: Turn) -> None:
         state = self._state
         with self._session.settling("pause", partial(self._pause, paused)):
-            state.paused = (await turn.call(SetPaused(paused=paused))).paused
+            state.mode.paused = (await turn.call(SetPaused(paused=paused))).paused
 
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
@@ -306,9 +323,9 @@ class RuntimeNamespace(RuntimeOps):
         wanted = StepMode(mode)
         async with self._session.turn(SetMode, timeout=timeout) as turn:
             # On the wire `auto` is a mode in which every step times out.
-            await ask_mode(self._state, turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
-            self._state.wanted_mode = self._state.mode
-            return self._state.mode
+            await self._state.mode.ask(turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+            self._state.mode.wanted = self._state.mode.current
+            return self._state.mode.current
 
     async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and adopt the state: kinematics and dynamics, no integration.
@@ -321,7 +338,7 @@ class RuntimeNamespace(RuntimeOps):
         async with self._session.turn(Forward, timeout=timeout) as turn:
             self._state.require_handshake("forward")
             reply = await turn.call(Forward())
-            self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
+            self._state.absorb(reply, "forward", into_mirror=not self._state.mode.puppet)
             return reply
 
 
@@ -344,3 +361,68 @@ def _latency(name: str, delay: float | CameraDelay) -> CameraDelay:
     if wanted.clock not in ("sim", "wall"):
         raise ValueError(f"{what}: clock must be 'sim' or 'wall', not {wanted.clock!r}.")
     return wanted
+
+
+# A key, an actor id and the name of an engine object can all identify a robot, and each may prefix the name of a body
+# or geom. The server knows only one of them, or the compiled name.
+
+
+def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | None) -> Q:
+    """Return a request with names that the server knows. Unknown names stay unchanged.
+
+    Raises:
+        UnknownName: A name is ambiguous; nothing was sent.
+    """
+    match request:
+        case SetTwist(articulation=str(name)) | SetControlSource(articulation=str(name)):
+            robot = objects.articulations.get(name)
+            return request if robot is None else replace(request, articulation=robot.prefix)
+        # MuJoCo crashes the process if a name is not text. Later checks report such names.
+        case SetMocapPose(body=str(body)) | ReadMocapPose(body=str(body)):
+            return replace(request, body=_compiled("body", body, objects, model))
+        case GetContacts(filter=names) if names is not None:
+            meant = {
+                side: _compiled("body" if side.startswith("body") else "geom", name, objects, model)
+                if isinstance(name, str) and name
+                else name
+                for side, name in asdict(names).items()
+            }
+            return replace(request, filter=replace(names, **meant))
+        case _:
+            return request
+
+
+def as_written(reply: R, request: Request[Any]) -> R:
+    """Return a reply with the names that the user's request contains."""
+    match reply, request:
+        case MocapReply(), (SetMocapPose(body=body) | ReadMocapPose(body=body)):
+            return replace(reply, body=body)
+        case GetContactsOk(contacts=contacts), GetContacts(filter=names) if names is not None:
+            written: Mapping[str, str] = {side: name for side, name in asdict(names).items() if name}
+            return replace(reply, contacts=[replace(contact, **written) for contact in contacts])
+        case _:
+            return reply
+
+
+def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
+    if model is None:
+        return name
+    import mujoco
+
+    number = mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
+
+    def exists(candidate: str) -> bool:
+        return mujoco.mj_name2id(model, number, candidate) >= 0
+
+    if exists(name):
+        return name
+    prefixes = {
+        called: robot.compiled_prefix
+        for key, robot in objects.articulations.items()
+        for called in (key, robot.actor_id)
+        if called
+    }
+    found = sorted(filter(exists, compiled_names(name, prefixes)))
+    if len(found) > 1:
+        raise UnknownName(kind, name, tuple(found), tuple(found), ())
+    return found[0] if found else name

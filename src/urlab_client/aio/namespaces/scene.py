@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import anyio
 
-from urlab_client.aio.arguments import require
+from urlab_client.aio.arguments import finite, require
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
@@ -20,7 +20,7 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
 from urlab_client.enums import PIEState
 from urlab_client.errors import CreateLevelFailed, ImportFailed, UnknownOp
-from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.base import Reply
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
     CreateLevel,
@@ -380,11 +380,7 @@ class SceneNamespace(SceneOps):
                 hint="Copy the file to the server's machine and use import_xml().",
             )
         flat = await anyio.to_thread.run_sync(flatten, model, abandon_on_cancel=True)
-
-        def send(request: Request[R]) -> Awaitable[R]:
-            return self._call(request, timeout)
-
-        reply = await upload(flat, send, on_progress)
+        reply = await upload(flat, partial(self._call, timeout=timeout), on_progress)
         return URLabBlueprint(
             class_path=reply.blueprint_class_path, short_name=reply.blueprint_short_name, imported_now=reply.imported
         )

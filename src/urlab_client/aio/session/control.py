@@ -12,17 +12,16 @@ import math
 import os
 import secrets
 import socket
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
-from urlab_client.aio.background import Tell, background_task
-from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.features import Features
+from urlab_client.aio.background import background_task
+from urlab_client.aio.defaults import Timeout
+from urlab_client.aio.session.turn import Deadlines
 from urlab_client.errors import ControlClaimed, NotControlOwner, URLabError
-from urlab_client.protocol.base import ControlRequest, Reply, Request
+from urlab_client.protocol.base import ControlRequest, Reply
 from urlab_client.protocol.messages.control import (
     UNCLAIMED,
     ClaimControl,
@@ -33,6 +32,9 @@ from urlab_client.protocol.messages.control import (
 from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
 from urlab_client.protocol.messages.session import Step
 
+if TYPE_CHECKING:
+    from urlab_client.aio.session.session import Session
+
 log: logging.Logger = logging.getLogger("urlab_client.control")
 
 R = TypeVar("R", bound=Reply)
@@ -42,43 +44,6 @@ CLAIM_S: Final = 30.0
 
 _RELEASE_S: Final = 1.0
 _RENEWALS: Final = 3  # per lifetime of a claim
-
-
-L_contra = TypeVar("L_contra", contravariant=True)
-L = TypeVar("L")
-
-
-class Asks(Protocol[L_contra]):
-    """Sends one request within the caller's turn and returns the reply."""
-
-    def __call__(self, request: Request[R], limits: L_contra, /) -> Awaitable[R]:
-        """See the class."""
-        ...
-
-
-class ControlledSession(Protocol):
-    """The part of a session that `Control` needs."""
-
-    session_id: str
-    features: Features
-    tell: Tell
-
-    @property
-    def unsettled(self) -> Mapping[str, object]:
-        """What abandoned requests may have changed."""
-        ...
-
-    def settling(self, what: str, settle: Callable[[Any], Awaitable[object]]) -> AbstractContextManager[None]:
-        """Keep `settle` for `resync()` if the body leaves open whether the server executed its request."""
-        ...
-
-    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
-        """Send a request in its own turn."""
-        ...
-
-    async def probe(self, request: Request[R], *, timeout: float) -> R | None:
-        """Send a request if no other is in progress."""
-        ...
 
 
 @cache
@@ -100,16 +65,12 @@ class _Claim:
 class Control:
     """The robots that one client owns.
 
-    Args:
-        session: Session that sends the claims.
-        wanted: Whether to claim a robot with the first write to it; False leaves that to `claim`.
-
     Attributes:
         resolve: Returns the key of an articulation for any of its names; None for an unknown name.
         owner: Owner name of this client's claims.
     """
 
-    def __init__(self, session: ControlledSession, *, wanted: bool = True) -> None:
+    def __init__(self, session: Session, *, wanted: bool) -> None:
         self.resolve: Callable[[str], str | None] = lambda name: name
         self.owner: str = process_owner()
         self._session = session
@@ -126,42 +87,37 @@ class Control:
             return self.owner
         return self._others.get(key)
 
-    async def send(self, request: ControlRequest[R], ask: Asks[L], limits: L) -> R:
+    async def send(self, request: ControlRequest[R], deadlines: Deadlines) -> R:
         """Send a request that writes to robots, and claim them first where necessary.
-
-        Args:
-            request: The request.
-            ask: Sends one request within the caller's turn.
-            limits: Time limits, passed to `ask`.
 
         Raises:
             NotControlOwner: Another client owns one of the robots; nothing was written.
         """
         if not self._session.features.claims:
-            return await ask(request, limits)
+            return await self._session.exchange_once(request, deadlines)
         request.control_owner = self.owner
         if isinstance(request, ClaimControl):
-            return cast("R", await self._claim(request, ask, limits))
+            return cast("R", await self._claim(request, deadlines))
         if isinstance(request, ReleaseControl):
-            return cast("R", await self._release(request, ask, limits))
+            return cast("R", await self._release(request, deadlines))
         robots = self._robots(request)
         if self._wanted and robots:
             now = asyncio.get_running_loop().time()
             for key in robots:
                 claim = self._held.get(key)
                 if claim is None or claim.until < now:
-                    await self._claim(self._claim_request(key), ask, limits)
+                    await self._claim(self._claim_request(key), deadlines)
         try:
-            reply = await ask(request, limits)
+            reply = await self._session.exchange_once(request, deadlines)
         except NotControlOwner as refusal:
             if refusal.owner not in {UNCLAIMED, *self._names} or not self._wanted or not robots:
                 raise self._refused(robots, refusal) from None
             # The claim expired, play was restarted, or the claim belonged to an earlier session. Nothing was written,
             # so the request may be sent again.
             for key in robots:
-                await self._claim(self._claim_request(key), ask, limits)
+                await self._claim(self._claim_request(key), deadlines)
             try:
-                reply = await ask(request, limits)
+                reply = await self._session.exchange_once(request, deadlines)
             except NotControlOwner as second:
                 raise self._refused(robots, second) from None
         self._note_write(robots)
@@ -232,18 +188,18 @@ class Control:
         ttl = CLAIM_S if claim is None else claim.ttl
         return ClaimControl(articulation=key, ttl_s=ttl, control_owner=self.owner)
 
-    async def _claim(self, request: ClaimControl, ask: Asks[L], limits: L) -> ClaimControlOk:
+    async def _claim(self, request: ClaimControl, deadlines: Deadlines) -> ClaimControlOk:
         key = self.resolve(request.articulation) or request.articulation
         session, what, ttl = self._session, _control_of(key), request.ttl_s
         try:
             with session.settling(what, lambda turn: turn.call(ClaimControl(articulation=key, ttl_s=ttl))):
-                reply = await ask(request, limits)
+                reply = await self._session.exchange_once(request, deadlines)
         except ControlClaimed as refusal:
             if request.force or refusal.owner not in self._names:
                 raise self._refused([key], refusal) from None
             # The owner is this client in an earlier session, so forcing takes the robot from no other client.
             request.force = True
-            reply = await ask(request, limits)
+            reply = await self._session.exchange_once(request, deadlines)
         except BaseException:
             if what in session.unsettled:
                 self._hold(key, ttl)  # most likely, so that `aclose` releases it
@@ -254,13 +210,13 @@ class Control:
         self._hold(key, ttl)
         return reply
 
-    async def _release(self, request: ReleaseControl, ask: Asks[L], limits: L) -> ReleaseControlOk:
+    async def _release(self, request: ReleaseControl, deadlines: Deadlines) -> ReleaseControlOk:
         key = self.resolve(request.articulation) or request.articulation
         self._held.pop(key, None)  # otherwise the claim would be renewed
         again = ReleaseControl(articulation=key)
         try:
             with self._session.settling(_control_of(key), lambda turn: turn.call(again)):
-                return await ask(request, limits)
+                return await self._session.exchange_once(request, deadlines)
         except NotControlOwner as refusal:
             raise self._refused([key], refusal) from None
 

@@ -49,14 +49,6 @@ async def finish(
 
     The server reports the end of a job once. The op is never sent again.
 
-    Args:
-        op: The op.
-        reply: Type of its reply.
-        started: Reply that announced the job.
-        poll: Sends one status request, subject to the deadline.
-        deadline: Loop time until which to wait; None for no limit.
-        on_progress: Callback invoked with the status after each poll.
-
     Raises:
         URLabRPCError: The editor refused the op; the refusal arrived as the job's result.
         OutcomeUnknown: The report of the job's end was lost.

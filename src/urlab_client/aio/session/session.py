@@ -16,7 +16,7 @@ from urlab_client.aio.features import Features
 from urlab_client.aio.session.call_records import CallRecords, Observe
 from urlab_client.aio.session.control import Control
 from urlab_client.aio.session.jobs import OnProgress, finish
-from urlab_client.aio.session.turn import Limits, Mutex, Settle, Turn, require_reply
+from urlab_client.aio.session.turn import Deadlines, Mutex, Settle, Turn, require_reply
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.errors import (
     ConnectionLost,
@@ -46,8 +46,6 @@ from urlab_client.protocol.codec import (
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 
-__all__ = ["STOP", "Session", "Turn", "leaves_open", "server_restarted"]
-
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
@@ -67,12 +65,12 @@ class Session:
     """A session with one server.
 
     The server handles one request at a time anyway, and a second request must not be queued behind a first one that may
-    fail. Requests therefore wait here for the line to be free, where waiting is visible and cancellable. Requests that
+    fail. Requests therefore wait here for the request lock, where waiting is visible and cancellable. Requests that
     depend on the client's state or change it also wait for a `turn`.
 
     Attributes:
         session_id: Id of the open session; empty without one.
-        greeted: Whether a handshake was sent, with any outcome.
+        hello_sent: Whether a handshake was sent, with any outcome.
         features: Features of the server, as far as its replies have shown them.
         control: The robots that this client owns.
         read_only: Whether requests that need a session are refused.
@@ -86,10 +84,10 @@ class Session:
         unkept: Why the session is no longer kept open although `keep_session` is set; otherwise None.
         unsettled: How to settle what the client mirrors and an abandoned request may have changed, by its name.
         unsettled_on: Number of connections opened when the latest of these requests was abandoned.
-        line: Held while a request is in progress, from its encoding to its reply.
-        turns: Held by the current `Turn`.
-        editing: Held while the editor runs a job.
-        scene: Held by the task that changes the scene, for one op or for several that belong together.
+        request_lock: Held while a request is in progress, from its encoding to its reply.
+        state_lock: Held by the current `Turn`.
+        editor_lock: Held while the editor runs a job.
+        scene_lock: Held by the task that changes the scene, for one op or for several that belong together.
     """
 
     def __init__(
@@ -99,10 +97,12 @@ class Session:
         default_timeout: float | None,
         json: bool = False,
         observe: Observe | None = None,
+        claim_control: bool = True,
+        read_only: bool = False,
     ) -> None:
         self.session_id: str = ""
-        self.greeted: bool = False
-        self.read_only: bool = False
+        self.hello_sent: bool = False
+        self.read_only = read_only
         self.features: Features = Features()
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
@@ -119,17 +119,17 @@ class Session:
         self._way = self._call_records or transport
         self._default_timeout = default_timeout
         self._json = json
-        self.control: Control = Control(self)
-        self.line: Mutex = Mutex()
-        self.turns: Mutex = Mutex()
-        self.editing: Mutex = Mutex()
-        self.scene: Mutex = Mutex()
+        self.control: Control = Control(self, wanted=claim_control)
+        self.request_lock: Mutex = Mutex()
+        self.state_lock: Mutex = Mutex()
+        self.editor_lock: Mutex = Mutex()
+        self.scene_lock: Mutex = Mutex()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
-        self._aside: asyncio.Task[Reply] | None = None
+        self._probe_task: asyncio.Task[Reply] | None = None
         # A handshake whose caller gave up after it was sent still opens a session.
-        self._given_up: asyncio.Future[bytes] | None = None
-        self._unanswered = False
+        self._abandoned_hello: asyncio.Future[bytes] | None = None
+        self._hello_unanswered = False
 
     @property
     def transport(self) -> RequestTransport:
@@ -140,11 +140,6 @@ class Session:
         self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
     ) -> R:
         """Send a request that does not depend on the client's state; return its reply, or the result of its job.
-
-        Args:
-            request: Any request struct of `urlab_client.protocol.messages`.
-            timeout: Seconds for queueing, sending and the reply, including a job; None waits without limit.
-            on_progress: Callback invoked with the progress of a job.
 
         Raises:
             URLabRPCError: The server refused the request.
@@ -157,14 +152,14 @@ class Session:
         if on_progress is not None and not callable(on_progress):
             raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
         self.check_offered(op)
-        limits = self.limits(op, timeout, self.bound_loop().time())
+        deadlines = self.deadlines(op, timeout, self.bound_loop().time())
         if op.ns != "scene" or op.effect is Effect.READ or _COMPOSING.get() is self:
-            return await self._call(request, op, limits, on_progress)
-        await self.acquire(self.scene, op, limits[0])
+            return await self._call(request, op, deadlines, on_progress)
+        await self.acquire(self.scene_lock, op, deadlines.reply)
         try:
-            return await self._call(request, op, limits, on_progress)
+            return await self._call(request, op, deadlines, on_progress)
         finally:
-            self.scene.release()
+            self.scene_lock.release()
 
     @asynccontextmanager
     async def composing(self, request: type[Request[Any]], timeout: Timeout) -> AsyncGenerator[None]:
@@ -174,25 +169,25 @@ class Session:
             URLabTimeoutError: Other tasks held the scene until the deadline of that op; nothing was sent.
         """
         op = op_of(request)
-        await self.acquire(self.scene, op, self.limits(op, timeout, self.bound_loop().time())[0])
+        await self.acquire(self.scene_lock, op, self.deadlines(op, timeout, self.bound_loop().time())[0])
         outer = _COMPOSING.set(self)
         try:
             yield
         finally:
             _COMPOSING.reset(outer)
-            self.scene.release()
+            self.scene_lock.release()
 
-    async def _call(self, request: Request[R], op: Op, limits: Limits, on_progress: OnProgress | None) -> R:
+    async def _call(self, request: Request[R], op: Op, deadlines: Deadlines, on_progress: OnProgress | None) -> R:
         if op.needs is not Needs.EDITOR:
-            return await self._on_line(request, op, limits)
+            return await self._exchange_alone(request, op, deadlines)
         # One job at a time: the next editor op would wait for it anyway, and block the server in the meantime.
-        await self.acquire(self.editing, op, limits[0])
+        await self.acquire(self.editor_lock, op, deadlines.reply)
         try:
-            await self.acquire(self.line, op, limits[0])
+            await self.acquire(self.request_lock, op, deadlines.reply)
             try:
-                answer = await self.exchange(request, op, limits)
+                answer = await self.exchange(request, op, deadlines)
             finally:
-                self.line.release()
+                self.request_lock.release()
             if not isinstance(answer, OpStarted):
                 return answer
             status = op_of(OpStatus)
@@ -200,28 +195,25 @@ class Session:
                 op,
                 op_reply(request, op),
                 answer,
-                lambda question: self._on_line(question, status, limits),
-                deadline=limits[0],
+                lambda question: self._exchange_alone(question, status, deadlines),
+                deadline=deadlines.reply,
                 on_progress=on_progress,
             )
         finally:
-            self.editing.release()
+            self.editor_lock.release()
 
-    async def _on_line(self, request: Request[R], op: Op, limits: Limits) -> R:
-        await self.acquire(self.line, op, limits[0])
+    async def _exchange_alone(self, request: Request[R], op: Op, deadlines: Deadlines) -> R:
+        await self.acquire(self.request_lock, op, deadlines.reply)
         try:
-            return require_reply(op, await self.exchange(request, op, limits))
+            return require_reply(op, await self.exchange(request, op, deadlines))
         finally:
-            self.line.release()
+            self.request_lock.release()
 
     def turn(self, request: type[Request[Any]], *, timeout: Timeout = DEFAULT, each: bool = False) -> Turn:
         """Return a turn for requests that depend on the client's state or change it.
 
-        Args:
-            request: Type of the first request, whose deadline also covers the wait for the turn.
-            timeout: Seconds for queueing and all requests together; None waits without limit. The default timeout
-                applies to each request separately.
-            each: Whether a given timeout also applies to each request separately.
+        The deadline of the first request also covers the wait for the turn. A given timeout covers all requests
+        together, or `each` of them; the default timeout always applies to each.
         """
         op = op_of(request)
         self.check_offered(op)
@@ -233,16 +225,16 @@ class Session:
         Returns:
             The reply, or None if the request was cancelled or not sent.
         """
-        if self.line.locked() or self._queued or self._aside is not None:
+        if self.request_lock.locked() or self._queued or self._probe_task is not None:
             return None  # two at a time could not both be cancelled for the next call
         task = asyncio.create_task(self.call(request, timeout=timeout), name="urlab-probe")
-        self._aside = task
+        self._probe_task = task
         try:
             await asyncio.wait((task,))
             return None if task.cancelled() else task.result()
         finally:
             task.cancel()
-            self._aside = None
+            self._probe_task = None
 
     @contextmanager
     def settling(self, what: str, settle: Settle) -> Generator[None]:
@@ -304,42 +296,35 @@ class Session:
         if listed is not None and op.name not in listed and op.name not in _UNLISTED:
             raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
-    def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
-        """Return the limits of a request.
-
-        Args:
-            op: Its op.
-            timeout: Timeout given by the caller.
-            since: Loop time from which the timeout counts.
-            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
-                default timeout.
-        """
+    def deadlines(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Deadlines:
+        """Return the deadlines of a request."""
         default = self._default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout
-            return deadline, deadline
+            return Deadlines(deadline, deadline)
         if default is None:
-            return None, None
+            return Deadlines(None, None)
         # The reply to a slow op may take long, but a missing server shows much sooner.
         seconds = (op.timeout if takes is None else takes) or 0.0
         connect_by = since + default
-        return (since + seconds if seconds > default else connect_by), connect_by
+        return Deadlines(since + seconds if seconds > default else connect_by, connect_by)
 
-    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]:
-        """Send a request and return its answer. The caller must hold the line."""
+    def exchange(self, request: Request[R], op: Op, deadlines: Deadlines) -> Coroutine[Any, Any, R | OpStarted]:
+        """Send a request and return its answer. The caller must hold the request lock."""
         if self.features.claims and isinstance(request, ControlRequest):
-            return self.control.send(request, self._ask, limits)
+            return self.control.send(request, deadlines)
         if self._call_records is not None:
-            return self._call_records.record(op, self._answer(request, op, limits))
-        return self._answer(request, op, limits)
+            return self._call_records.record(op, self._answer(request, op, deadlines))
+        return self._answer(request, op, deadlines)
 
-    async def _ask(self, request: Request[R], limits: Limits) -> R:
+    async def exchange_once(self, request: Request[R], deadlines: Deadlines) -> R:
+        """Send a request as it is, without the claims that it may need. The caller must hold the request lock."""
         op = op_of(request)
-        answer = self._answer(request, op, limits)
+        answer = self._answer(request, op, deadlines)
         records = self._call_records
         return require_reply(op, await (answer if records is None else records.record(op, answer)))
 
-    async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
+    async def _answer(self, request: Request[R], op: Op, deadlines: Deadlines, *, again: bool = False) -> R | OpStarted:
         # A single coroutine, because each further one between a step and its socket slows down every step.
         stamped = self.session_id
         frame = encode_request(request, stamped, json=self._json)
@@ -347,17 +332,17 @@ class Session:
             check_finite(request)
             if not self._json:
                 check_request(request, frame)
-        late = self._await_later if op is _HELLO else None
+        late = self._adopt_later if op is _HELLO else None
         sent, began = self._transport.stats.sent, time.perf_counter()
         try:
             try:
-                deadline, connect_by = limits
+                deadline, connect_by = deadlines
                 answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as lost:
-                answer = await self._ask_again(frame, op, lost, limits)
+                answer = await self._ask_again(frame, op, lost, deadlines)
             finally:
                 if late is not None and self._transport.stats.sent > sent:
-                    self.greeted = self._unanswered = True  # `_unanswered` until the reply has been read
+                    self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
             if log.isEnabledFor(logging.DEBUG):
                 took = 1e3 * (time.perf_counter() - began)
                 log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
@@ -365,15 +350,15 @@ class Session:
         except SessionTakenOver as refusal:
             # An abandoned handshake of this client still opens a session. A request refused because of it was not
             # executed, and is sent again in that session.
-            if not again and await self._settled(limits[0]) and self.session_id != stamped:
-                return await self._answer(request, op, limits, again=True)
+            if not again and await self._settled(deadlines.reply) and self.session_id != stamped:
+                return await self._answer(request, op, deadlines, again=True)
             if not stamped:
                 raise NoSession("no session is open.", op=op.name) from None
             if self.on_refusal is not None:
                 self.on_refusal(refusal)
             if self.was_down:
                 raise self._after_restart(stamped, op, refusal.message) from self.unkept
-            if self._unanswered:
+            if self._hello_unanswered:
                 raise _maybe_own_handshake(refusal) from None
             raise
 
@@ -409,22 +394,22 @@ class Session:
         if self.was_down:
             self.unsettled.clear()  # the server has been restarted
         self.was_down = False
-        self._given_up = None
-        self._unanswered = False
+        self._abandoned_hello = None
+        self._hello_unanswered = False
         if self.on_opened is not None:
             self.on_opened(hello)
 
-    def _await_later(self, reply: asyncio.Future[bytes]) -> None:
+    def _adopt_later(self, reply: asyncio.Future[bytes]) -> None:
         """Adopt the session that an abandoned handshake opens, when its reply arrives."""
-        self._given_up = reply
-        reply.add_done_callback(self._take_later)
+        self._abandoned_hello = reply
+        reply.add_done_callback(self._adopt_abandoned_hello)
 
-    def _take_later(self, reply: asyncio.Future[bytes]) -> None:
-        if self._given_up is not reply or not reply.done():
+    def _adopt_abandoned_hello(self, reply: asyncio.Future[bytes]) -> None:
+        if self._abandoned_hello is not reply or not reply.done():
             return  # a later handshake has been answered in the meantime
-        self._given_up = None
+        self._abandoned_hello = None
         if reply.cancelled():
-            return  # the connection was lost; `_unanswered` remembers it
+            return  # the connection was lost; `_hello_unanswered` remembers it
         try:
             self._open(decode_reply(op_of(Hello), HelloOk, reply.result()))
         except URLabError as error:
@@ -432,20 +417,20 @@ class Session:
 
     async def _settled(self, deadline: float | None) -> bool:
         """Wait for the reply to an abandoned handshake; return whether none is outstanding."""
-        reply = self._given_up
+        reply = self._abandoned_hello
         if reply is not None:
             left = None if deadline is None else max(0.0, deadline - asyncio.get_running_loop().time())
             await asyncio.wait((reply,), timeout=left)
-            self._take_later(reply)
-        return self._given_up is None
+            self._adopt_abandoned_hello(reply)
+        return self._abandoned_hello is None
 
-    async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, limits: Limits) -> bytes:
+    async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, deadlines: Deadlines) -> bytes:
         """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
-        late = self._await_later if op is _HELLO else None
+        late = self._adopt_later if op is _HELLO else None
         while True:
             log.debug("%s: sending the request again, because the connection was lost", op.name)
             try:
-                deadline, connect_by = limits
+                deadline, connect_by = deadlines
                 return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as again:
                 lost = again
@@ -453,7 +438,7 @@ class Session:
                 raise lost from unreachable
 
     async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
-        """Wait for `line`, `turns`, `editing` or `scene`.
+        """Wait for one of the session's locks.
 
         Raises:
             URLabTimeoutError: Another call held it until the deadline; nothing was sent.
@@ -464,8 +449,8 @@ class Session:
         await (waiting if self._call_records is None else self._call_records.queued(op, waiting))
 
     async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
-        if self._aside is not None:
-            self._aside.cancel()
+        if self._probe_task is not None:
+            self._probe_task.cancel()
         self._queued += 1
         try:
             async with asyncio.timeout_at(deadline):

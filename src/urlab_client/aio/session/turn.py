@@ -6,42 +6,26 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, TypeVar, cast
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.messages.jobs import OpStarted
 
+if TYPE_CHECKING:
+    from urlab_client.aio.session.session import Session
+
 R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
 
-Limits: TypeAlias = tuple[float | None, float | None]
-"""Loop times of two deadlines, for the reply and for the connection; None waits without limit."""
+class Deadlines(NamedTuple):
+    """Loop times until which to wait for the reply to a request, and for its connection; None waits without limit."""
 
-
-class _TurnSession(Protocol):
-    """The part of `Session` that a turn needs; see there."""
-
-    line: Mutex
-    turns: Mutex
-    editing: Mutex
-
-    @property
-    def transport(self) -> RequestTransport: ...
-
-    def bound_loop(self) -> asyncio.AbstractEventLoop: ...
-
-    def check_offered(self, op: Op) -> None: ...
-
-    def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits: ...
-
-    async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None: ...
-
-    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]: ...
+    reply: float | None
+    connect: float | None
 
 
 class Turn:
@@ -53,12 +37,12 @@ class Turn:
 
     __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
 
-    def __init__(self, session: _TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
+    def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
         self._session = session
         self._op = op
         self._timeout: Timeout = timeout
         self._each = each
-        self._asked: Limits | None = None
+        self._asked: Deadlines | None = None
         self._first = True
         self._ready = False
         self._began = session.bound_loop().time()
@@ -68,11 +52,11 @@ class Turn:
     def begin_nowait(self) -> bool:
         """Begin if no other task has a turn and no request is in progress; return whether the turn has begun."""
         session, op = self._session, self._op
-        self._asked = session.limits(op, self._timeout, self._began)
-        if op.needs is Needs.EDITOR or not session.turns.acquire_nowait():
+        self._asked = session.deadlines(op, self._timeout, self._began)
+        if op.needs is Needs.EDITOR or not session.state_lock.acquire_nowait():
             return False
-        if not session.line.acquire_nowait():
-            session.turns.release()
+        if not session.request_lock.acquire_nowait():
+            session.state_lock.release()
             return False
         self._ready = True
         return True
@@ -84,20 +68,20 @@ class Turn:
             URLabTimeoutError: Other tasks had their turns until the deadline; nothing was sent.
         """
         session, op = self._session, self._op
-        limits = self._asked or session.limits(op, self._timeout, self._began)
-        self._asked = limits
-        await session.acquire(session.turns, op, limits[0])
+        deadlines = self._asked or session.deadlines(op, self._timeout, self._began)
+        self._asked = deadlines
+        await session.acquire(session.state_lock, op, deadlines.reply)
         try:
-            await self._take_line(limits[0])
+            await self._acquire_request_lock(deadlines.reply)
         except BaseException:
-            session.turns.release()
+            session.state_lock.release()
             raise
 
     def end(self) -> None:
         """End the turn, so that the next one can begin."""
         if self._ready:
-            self._give_line()
-        self._session.turns.release()
+            self._release_request_lock()
+        self._session.state_lock.release()
 
     async def __aenter__(self) -> Self:
         await self.begin()
@@ -116,23 +100,20 @@ class Turn:
     def call(self, request: Request[R], *, takes: float | None = None) -> Coroutine[Any, Any, R]:
         """Send a request, built since the last wait of this turn, and return its reply.
 
-        Args:
-            request: The request.
-            takes: Seconds that the server may take, instead of the seconds that the op declares; applies to the
-                default timeout.
+        By default the server may take the seconds that the op declares; `takes` overrides them.
 
         Raises:
             URLabError: See `Session.call`.
         """
-        session, op, limits = self._session, self._op, self._asked
+        session, op, deadlines = self._session, self._op, self._asked
         self._before = session.transport.stats.sent
-        if limits is None or takes is not None or type(request) is not op.request:
+        if deadlines is None or takes is not None or type(request) is not op.request:
             op = op_of(request)
             session.check_offered(op)
-            limits = self._limits(op, takes)
+            deadlines = self._deadlines(op, takes)
         self._asked = None
         self._first = False
-        answer = session.exchange(request, op, limits)
+        answer = session.exchange(request, op, deadlines)
         if op.needs is Needs.EDITOR:
             return _await_reply(op, answer)
         return cast("Coroutine[Any, Any, R]", answer)  # the server answers only the editor's ops with a job
@@ -140,41 +121,41 @@ class Turn:
     def deadline(self, takes: float) -> float:
         """Return the loop time until which this turn may wait for something that takes `takes` seconds."""
         by = asyncio.get_running_loop().time() + takes
-        limit = None if self._timeout is DEFAULT else self._limits(self._op)[0]
+        limit = None if self._timeout is DEFAULT else self._deadlines(self._op).reply
         return by if limit is None else min(by, limit)
 
     async def aside(self, work: Awaitable[T]) -> T:
         """Let requests that do not depend on the client's state pass while awaiting `work`, which sends nothing."""
-        self._give_line()
+        self._release_request_lock()
         result = await work
-        await self._take_line(self._limits(self._op)[0])
+        await self._acquire_request_lock(self._deadlines(self._op).reply)
         return result
 
-    async def _take_line(self, deadline: float | None) -> None:
+    async def _acquire_request_lock(self, deadline: float | None) -> None:
         session, op = self._session, self._op
-        editing = op.needs is Needs.EDITOR
-        if editing:
-            await session.acquire(session.editing, op, deadline)
+        in_editor = op.needs is Needs.EDITOR
+        if in_editor:
+            await session.acquire(session.editor_lock, op, deadline)
         try:
-            await session.acquire(session.line, op, deadline)
+            await session.acquire(session.request_lock, op, deadline)
         except BaseException:
-            if editing:
-                session.editing.release()
+            if in_editor:
+                session.editor_lock.release()
             raise
         self._ready = True
 
-    def _give_line(self) -> None:
+    def _release_request_lock(self) -> None:
         self._left = self._session.transport.stats.sent > self._before
         self._ready = False
-        self._session.line.release()
+        self._session.request_lock.release()
         if self._op.needs is Needs.EDITOR:
-            self._session.editing.release()
+            self._session.editor_lock.release()
 
-    def _limits(self, op: Op, takes: float | None = None) -> Limits:
+    def _deadlines(self, op: Op, takes: float | None = None) -> Deadlines:
         # The wait for the turn counts for the first request, and for all requests if one timeout covers them.
         counted = self._first or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
-        return self._session.limits(op, self._timeout, since, takes)
+        return self._session.deadlines(op, self._timeout, since, takes)
 
 
 Settle: TypeAlias = Callable[[Turn], Awaitable[object]]

@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import learn_mode, stopped_live
 from urlab_client.aio.state.step_pictures import first_picture_s
-from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
-from urlab_client.aio.transport.subscriber import MessageHandler
+from urlab_client.aio.streams.pictures import PictureListener
+from urlab_client.aio.streams.sources import Camera
 from urlab_client.enums import StepMode
 from urlab_client.errors import (
     ModeLocked,
     NoActiveManager,
     PictureTimeout,
-    ProtocolError,
     URLabError,
     URLabTimeoutError,
 )
@@ -34,7 +32,7 @@ from urlab_client.protocol.messages.session import Meta, Step
 from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pictures import decode_camera, picture_stamp
+from urlab_client.values.pictures import decode_camera
 
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05
@@ -49,18 +47,13 @@ _ASSUMED = "The server's step mode is unknown, and outside live mode it may publ
 
 
 class Capturing:
-    """Takes pictures for one client.
-
-    Args:
-        state: State of the client.
-        default_timeout: Seconds to wait for a camera that has delivered before; None waits without limit.
-    """
+    """Takes pictures for one client."""
 
     def __init__(self, state: SimState, default_timeout: float | None) -> None:
         self._state = state
         self._default_timeout = default_timeout
 
-    async def take(self, cameras: Sequence[HasCamera], timeout: Timeout) -> list[CameraSample]:
+    async def take(self, cameras: Sequence[Camera], timeout: Timeout) -> list[CameraSample]:
         """Return a picture of each camera, taken after this call.
 
         Raises:
@@ -80,21 +73,21 @@ class Capturing:
             views = self._views(cameras)
             taking = _Taking(state, turn, views, self._deadline(views, timeout))
             try:
-                if state.mode_assumed and not state.session.read_only:
+                if state.mode.assumed and not state.session.read_only:
                     await self._learn_mode(turn)
-                if state.mode is StepMode.LIVE or state.mode_assumed:
-                    await taking.in_live_mode(certain=not state.mode_assumed)
+                if state.mode.live or state.mode.assumed:
+                    await taking.in_live_mode(certain=not state.mode.assumed)
                 else:
-                    async with stopped_live(state, turn):
+                    async with state.mode.stopped_live(turn):
                         await taking.in_live_mode(certain=True)
-                    taking.note_time(state.sim_time)
+                    taking.note_time(state.clocks.sim_time)
             except ModeLocked as locked:
                 locked.hint = "In this mode, pictures come with steps: call client.step(include_cameras=…)."
                 raise
         return taking.delivered()
 
-    def _views(self, cameras: Sequence[HasCamera]) -> list[URLabCameraView]:
-        present = {id(view): view for view in self._state.objects.views()}
+    def _views(self, cameras: Sequence[Camera]) -> list[URLabCameraView]:
+        present = {id(view.camera): view for view in self._state.objects.views()}
         missing = [camera.name for camera in cameras if id(camera) not in present]
         if missing:
             raise URLabError(
@@ -119,9 +112,9 @@ class Capturing:
             return
         await turn.aside(asyncio.sleep(_MOVES_S))
         if (await turn.call(PieStatus())).sim_time != before:
-            state.mode = StepMode.LIVE  # no other client holds the session, so physics runs on its own
+            state.mode.note(StepMode.LIVE)  # no other client holds the session, so physics runs on its own
         else:
-            await learn_mode(state, turn)
+            await state.mode.find_out(turn)
 
 
 class _Taking:
@@ -135,11 +128,7 @@ class _Taking:
         self._found: dict[int, CameraSample] = {}
 
     async def in_live_mode(self, *, certain: bool) -> None:
-        """Take the pictures of a server in live mode.
-
-        Args:
-            certain: Whether live mode is confirmed, so that a `step` advances nothing.
-        """
+        """Take the pictures of a server in live mode."""
         state, features = self._state, self._state.session.features
         try:
             async with asyncio.timeout_at(self._deadline):
@@ -156,7 +145,7 @@ class _Taking:
             raise PictureTimeout(
                 f"capture: no picture of {', '.join(map(repr, late))} arrived in time.",
                 cameras=late,
-                hint=_ASSUMED if state.mode_assumed else _HINT,
+                hint=_ASSUMED if state.mode.assumed else _HINT,
             ) from None
 
     def note_time(self, sim_time: float) -> None:
@@ -193,22 +182,28 @@ class _Taking:
 
     async def _watch(self, least: int | None) -> None:
         publishers = self._state.publishers
-        receivers = [_NextPicture(publishers.camera(view, StreamPolicy.ALL), least) for view in self._views]
+        listeners = [PictureListener(publishers.camera(view.camera, StreamPolicy.ALL)) for view in self._views]
         try:
-            for receiver in receivers:
-                receiver.source.attach(receiver)
-            await self._turn.aside(self._receive(receivers))
+            for listener in listeners:
+                listener.source.attach(listener)
+            await self._turn.aside(self._receive(listeners, least))
         finally:
-            for receiver in receivers:
-                receiver.source.detach(receiver)
+            for listener in listeners:
+                listener.source.detach(listener)
 
-    async def _receive(self, receivers: Sequence[_NextPicture]) -> None:
+    async def _receive(self, listeners: Sequence[PictureListener], least: int | None) -> None:
         for _ in range(2):  # iterations of the loop that drain the sockets
             await asyncio.sleep(0)
-        for receiver in receivers:
-            receiver.begin()
-        for view, receiver in zip(self._views, receivers, strict=True):
-            self._keep(view, await receiver.payload, view.resolution)
+        for listener in listeners:
+            listener.forget()
+        for view, listener in zip(self._views, listeners, strict=True):
+            stamp, payload = await listener.next()
+            if stamp is None or least is None:
+                _, payload = await listener.next()  # without numbers, the first may have been in transit
+            else:
+                while stamp is not None and stamp.frame_id < least:
+                    stamp, payload = await listener.next()
+            self._keep(view, payload, view.resolution)
 
     def _keep(
         self,
@@ -219,7 +214,7 @@ class _Taking:
         frame_id: int | None = None,
         sim_time: float | None = None,
     ) -> None:
-        image = decode_camera(payload, view.mode, *size, memory=view.memory, where=view.name)
+        image = decode_camera(payload, view.mode, *size, memory=view.camera.memory, where=view.name)
         self._found[id(view)] = CameraSample(
             camera=view.name,
             mode=view.mode,
@@ -229,50 +224,3 @@ class _Taking:
             capture_time=image.capture_time,
             recv_wall_time_ns=time.time_ns(),
         )
-
-
-class _NextPicture(MessageHandler):
-    """Waits for a picture that was taken after `begin`.
-
-    A picture with a snapshot number is compared with `least`. Without numbers, the second picture counts, because the
-    first may have been in transit.
-
-    Attributes:
-        source: Source of the camera's pictures.
-        payload: The picture received.
-    """
-
-    def __init__(self, source: CameraSource, least: int | None) -> None:
-        self.source = source
-        self.payload: asyncio.Future[BytesLike] = asyncio.get_running_loop().create_future()
-        self._least = least
-        self._begun = False
-        self._before = 0
-
-    def begin(self) -> None:
-        """Accept pictures from now on."""
-        self._begun = True
-
-    def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Process one message."""
-        if not self._begun or self.payload.done():
-            return
-        width, height = self.source.view.info.resolution
-        try:
-            stamp = picture_stamp(payload, width, height, where=self.source.view.name)
-        except ProtocolError as error:
-            self.payload.set_exception(error)
-            return
-        by_number = None if stamp is None or self._least is None else stamp.frame_id >= self._least
-        fresh = self._before > 0 if by_number is None else by_number
-        self._before += 1
-        if fresh:
-            self.payload.set_result(payload)
-
-    def on_malformed(self, problem: str) -> None:
-        """Ignore a malformed message."""
-
-    def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Fail because the client was closed."""
-        if not self.payload.done():
-            self.payload.set_exception(error())

@@ -34,10 +34,6 @@ class ConnectionMonitor:
 
     In live mode it always watches the state. In the other modes, where the client does not otherwise use the state
     socket, it watches only while the events have listeners.
-
-    Args:
-        session: Session of the client.
-        state: State of the client, which the monitor keeps current.
     """
 
     def __init__(self, session: Session, state: SimState) -> None:
@@ -110,7 +106,7 @@ class ConnectionMonitor:
 
     @property
     def _playing(self) -> bool:
-        return self._state.hello is not None and self._state.hello.manager_present
+        return self._state.playing
 
     def _on_state_line(self, connected: bool) -> None:
         if self._playing and not connected:
@@ -169,15 +165,12 @@ class _Presence(MessageHandler):
         self._on_sign = on_sign
 
     def on_connection(self, connected: bool) -> None:
-        """Report the state of the connection."""
         self._on_line(connected)
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Report a snapshot as a sign of play."""
         self._on_sign()
 
     def on_malformed(self, problem: str) -> None:
-        """Report a malformed snapshot as a sign of play."""
         self._on_sign()
 
     def on_end(self, error: Callable[[], URLabError]) -> None:

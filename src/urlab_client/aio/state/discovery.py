@@ -15,7 +15,6 @@ import anyio.to_thread
 from urlab_client.aio.session.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import promote
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.enums import StepMode
 from urlab_client.errors import (
@@ -39,15 +38,7 @@ _PERHAPS_S: Final = 0.2  # of one that publishes one per tick in live mode, and 
 
 
 class Discovery:
-    """Opens sessions and applies handshakes.
-
-    Args:
-        state: State of the client, updated from each handshake.
-        local_model: Whether to load the model of the handshake.
-        check_version: Whether to raise an error if the MuJoCo builds differ.
-        promote: Whether to switch the server to the step mode that the client was created with.
-        trusted: Whether to load models in MuJoCo's binary format.
-    """
+    """Opens sessions and applies handshakes."""
 
     def __init__(
         self, state: SimState, *, local_model: bool, check_version: bool, promote: bool, trusted: bool
@@ -64,7 +55,7 @@ class Discovery:
         state = self._state
         state.pending.handshake = True  # until it has been adopted
         hello = await state.session.hello(turn, Hello(observations=observations))
-        state.level = state.sent_level = observations
+        state.level.open(observations)
         await self.adopt(turn, hello)
         return hello
 
@@ -113,8 +104,8 @@ class Discovery:
 
     async def _hello_with_assets(self, turn: Turn) -> HelloOk:
         state = self._state
-        hello = await state.session.hello(turn, Hello(observations=state.level, include_assets=True))
-        state.sent_level = state.level
+        hello = await state.session.hello(turn, Hello(observations=state.level.of_session, include_assets=True))
+        state.level.open(state.level.of_session)
         return hello
 
     async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
@@ -152,7 +143,7 @@ class Discovery:
         # From here on nothing awaits until the handshake is fully applied, so a cancellation cannot separate model and
         # wrappers. The model's bytes, several times its size, are no longer needed.
         hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
-        played = state.hello is not None and state.hello.manager_present
+        played = state.playing
         with state.mirror.lock:
             # Most likely the same play session goes on. If not, the first state of the new one shows it.
             keep = played and hello.manager_present and state.mirror.holds(loaded)
@@ -161,7 +152,7 @@ class Discovery:
             state.hello = hello
             state.objects.bind(hello, examined, keep=keep)
             if not keep:
-                state.forget_clocks()
+                state.clocks.restart()
         state.located = False
         state.pending.play = state.pending.handshake = False
         views = state.objects.views()  # binds the cameras to the handshake's descriptions
@@ -176,22 +167,22 @@ class Discovery:
         if hello.manager_present:
             await self._join(turn)
         else:
-            state.mode = StepMode.LIVE
+            state.mode.note(StepMode.LIVE)
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
-            hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode,
+            hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode.current,
         )  # fmt: skip
 
     async def _join(self, turn: Turn) -> None:
         """Learn the state of the play session, and switch the server to the wanted step mode."""
-        state, wanted = self._state, self._state.wanted_mode
+        state, wanted = self._state, self._state.mode.wanted
         promoted = self._promote and wanted is not StepMode.AUTO
         if promoted:
-            state.pending.mode = wanted  # until the server has accepted it, even if this call is cancelled
+            state.mode.unsettled = wanted  # until the server has accepted it, even if this call is cancelled
         else:
-            state.assume_mode(StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+            state.mode.assume(StepMode.LIVE if wanted is StepMode.AUTO else wanted)
         await self._receive_state(turn)  # before a change of mode, because some servers publish in live mode only
-        if promoted and await promote(state, turn, wanted):
+        if promoted and await state.mode.promote(turn, wanted):
             state.located = False  # physics may have gone on until the change of mode
 
     async def _receive_state(self, turn: Turn) -> None:
@@ -249,7 +240,7 @@ class _FirstSnapshot(MessageHandler):
             self.came.set_result(found)
 
 
-async def look(turn: Turn) -> ForwardOk | None:
+async def read_state(turn: Turn) -> ForwardOk | None:
     """Return the simulation's state, or None if play is not running or the server does not provide it."""
     try:
         return await turn.call(Forward())

@@ -8,10 +8,9 @@ from collections.abc import Iterable
 from urlab_client.aio.client_types import Resync
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.session.session import STOP, Turn
-from urlab_client.aio.state.discovery import Discovery, look
+from urlab_client.aio.state.discovery import Discovery, read_state
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.enums import StepMode
 from urlab_client.errors import NoSession, SessionTakenOver, URLabRPCError
 from urlab_client.protocol.messages.session import Forward, ForwardOk
@@ -27,17 +26,19 @@ async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DE
     """
     async with state.session.turn(Forward, timeout=timeout) as turn:
         pending, state.pending = state.pending, PendingOutcomes()
-        state.pending.paused = pending.paused
+        mode, state.mode.unsettled = state.mode.unsettled, None
         try:
-            return await _resync(state, discovery, pending, turn)
+            return await _resync(state, discovery, pending, mode, turn)
         except BaseException:
-            pending.mode = state.pending.mode or pending.mode
+            state.mode.unsettled = state.mode.unsettled or mode
             pending.handshake = state.pending.handshake or pending.handshake
             state.pending = pending  # for the next attempt
             raise
 
 
-async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcomes, turn: Turn) -> Resync:
+async def _resync(
+    state: SimState, discovery: Discovery, pending: PendingOutcomes, mode: StepMode | str | None, turn: Turn
+) -> Resync:
     sent = pending.steps
     applied: int | None = None if sent else 0
     was_reset: bool | None = None
@@ -46,7 +47,7 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
     if not pending.play:  # a later start of play leaves nothing to stop
         await _settle(state, turn, [STOP])
     try:
-        reply = before = await look(turn)
+        reply = before = await read_state(turn)
     except (SessionTakenOver, NoSession):
         reply, held, renewed = None, False, True
     if before is not None:
@@ -54,30 +55,30 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         # A request interrupted by a lost connection may still be in transit and reach the server later. In puppet mode
         # the next push overrides it; in other modes the server rejects it once its session has been replaced.
         connects = state.session.transport.stats.connects
-        late = pending.connects != connects and state.mode is not StepMode.PUPPET
+        late = pending.connects != connects and not state.mode.puppet
         renewed = late and not (applied == sent and (was_reset or not pending.reset))
         renewed = renewed or (bool(state.session.unsettled) and state.session.unsettled_on != connects)
     # Without a handshake, or if one was interrupted, the client may know another world than the one that plays.
     if renewed or pending.play or pending.handshake or state.hello is None:
         renewed = True
-        await discovery.open(turn, state.level)
-        reply = await look(turn)
+        await discovery.open(turn, state.level.of_session)
+        reply = await read_state(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
             applied = _with_late_steps(state, applied, reply.time - before.time)
-    if reply is not None and pending.mode is not None:
-        await ask_mode(state, turn, pending.mode)
-        reply = await look(turn)  # in live mode the simulation has advanced meanwhile
+    if reply is not None and mode is not None:
+        await state.mode.ask(turn, mode)
+        reply = await read_state(turn)  # in live mode the simulation has advanced meanwhile
     if reply is not None:
         if was_reset:
             state.reset_seed = pending.seed
             state.absorb_reset(reply, pending.keyframe)
         else:
-            state.absorb(reply, "forward", into_mirror=state.mode is not StepMode.PUPPET)
+            state.absorb(reply, "forward", into_mirror=not state.mode.puppet)
         await _settle(state, turn, list(state.session.unsettled))
         if state.publishers.camera_switch is not None:
             await turn.aside(state.publishers.camera_switch.settle())
     if applied is not None:
-        pending.give_back(applied)
+        pending.restore_wrenches(applied)
     return Resync(
         session_held=held,
         session_renewed=renewed,

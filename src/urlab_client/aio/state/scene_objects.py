@@ -8,11 +8,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 
 from urlab_client.aio.arguments import text
-from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.articulation import Move, URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror
-from urlab_client.aio.motion import Motion
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.handshake import Examined
 from urlab_client.aio.streams.publishers import Publishers
@@ -36,9 +35,12 @@ class SceneObjects:
         global_cameras: Scene-level cameras.
         records: Mirrored state of the articulations, by key.
         entity_records: Mirrored state of the plain entities, by name.
+        move: Moves the joints of an articulation; set by the client.
     """
 
-    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror, motion: Motion) -> None:
+    move: Move
+
+    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror) -> None:
         self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
         self.articulations_by_id: dict[str, URLabArticulation] = {}
         self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
@@ -48,7 +50,6 @@ class SceneObjects:
         self._session = session
         self._publishers = publishers
         self._mirror = mirror
-        self._motion = motion
 
     def bind(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
         """Adopt the contents of a handshake; `keep` says whether the known state is also that of its world."""
@@ -157,7 +158,7 @@ class SceneObjects:
             else:
                 record.bind(info, layout, keep=keep)
             wrappers[key] = self.articulations.get(key) or URLabArticulation(
-                record, self._session, self._publishers, self._motion
+                record, self._session, self._publishers, self.move
             )
             found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
             for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
@@ -182,5 +183,5 @@ class SceneObjects:
         view = self.global_cameras.get(name)
         if view is None:
             return URLabCameraView(name, info, self._publishers)
-        view.info = info
+        view.camera.info = info
         return view

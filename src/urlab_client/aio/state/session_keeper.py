@@ -32,13 +32,7 @@ _PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts; the last one r
 
 
 class SessionKeeper:
-    """Keeps the session of one client open, in one task.
-
-    Args:
-        session: Session of the client.
-        state: State of the client.
-        discovery: Discovery that opens sessions.
-    """
+    """Keeps the session of one client open, in one task."""
 
     def __init__(self, session: Session, state: SimState, discovery: Discovery) -> None:
         self._session = session
@@ -83,7 +77,7 @@ class SessionKeeper:
     async def _act_on(self, event: ClientEvent) -> None:
         match event:
             case ServerLost():
-                self._time = self._state.sim_time
+                self._time = self._state.clocks.sim_time
             case SessionLost():
                 if event.session_id == self._session.session_id:
                     await self._on_lost(event.session_id)
@@ -133,7 +127,7 @@ class SessionKeeper:
                 async with session.turn(Hello) as turn:
                     if session.session_id == lost:
                         log.info("discovering again, because %s", why)
-                        await self._discovery.open(turn, state.level)
+                        await self._discovery.open(turn, state.level.of_session)
             except (URLabConnectionError, URLabTimeoutError) as error:
                 if isinstance(error, ClientClosed):
                     raise

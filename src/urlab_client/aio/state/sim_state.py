@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
-from urlab_client.aio.motion import Motion
-from urlab_client.aio.observer import ClientObserver
 from urlab_client.aio.session.session import Session
+from urlab_client.aio.state.clocks import Clocks
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
-from urlab_client.aio.streams.live_state import LatestPicture, LiveState
+from urlab_client.aio.state.step_mode import ModeState
+from urlab_client.aio.streams.live_state import LiveState
+from urlab_client.aio.streams.pictures import LatestPicture, StepStreams
 from urlab_client.aio.streams.publishers import Publishers
-from urlab_client.aio.streams.step_streams import StepStreams
 from urlab_client.enums import CameraMode, CameraTiming, StepMode
 from urlab_client.errors import (
     NoActiveManager,
@@ -50,9 +51,6 @@ from urlab_client.values.types import SimOptions
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
-# By the server's clock. A larger difference means that the clock was set, not that messages were reordered.
-_OVERTAKEN_S = 1.0
-
 
 _Parts = tuple[
     list[tuple[MirroredArticulation, ArticulationState]],
@@ -62,88 +60,76 @@ _Parts = tuple[
 """The parts of a checked state, each with its target."""
 
 
+class ReplyLevel:
+    """Observation level of the replies to steps.
+
+    Attributes:
+        of_session: Level of the session.
+        in_force: Level in the server, which an earlier step may have changed; empty if unknown.
+    """
+
+    def __init__(self) -> None:
+        self.of_session: str = "standard"
+        self.in_force: str = "standard"
+
+    def open(self, level: str) -> None:
+        """Note the level that a handshake has set."""
+        self.of_session = self.in_force = level
+
+    def forget(self) -> None:
+        """Note that the level in the server is unknown."""
+        self.in_force = ""
+
+
 class SimState:
     """State from `discover()` and the replies after it.
 
     Attributes:
-        session: The RPC session.
-        publishers: Publishers of the server.
-        mirror: Local model and data.
         objects: Articulations, entities and cameras.
-        wanted_mode: Step mode that the user requested.
-        mode_assumed: Whether `mode` is an assumption that no reply has confirmed.
-        promoted_from: Mode to restore on close after this client changed it; possibly one that only the server knows.
-        mode_word: Name of the step mode in the server's last reply that contains it.
-        level: Observation level of the session.
-        paused: Whether this client has paused physics and nothing has resumed it since.
         recording: Whether this client has started a recording that nothing has ended since.
-        sent_level: Observation level in the server, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
         located: Whether the state is known exactly: a reply or snapshot has brought it since the last handshake.
-        step_count: Steps since the last handshake or reset.
         reset_seed: Seed of the last reset, or None without one.
-        sim_time: Simulation time of the last reply, seconds.
+        user: Values of the scene's user channels.
         on_adopted: Callback invoked after each handshake and at the end of play.
-        pending: Requests whose replies were lost.
+        pending: Steps and resets whose replies were lost.
         switching_play: Whether this client is starting or ending play, so that it reports neither as news.
-        observers: Observers of the client, such as recorders.
+        observers: Observers of the client, such as recorders. Replaced, never modified: read from any thread.
         step_streams: Streams that deliver the pictures of steps if replies carry older ones.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        publishers: Publishers,
-        motion: Motion,
-        *,
-        wanted_mode: StepMode,
-        live_pictures: bool,
-    ) -> None:
+    def __init__(self, session: Session, publishers: Publishers, *, wanted_mode: StepMode, live_pictures: bool) -> None:
         self.session = session
         self.publishers = publishers
         self.step_streams: StepStreams = StepStreams(publishers)
         self.mirror: Mirror = Mirror()
-        self.objects: SceneObjects = SceneObjects(session, publishers, self.mirror, motion)
-        self.wanted_mode = wanted_mode
-        self._mode = StepMode.LIVE
-        self.mode_assumed: bool = False
-        self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
-        self.promoted_from: StepMode | str | None = None
-        self.mode_word = ""
-        self.level = "standard"
-        self.paused: bool = False
+        self.objects: SceneObjects = SceneObjects(session, publishers, self.mirror)
+        self.mode: ModeState = ModeState(session, wanted_mode, self._receive_live)
+        self.clocks: Clocks = Clocks()
+        self.level: ReplyLevel = ReplyLevel()
+        self.pending: PendingOutcomes = PendingOutcomes()
         self.recording: bool = False
-        self.sent_level: str = "standard"
         self.hello: HelloOk | None = None
         self.located: bool = False
-        self.step_count: int = 0
         self.reset_seed: int | None = None
-        self.sim_time: float = 0.0
-        self.sim_time_sec: int = 0
-        self.sim_time_nsec: int = 0
-        self.wall_time_sec: int = 0
-        self.wall_time_nsec: int = 0
-        self.recv_wall_time_ns: int = 0
         self.user: dict[str, Any] = {}
+        self.on_adopted: Callable[[], None] | None = None
+        self.switching_play = False
+        self.observers: tuple[ClientObserver, ...] = ()
+        self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
+        self._live_pictures = live_pictures
         session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
         session.control.resolve = self._articulation_key
-        self._live_pictures = live_pictures
-        self.pending: PendingOutcomes = PendingOutcomes()
-        self.on_adopted: Callable[[], None] | None = None
-        self.switching_play = False
-        self.observers: tuple[ClientObserver, ...] = ()  # replaced, never modified: read from any thread
 
     @property
-    def mode(self) -> StepMode:
-        """Current step mode, as far as this client knows. Only live mode receives state in the background."""
-        return self._mode
+    def playing(self) -> bool:
+        """Whether a play session is running, as far as this client knows."""
+        return self.hello is not None and self.hello.manager_present
 
-    @mode.setter
-    def mode(self, mode: StepMode) -> None:
-        self.mode_assumed = False
-        self._mode = mode
-        live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
+    def _receive_live(self) -> None:
+        """Start or stop receiving state in the background, which only live mode does."""
+        live = self.mode.live and self.playing
         receivers: list[LiveState | LatestPicture] = [self._live]
         if self._live_pictures:
             receivers.extend(view.pictures for view in self.objects.views())
@@ -171,11 +157,6 @@ class SimState:
                 log.exception("%r failed to return the pictures that it wants", observer)
         return wanted
 
-    def assume_mode(self, mode: StepMode) -> None:
-        """Assume a step mode until a reply shows the real one, because no op can query it without changing it."""
-        self.mode = mode
-        self.mode_assumed = True
-
     @property
     def live(self) -> bool:
         """Whether state is received in the background."""
@@ -189,7 +170,7 @@ class SimState:
     @property
     def local_time(self) -> float:
         """Simulation time of the local data or, without local data, of the last reply, seconds."""
-        return self.sim_time if self.mirror.data is None else self.mirror.data.time
+        return self.clocks.sim_time if self.mirror.data is None else self.mirror.data.time
 
     def _articulation_key(self, name: str) -> str | None:
         articulation = self.objects.articulations.get(name)
@@ -201,7 +182,7 @@ class SimState:
         Raises:
             NoSession: The handshake of the session or of a new play session was abandoned.
         """
-        if self.hello is None and self.session.greeted:
+        if self.hello is None and self.session.hello_sent:
             raise NoSession("discover() did not finish. Nothing was sent.", op=op)
         if self.pending.play:
             raise NoSession(
@@ -213,8 +194,8 @@ class SimState:
     def _note_session(self, hello: HelloOk) -> None:
         """Handle a new session, possibly from a handshake that its caller had abandoned."""
         self.pending.clear()  # the server rejects requests of the previous session
-        self.step_count = 0
-        self.sent_level = ""
+        self.clocks.step_count = 0
+        self.level.forget()
         self.publishers.events.publish(
             SessionOpened(
                 session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
@@ -229,7 +210,8 @@ class SimState:
             self.mirror.reset(keyframe)
             for record in self.objects.entity_records.values():
                 record.pose = None
-            self._take_over(reply, parts, received, into_mirror=True)
+            self._write(reply, parts, received, into_mirror=True)
+        self._publish(reply)
 
     @property
     def _trusted(self) -> bool:
@@ -247,9 +229,8 @@ class SimState:
         return True
 
     def _absorb_live(self, snapshot: StateSnapshot) -> None:
-        age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
-        if 0 < age < _OVERTAKEN_S:
-            return  # sent before the last reply but received after it
+        if self.clocks.overtook(snapshot):
+            return
         if not self._trusted:
             return  # the connection was lost, so this may be from another server
         known = self.objects.records
@@ -263,16 +244,12 @@ class SimState:
     def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
         """Apply the state in a reply completely or not at all.
 
-        Args:
-            reply: The reply.
-            op: Op of the reply, for messages.
-            into_mirror: Whether to write it to the local data, too; not in puppet mode, where they are its source.
-
         Raises:
             ProtocolError: The state does not fit the model or the cameras; nothing was applied.
         """
         received = time.time_ns()
-        self._take_over(reply, self._checked(reply, op), received, into_mirror=into_mirror)
+        self._write(reply, self._checked(reply, op), received, into_mirror=into_mirror)
+        self._publish(reply)
 
     def absorb_found(self, reply: StateReply | StateSnapshot, op: str) -> None:
         """Apply the state found after a handshake; raise the same errors as `absorb`.
@@ -311,8 +288,8 @@ class SimState:
                 pictures = [(view, _pixels(view, frame), frame) for view, frame in self._frames(reply.cameras)]
         return articulations, entities, pictures
 
-    def _take_over(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
-        self._write(reply, parts, received, into_mirror=into_mirror)
+    def _publish(self, reply: StateReply | StateSnapshot) -> None:
+        """Pass a state that was applied to the readers of streams and the observers."""
         own = self.publishers.own_steps
         if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
             own.publish(reply)
@@ -337,7 +314,9 @@ class SimState:
             if into_mirror and data is not None:
                 data.time = reply.time
             self.mirror.mark_stale()
-            self._absorb_clocks(reply, received)
+            self.clocks.absorb(reply, received)
+            if isinstance(reply, StateSnapshot):
+                self.user = reply.user
 
     def _check_perturbation(self, drag: Perturbation, op: str) -> None:
         model = self.mirror.model
@@ -349,23 +328,6 @@ class SimState:
                 f"bodies are 1 to {model.nbody - 1}, and a wrench has six finite numbers.",
                 op=op,
             )
-
-    def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
-        self.step_count = reply.step
-        self.sim_time = reply.time
-        if isinstance(reply, StateSnapshot):
-            self.user = reply.user
-        self.recv_wall_time_ns = received
-        if reply.sim_time is not None:
-            self.sim_time_sec, self.sim_time_nsec = reply.sim_time.sec, reply.sim_time.nsec
-        if reply.wall_time is not None:
-            self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
-
-    def forget_clocks(self) -> None:
-        """Reset counter and clocks to zero, as a new play session does. Call under the lock."""
-        self.step_count = 0
-        self.sim_time = 0.0
-        self.sim_time_sec = self.sim_time_nsec = 0
 
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
         """Mirror the leading joint positions that `set_qpos` wrote to an articulation, given by any of its names.
@@ -409,17 +371,16 @@ class SimState:
 
     def on_play_ended(self, reason: str = "") -> None:
         """Handle the end of play: the server is back in live mode and has no articulations."""
-        played = self.hello is not None and self.hello.manager_present
+        played = self.playing
         if self.hello is not None:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
         if self.publishers.camera_switch is not None:
             self.publishers.camera_switch.forget()
-        self.mode = StepMode.LIVE
-        self.paused = self.recording = False
+        self.mode.end_play()
+        self.recording = False
         self.session.unsettled.clear()
-        self.promoted_from = None
         if played:
             self.publishers.events.publish(PlayEnded(reason=reason))
             if self.on_adopted is not None:
@@ -446,4 +407,4 @@ def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
     if isinstance(mode, CameraMode) and frame.dtype != ("float32" if mode is CameraMode.DEPTH else "bgra8"):
         raise ProtocolError(f"step: a frame of {mode} camera {view.name!r} has dtype {frame.dtype!r}.", op="step")
     size = frame.width, frame.height
-    return decode_camera(frame.data, view.mode, *size, memory=view.memory, where=view.name).pixels
+    return decode_camera(frame.data, view.mode, *size, memory=view.camera.memory, where=view.name).pixels

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
-from urlab_client.aio.streams.camera_source import FIRST_PICTURE_S
+from urlab_client.aio.streams.sources import FIRST_PICTURE_S
 from urlab_client.enums import CameraTiming
 from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
 
@@ -33,10 +33,6 @@ def first_picture_s(views: Iterable[URLabCameraView]) -> float:
 
 class StepPictures:
     """The pictures of one step.
-
-    Args:
-        state: State of the client, which contains the cameras.
-        asked: Requested pictures: True for all newest ones, False for none, or a map of camera to `sync` or `latest`.
 
     Attributes:
         interruption: Cancellation that interrupted the wait for pictures.
@@ -119,10 +115,6 @@ class StepPictures:
     def account(self, reply: StepOk, *, came: bool) -> None:
         """Mark the cameras whose pictures are missing, after the reply was applied.
 
-        Args:
-            reply: The reply.
-            came: Whether a step of this mode delivers pictures.
-
         Raises:
             CancelledError: The wait for pictures was cancelled.
         """
@@ -152,7 +144,7 @@ class StepPictures:
             reply.cameras = {**frames, **found}
 
     def _listen(self, names: Iterable[str]) -> bool:
-        views = [(name, view) for name in names if (view := self._state.objects.camera(name)) is not None]
+        views = [(name, view.camera) for name in names if (view := self._state.objects.camera(name)) is not None]
         return self._state.step_streams.listen(views, self._state.hello)
 
     def take(self, reply: StepOk) -> None:

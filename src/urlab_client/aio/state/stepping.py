@@ -1,97 +1,91 @@
-"""One step: its request in each step mode and the handling of its reply, all within the caller's turn."""
+"""One step or reset: its request in each step mode and the handling of its reply, all within the caller's turn."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from urlab_client.aio.arguments import mapping
-from urlab_client.aio.model.articulation_state import Carried, give_back
+from urlab_client.aio.arguments import finite, mapping, text
+from urlab_client.aio.model.articulation_state import MirroredArticulation, SentWrenches, restore_wrenches
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.session.session import Turn, leaves_open
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
-from urlab_client.aio.state.step_mode import settle_mode
 from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.enums import CameraTiming, StepMode
-from urlab_client.errors import StepTimeout, URLabError
+from urlab_client.errors import StepTimeout, UnknownKeyframe, URLabError
 from urlab_client.protocol.codec import check_finite, op_of
-from urlab_client.protocol.messages.session import Step, StepOk
+from urlab_client.protocol.messages.session import ArticulationCommand, Reset, ResetOk, Step, StepOk
+from urlab_client.values.names import compiled_names
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
 
 async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
-    """Advance physics according to the step mode and apply the new state.
-
-    Args:
-        state: State of the client.
-        turn: Turn that contains the whole operation.
-        n_steps: Number of physics steps.
-        cameras: Pictures to return.
-        asked: Observation level of the reply; None for the session's.
-    """
+    """Advance physics according to the step mode and apply the new state."""
     state.require_handshake("step")
-    await settle_mode(state, turn)
-    mode = state.mode
+    if state.mode.unsettled is not None or state.mode.pause_unsettled:
+        await state.mode.settle(turn)
+    mode = state.mode.current
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
     pictures = await _pictures(state, turn, cameras, n_steps) if state.observers or cameras is not False else None
-    if mode is StepMode.LIVE and not state.mode_assumed:
+    if mode is StepMode.LIVE and not state.mode.assumed:
         return await _live_step(state, turn, pictures)
-    request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
+    request, wrenches = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
     if pictures is not None:
         pictures.ask(request)
-    assumed, before, session = state.mode_assumed, state.step_count, state.session.session_id
-    level = asked or state.level
-    request.observations = None if level == state.sent_level else level
-    state.sent_level = ""  # unknown until the reply arrives
+    assumed, before, session = state.mode.assumed, state.clocks.step_count, state.session.session_id
+    level = asked or state.level.of_session
+    request.observations = None if level == state.level.in_force else level
+    state.level.forget()  # until the reply arrives
     try:
         reply = await turn.call(request, takes=_seconds(pictures))
         if state.session.session_id == session:  # otherwise an abandoned handshake set the level
-            state.sent_level = level if state.session.features.level_sticks else state.level
+            state.level.in_force = level if state.session.features.level_sticks else state.level.of_session
         if pictures is not None:
             await pictures.complete(turn, reply)
         state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
     except BaseException as error:
-        _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, carried)
+        _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, wrenches)
         raise
     if state.pending:
         state.pending.clear()
     if assumed:
         # If an abandoned handshake was answered meanwhile, the server's counter started anew.
         _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
-        if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
+        if state.mode.puppet and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
             return await take_steps(state, turn, n_steps, cameras, asked)  # the request has only set the clock
-    if state.mode is StepMode.PUPPET:
+    if state.mode.puppet:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
     if pictures is not None:
-        pictures.account(reply, came=state.mode is not StepMode.LIVE)
+        pictures.account(reply, came=not state.mode.live)
     return reply
 
 
 async def send_step(state: SimState, turn: Turn, request: Step) -> StepOk:
     """Send a step as it is, within a turn, in which nobody else changes the mode."""
     check_finite(request)  # a hot op: its request is not checked again before it is sent
-    await settle_mode(state, turn)
-    if request.n_steps < 1 and state.mode is StepMode.DIRECT:
-        raise ValueError(_too_few(request.n_steps, state.mode))  # the server would take one
+    if state.mode.unsettled is not None or state.mode.pause_unsettled:
+        await state.mode.settle(turn)
+    if request.n_steps < 1 and state.mode.current is StepMode.DIRECT:
+        raise ValueError(_too_few(request.n_steps, state.mode.current))  # the server would take one
     return await turn.call(request)
 
 
-def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int, carried: Carried) -> None:
+def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int, wrenches: SentWrenches) -> None:
     if turn.sent and leaves_open(error):
-        state.pending.add_steps(state, error, steps, carried)
+        state.pending.add_steps(state.clocks, state.session.transport.stats.connects, error, steps, wrenches)
     else:
-        give_back(carried)
+        restore_wrenches(wrenches)
     if isinstance(error, StepTimeout):
-        state.mode = StepMode.DIRECT  # only direct mode lets a step wait
+        state.mode.note(StepMode.DIRECT)  # only direct mode lets a step wait
 
 
 async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None) -> StepOk:
-    carried = take_wrenches(state)  # without effect on servers that ignore them in this mode
+    wrenches = take_wrenches(state)  # without effect on servers that ignore them in this mode
     try:
-        request = Step(per_articulation=live_commands(state, carried) or None)
+        request = Step(per_articulation=live_commands(state, wrenches) or None)
         if pictures is not None:
             pictures.ask(request)
         reply = await turn.call(request, takes=_seconds(pictures))
@@ -100,26 +94,26 @@ async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None)
         state.absorb(reply, "step")
     except BaseException as error:
         if not (turn.sent and leaves_open(error)):
-            give_back(carried)
+            restore_wrenches(wrenches)
         raise
     if pictures is not None:
         pictures.account(reply, came=True)
     return reply
 
 
-def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
-    carried = take_wrenches(state)
+def _direct_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
+    wrenches = take_wrenches(state)
     try:
-        commands = direct_commands(state, carried)
+        commands = direct_commands(state, wrenches)
     except ValueError:
-        give_back(carried)
+        restore_wrenches(wrenches)
         raise
     # While the mode is only assumed, the server may be in puppet mode, in which it sets its clock from the request.
-    time = state.local_time if state.mode_assumed else None
-    return Step(n_steps=n_steps, per_articulation=commands or None, time=time), carried
+    time = state.local_time if state.mode.assumed else None
+    return Step(n_steps=n_steps, per_articulation=commands or None, time=time), wrenches
 
 
-def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
+def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
     mirror = state.mirror
     model, data = mirror.model, mirror.data
     if model is None or data is None:
@@ -149,17 +143,17 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
     Raises:
         URLabError: The mode differs from the one that the client was created with, and the client must not switch.
     """
-    expected = state.mode
+    expected = state.mode.current
     if advanced == 0:
-        state.mode = StepMode.LIVE
-        state.sent_level = ""  # the server ignores the level in this mode
+        state.mode.note(StepMode.LIVE)
+        state.level.forget()  # the server ignores the level in this mode
     elif advanced == 1 and reply.time == request.time and state.mirror.model is not None:
-        state.mode = StepMode.PUPPET
+        state.mode.note(StepMode.PUPPET)
     elif advanced == request.n_steps:
-        state.mode = StepMode.DIRECT
-    if state.mode is not expected and state.wanted_mode is not StepMode.AUTO:
+        state.mode.note(StepMode.DIRECT)
+    if state.mode.current is not expected and state.mode.wanted is not StepMode.AUTO:
         raise URLabError(
-            f"step: the server handled this step in step mode {state.mode}, not in {expected}.",
+            f"step: the server handled this step in step mode {state.mode.current}, not in {expected}.",
             op="step",
             hint=f"Call runtime.set_mode({str(expected)!r}), or leave auto_promote_step_mode on.",
         )
@@ -167,7 +161,7 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
 
 async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int) -> StepPictures | None:
     """Return the pictures to request with a step, or None. Waits until the observers can accept more data."""
-    if state.mode is not StepMode.LIVE:
+    if not state.mode.live:
         for observer in state.observers:
             await observer.ready()
     asked: bool | dict[str, str | None]
@@ -180,7 +174,7 @@ async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int)
         asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     pictures = StepPictures(state, asked)
     if not pictures or (
-        state.mode is StepMode.LIVE and not state.mode_assumed and not state.session.features.live_pictures_in_steps
+        state.mode.live and not state.mode.assumed and not state.session.features.live_pictures_in_steps
     ):
         return None
     await pictures.listen(turn)
@@ -196,3 +190,102 @@ def _too_few(n_steps: int, mode: StepMode) -> str:
 def _seconds(pictures: StepPictures | None) -> float | None:
     """Return the seconds that a step with pictures may take; None for the default of a step."""
     return None if pictures is None or not pictures.seconds else (op_of(Step).timeout or 0.0) + pictures.seconds
+
+
+def direct_commands(state: SimState, wrenches: SentWrenches) -> dict[str, ArticulationCommand]:
+    """Return the commands of a step, including its wrenches."""
+    ours = _ours(state)
+    if not wrenches:  # true for nearly every step
+        return {record.name: record.direct_command(None) for record in ours}
+    commands = {record.name: record.direct_command(wrenches.get(record)) for record in ours}
+    for name, record in state.objects.entity_records.items():
+        if record not in wrenches:
+            continue
+        if not state.session.features.claims:
+            # Use the entity's own name: the server tries `<key>_<body>` first and then the bare name of the body.
+            commands[name] = record.wrench_command(wrenches[record])
+        else:
+            # An entity has no owner, so the command of a robot carries its wrenches.
+            key = next(iter(commands or state.objects.records))
+            carrier = commands.setdefault(key, ArticulationCommand())
+            carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **wrenches[record]}
+    return commands
+
+
+def live_commands(state: SimState, wrenches: SentWrenches) -> dict[str, ArticulationCommand]:
+    """Return the commands of a step in live mode."""
+    if state.session.features.live_pictures_in_steps:
+        return direct_commands(state, wrenches)
+    return {record.name: record.live_command() for record in _ours(state)}
+
+
+def _ours(state: SimState) -> Iterable[MirroredArticulation]:
+    # A server whose robots have owners rejects a step that writes to another client's robots, so send only our own.
+    records = state.objects.records.values()
+    return [record for record in records if record.driven] if state.session.features.claims else records
+
+
+def take_wrenches(state: SimState) -> SentWrenches:
+    """Return the wrenches for the step being built and clear their buffers."""
+    wrenches: SentWrenches = {}
+    for record in _ours(state):
+        if record.wrenches:
+            wrenches[record] = record.take_wrenches()
+    for entity in state.objects.entity_records.values():
+        if entity.wrenches and (state.objects.records or not state.session.features.claims):
+            wrenches[entity] = entity.take_wrenches()
+    return wrenches
+
+
+async def take_reset(
+    state: SimState, turn: Turn, keyframe: str | None, seed: int | None, qpos: Mapping[str, Mapping[str, float]]
+) -> ResetOk:
+    """Reset the simulation and apply the new state."""
+    state.require_handshake("reset")
+    articulations = state.objects.articulations
+    given = mapping("reset: per_articulation_qpos", qpos, "articulation keys to joint positions")
+    overrides = {articulations[key].prefix: _joint_values(state, key, values) for key, values in given.items()}
+    request = Reset(
+        keyframe_name=None if keyframe is None else _compiled_keyframe(state, keyframe),
+        seed=seed,
+        per_articulation_qpos=overrides or None,
+    )
+    try:
+        reply = await turn.call(request)
+        state.reset_seed = seed
+        state.absorb_reset(reply, request.keyframe_name)
+    except BaseException as error:
+        if turn.sent and leaves_open(error):
+            state.pending.add_reset(state.clocks, state.session.transport.stats.connects, request.keyframe_name, seed)
+        raise
+    state.pending.clear()
+    return reply
+
+
+def _joint_values(state: SimState, key: str, values: Mapping[str, float]) -> dict[str, float]:
+    joints = state.objects.articulations[key].joints
+    given = mapping(f"reset: per_articulation_qpos of {key!r}", values, "joint names to numbers")
+    live = {(joints[name].name if joints else name): value for name, value in given.items()}
+    return {name: finite(f"reset: joint {name!r} of {key!r}", value) for name, value in live.items()}
+
+
+def _compiled_keyframe(state: SimState, name: str) -> str:
+    """Return the compiled name, which is the only one that the server knows."""
+    text("reset: keyframe_name", name)
+    model = state.mirror.model
+    if model is None:
+        return name
+    compiled = [key for key in model_names(model, "key") if key]
+    if name in compiled:
+        return name
+    prefixes = {key: art.compiled_prefix for key, art in state.objects.articulations.items()}
+    wanted = compiled_names(name, prefixes)
+    matches = [key for key in compiled if key in wanted]
+    if len(matches) == 1:
+        return matches[0]
+    problem = (
+        f"{name!r} could mean {', '.join(matches)}"
+        if matches
+        else f"no keyframe is called {name!r}; the keyframes are: {', '.join(compiled) or 'none'}"
+    )
+    raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")

@@ -48,11 +48,6 @@ class StreamBuffer:
     Beyond the limits the oldest message is dropped, so that a slow reader misses as little as possible. `latest` has no
     limits: it keeps one message of any size.
 
-    Args:
-        policy: Which messages to keep.
-        max_items: Maximum number of messages.
-        max_bytes: Maximum number of bytes of content; a larger message is never kept.
-
     Attributes:
         policy: Policy, as given.
         received: Number of pushed messages.

@@ -32,12 +32,7 @@ _UNKNOWN = CameraTransports()  # the outcome of a request is, so the next one is
 
 
 class CameraSwitch:
-    """The cameras that one client has switched on.
-
-    Args:
-        session: Session that sends the requests.
-        refresh: Callback invoked when the source of pictures may have changed.
-    """
+    """The cameras that one client has switched on."""
 
     def __init__(self, session: Session, refresh: Callable[[], None]) -> None:
         self._session = session
@@ -53,12 +48,7 @@ class CameraSwitch:
         self._closed = False
 
     def use(self, info: CameraInfo, *, asked: bool) -> None:
-        """Switch a camera on if it is off. Call from the event loop.
-
-        Args:
-            info: The camera.
-            asked: True if the user requests its pictures; False if the client receives them in the background.
-        """
+        """Switch a camera on if it is off. Call from the event loop."""
         topic = info.zmq_topic
         self._users[topic] = self._users.get(topic, 0) + 1
         self._infos[topic] = info
@@ -95,10 +85,6 @@ class CameraSwitch:
         self, wanted: Mapping[str, CameraTransports], *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraStreaming]:
         """Switch cameras as the user requests.
-
-        Args:
-            wanted: Transports that each camera should use, by topic.
-            timeout: Seconds for the request.
 
         Returns:
             The server's reply for each camera that it knows, by topic.

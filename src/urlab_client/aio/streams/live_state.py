@@ -5,17 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from threading import Lock, RLock
+from threading import RLock
 
 from msgspec import Struct
 
-from urlab_client.aio.streams.camera_source import CameraSource
-from urlab_client.aio.streams.state_source import StateSource
-from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
+from urlab_client.aio.streams.sources import StateSource
+from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pictures import Pixels
 
 log: logging.Logger = logging.getLogger("urlab_client.streams")
 
@@ -38,12 +36,6 @@ class LiveStats(Struct):
 
 class LiveState(MessageHandler):
     """Applies the newest snapshot of each batch in the receiving callback, without a task, thread or queue.
-
-    Args:
-        source: Source of the snapshots.
-        absorb: Callback that applies a snapshot, completely or not at all. May raise `ProtocolError`.
-        lock: Lock that guards the state. The event loop never blocks on it: its holder may be waiting for a call on
-            this loop.
 
     Attributes:
         stats: Counters since construction.
@@ -79,7 +71,6 @@ class LiveState(MessageHandler):
         self._forget()
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Process one message."""
         self.stats.received += 1
         if self._source.wants(topic, payload):
             self._payload = payload
@@ -91,22 +82,20 @@ class LiveState(MessageHandler):
                 payload, self._payload = self._payload, None
                 self._snapshot = StateSnapshot.decode(payload)
             if self._snapshot is not None:
-                self._take_over(self._snapshot)
+                self._apply(self._snapshot)
         except ProtocolError as error:
             self._snapshot = None
             self._refuse(str(error))
 
     def on_malformed(self, problem: str) -> None:
-        """Count and log a malformed message."""
         self.stats.received += 1
         self._refuse(problem)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Stop because the client was closed."""
         self._running = False
         self._forget()
 
-    def _take_over(self, snapshot: StateSnapshot) -> None:
+    def _apply(self, snapshot: StateSnapshot) -> None:
         if not self._free():
             if self._retry is None:
                 self._retry = asyncio.get_running_loop().call_later(_RETRY_S, self._try_again)
@@ -138,88 +127,3 @@ class LiveState(MessageHandler):
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
-
-
-class LatestPicture(MessageHandler):
-    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access.
-
-    Args:
-        source: Source of the camera's pictures.
-    """
-
-    def __init__(self, source: CameraSource) -> None:
-        self._source = source
-        self._lock = Lock()
-        self._message: tuple[bytes, BytesLike] | None = None
-        self._pixels: Pixels | None = None
-        self._sim_time: float | None = None
-        self._frame_id: int | None = None
-        self._running = False
-        self._warned = False
-
-    def start(self) -> None:
-        """Start receiving. Call from the event loop. Idempotent."""
-        if not self._running:
-            try:
-                self._source.attach(self)
-            except (ProtocolError, ValueError) as error:  # the server announces an invalid endpoint
-                log.warning("the pictures of a camera are not received in the background: %s", error)
-                return
-            self._running = True
-
-    def stop(self) -> None:
-        """Stop receiving. Call from the event loop. Idempotent."""
-        self._running = False
-        self._source.detach(self)
-        self.newest()  # decode now: the camera may change before the next access
-
-    def deliver(self, pixels: Pixels, sim_time: float | None, frame_id: int | None = None) -> None:
-        """Store a picture from a reply."""
-        with self._lock:
-            self._message = None
-            self._pixels, self._sim_time, self._frame_id = pixels, sim_time, frame_id
-
-    @property
-    def came(self) -> bool:
-        """Whether a picture has arrived."""
-        return self._pixels is not None or self._message is not None
-
-    def frame_id(self) -> int | None:
-        """Return the number of the snapshot that the newest picture shows, or None if unknown. Call from any thread."""
-        self.newest()
-        return self._frame_id
-
-    def newest(self) -> tuple[Pixels | None, float | None]:
-        """Return the newest picture and its simulation time, each None if missing. Call from any thread."""
-        with self._lock:
-            if self._message is not None:
-                (topic, payload), self._message = self._message, None
-                try:
-                    sample = self._source.decode(topic, payload)
-                except MessageGone:
-                    pass  # keep the previous picture
-                except ProtocolError as error:
-                    self._warn(str(error))
-                else:
-                    self._pixels, self._sim_time = sample.pixels, sample.sim_time
-                    self._frame_id = sample.frame_id
-            return self._pixels, self._sim_time
-
-    def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Process one message."""
-        if self._lock.acquire(blocking=False):  # held during conversion: skip this picture, the next one follows
-            self._message = topic, payload
-            self._lock.release()
-
-    def on_malformed(self, problem: str) -> None:
-        """Count and log a malformed message."""
-        self._warn(problem)
-
-    def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Stop because the client was closed."""
-        self._running = False
-
-    def _warn(self, problem: str) -> None:
-        if not self._warned:
-            self._warned = True
-            log.warning("skipped a malformed picture: %s Further ones are skipped without a warning.", problem)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 
 import numpy as np
 
 from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.features import Features
-from urlab_client.aio.streams.camera_source import CameraSource, HasCamera
 from urlab_client.aio.streams.camera_switch import CameraSwitch
-from urlab_client.aio.streams.derived_rows import DerivedRowSource, HasRows
-from urlab_client.aio.streams.event_bus import EventBus
-from urlab_client.aio.streams.row_source import RowSource
-from urlab_client.aio.streams.state_source import OwnSteps, StateSource
+from urlab_client.aio.streams.events import EventBus
+from urlab_client.aio.streams.rows import RowFilter, RowSource
+from urlab_client.aio.streams.sources import Camera, CameraSource, OwnSteps, StateSource
 from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.shm_streams import Regions
@@ -21,7 +19,6 @@ from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.topics import TopicKind
 from urlab_client.values.pictures import Pixels
 
 
@@ -51,15 +48,6 @@ class SharedFrame:
 class Publishers:
     """The publishing side of a server. Sockets and regions are opened only when something is received.
 
-    Args:
-        rpc_endpoint: Callback that returns the address for requests; the other ports are on the same host.
-        state_port: Callback that returns the port of the state stream.
-        default_timeout: Default number of seconds that a stream waits for its first item; None waits without limit.
-        live: Callback that returns whether the server is in live mode, as far as the client knows.
-        features: Callback that returns the features of the server.
-        keys: Keys for publishers that require encryption; None if they do not.
-        memory: Location of the regions for a client that receives from shared memory.
-
     Attributes:
         default_timeout: The argument of that name.
         subscriptions: Active subscriptions.
@@ -70,7 +58,7 @@ class Publishers:
         own_steps: Delivers the client's own steps to receivers of snapshots.
     """
 
-    capture: Callable[[Sequence[HasCamera], Timeout], Awaitable[list[CameraSample]]]
+    capture: Callable[[Sequence[Camera], Timeout], Awaitable[list[CameraSample]]]
 
     def __init__(
         self,
@@ -110,29 +98,15 @@ class Publishers:
     def _only_own(self) -> bool:
         return not (self._features().publishes_steps or self._live())
 
-    def rows(
-        self,
-        articulations: Collection[str],
-        kinds: Collection[str | TopicKind],
-        components: Collection[str],
-        *,
-        entities: bool,
-        robots: Callable[[], Mapping[str, HasRows]],
-    ) -> RowSource:
-        """Return the source of rows; see `RowSource`, or `DerivedRowSource` for servers that publish none."""
-        if self._features().publishes_rows:
-            return RowSource(
-                self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities
-            )
-        # From the socket, which delivers every snapshot; a region holds only the newest.
-        states = self.state(StreamPolicy.ALL)
-        return DerivedRowSource(states, robots, articulations, kinds, components, entities=entities)
+    def rows(self, wanted: RowFilter) -> RowSource:
+        """Return the source of rows that the server publishes."""
+        return RowSource(self.subscriptions, self._state_endpoint, wanted)
 
-    def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
+    def camera(self, camera: Camera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
         """Return the source of a camera's pictures for a stream of that policy; see `CameraSource`."""
         return CameraSource(
             self.subscriptions,
-            view,
+            camera,
             self._host,
             regions=self._regions_for(policy),
             live=self._live,
@@ -140,19 +114,19 @@ class Publishers:
             asked=asked,
         )
 
-    def shared_frame(self, view: HasCamera) -> SharedFrame | None:
+    def shared_frame(self, camera: Camera) -> SharedFrame | None:
         """Return a camera's newest picture in shared memory, or None if there is none. Call from any thread."""
         if self.regions is None:
             return None
-        found = self.regions.view(CameraSource(self.subscriptions, view, self._host).place())
-        width, height = view.info.resolution
+        found = self.regions.view(CameraSource(self.subscriptions, camera, self._host).place())
+        width, height = camera.info.resolution
         if found is None or len(found[0].payload) < width * height * 4:
             return None
         publication, valid = found
         slot = publication.payload[-width * height * 4 :]  # newer servers put a header in front
         pixels = (
             np.frombuffer(slot, "<f4").reshape(height, width)
-            if view.mode == CameraMode.DEPTH
+            if camera.mode == CameraMode.DEPTH
             else np.frombuffer(slot, np.uint8).reshape(height, width, 4)
         )
         return SharedFrame(pixels, publication.sequence, valid)

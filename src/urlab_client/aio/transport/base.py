@@ -8,8 +8,9 @@ from typing import Protocol, TypeAlias
 
 from msgspec import Struct
 
+from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabError, URLabTimeoutError
 from urlab_client.events import ClientEvent
-from urlab_client.protocol.base import Op
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.messages.session import HelloOk
 
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
@@ -98,3 +99,22 @@ class RequestTransport(Protocol):
     async def aclose(self) -> None:
         """Fail all pending requests and release all resources. Idempotent."""
         ...
+
+
+def lost(op: Op, what: str) -> URLabError:
+    """Return the error for a request that was sent when `what`, the connection or the server, was lost."""
+    text = f"{op.name}: {what} was lost after the request was sent."
+    if op.effect is Effect.READ:
+        return ConnectionLost(text, op=op.name, hint="The op changes nothing, so it can be sent again.")
+    hint = "It may have been executed: client.resync() determines the outcome and recovers."
+    return OutcomeUnknown(text, op=op.name, hint=hint)
+
+
+def no_reply(op: Op, where: str, seconds: float) -> URLabTimeoutError:
+    """Return the error for a request that was sent and not answered by its deadline."""
+    executed = "" if op.effect is Effect.READ else " The request was sent and may still be executed."
+    return URLabTimeoutError(
+        f"{op.name}: no reply {where} within {seconds * 1000:.0f} ms.{executed}",
+        op=op.name,
+        hint="The connection is up, so the server is busy or blocked; allow more time with timeout=…",
+    )

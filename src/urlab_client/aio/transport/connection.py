@@ -22,7 +22,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._platform.signals import uninterrupted
 from urlab_client.aio.background import Tell
-from urlab_client.aio.transport.waiting import Watch, watch_socket
+from urlab_client.aio.transport.waiting import Socket, Watch, watch_socket
 from urlab_client.keys import KeyPair, public_key, read_pair
 
 HEARTBEAT_MS = 1000
@@ -32,9 +32,6 @@ _CONNECT_MS = 3000
 _SILENT = 0.9  # of that time, and nothing refused the attempt
 _RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
-
-NOTICED_S: Final = (HEARTBEAT_MS + SILENCE_MS) / 1000
-"""Seconds after which a connection to a silent peer is closed."""
 
 FAILED_HANDSHAKES: Final = (
     zmq.Event.HANDSHAKE_FAILED_AUTH,
@@ -75,7 +72,6 @@ SERVER_KEY_HINT = "If the server requires CURVE keys, pass server_key=…, and c
 _SERVER_VARIABLE = "URLAB_SERVER_KEY"
 _CLIENT_VARIABLE = "URLAB_CLIENT_KEY"
 
-Socket: TypeAlias = zmq.Socket[bytes]
 Context: TypeAlias = zmq.Context[Socket]
 Note: TypeAlias = Callable[[zmq.Event, int, str | None], None]
 """Handles an event of a connection: the event, its value, and the obstacle that it shows, if any."""
@@ -140,13 +136,7 @@ def client_keys(address: str, server_key: str | None, client_key: str | None) ->
 class Connection:
     """A ZeroMQ socket that connects to one address, and the monitor that shows what becomes of it.
 
-    Args:
-        loop: The running event loop.
-        socket: The socket, not yet connected; the connection owns it.
-        endpoint: The address.
-        keys: Keys for a server that requires them.
-        note: Called on the event loop for each event.
-        tell: Publishes the event that a watching thread died.
+    Takes over the socket, which is not yet connected. `note` is called on the event loop for each event.
 
     Raises:
         ValueError: The address is not valid; the socket is closed.
@@ -162,9 +152,9 @@ class Connection:
         *,
         tell: Tell | None = None,
     ) -> None:
-        self.endpoint = endpoint
+        self.endpoint: str = endpoint
         self._loop = loop
-        self._socket = socket
+        self.socket: Socket = socket
         self._note = note
         self._attempts = Attempts(loop.time())
         self._retrying = False
@@ -195,7 +185,7 @@ class Connection:
 
     def watch(self, on_readable: Callable[[], object], *, on_demand: bool = False) -> Watch:
         """Call `on_readable` whenever the socket is readable; see `watch_socket`."""
-        watch = watch_socket(self._loop, self._socket, on_readable, on_demand=on_demand)
+        watch = watch_socket(self._loop, self.socket, on_readable, on_demand=on_demand)
         self._watches.append(watch)
         return watch
 
@@ -223,8 +213,8 @@ class Connection:
         if self._closed:
             return
         with contextlib.suppress(zmq.ZMQError):  # ZeroMQ has already dropped the endpoint
-            self._socket.disconnect(self.endpoint)
-        self._socket.connect(self.endpoint)
+            self.socket.disconnect(self.endpoint)
+        self.socket.connect(self.endpoint)
 
     def close(self) -> None:
         """Close the socket. Idempotent."""
@@ -233,17 +223,13 @@ class Connection:
         self._closed = True
         for watch in self._watches:
             watch.close()
-        self._socket.disable_monitor()
+        self.socket.disable_monitor()
         self._monitor.close(linger=0)
-        self._socket.close(linger=0)
+        self.socket.close(linger=0)
 
 
 class Attempts:
-    """Tracks the attempts of a connection to distinguish a refusing host from a silent one, as ZeroMQ does not.
-
-    Args:
-        now: Start time of the first attempt, seconds.
-    """
+    """Tracks the attempts of a connection to distinguish a refusing host from a silent one, as ZeroMQ does not."""
 
     def __init__(self, now: float) -> None:
         self._began = now
@@ -252,10 +238,7 @@ class Attempts:
     def obstacle(self, event: zmq.Event, value: int, now: float) -> str | None:
         """Return the obstacle that a monitor's event shows, or None if it shows none.
 
-        Args:
-            event: The event.
-            value: Value of the event; for `CONNECT_RETRIED`, the milliseconds until the next attempt.
-            now: Current time, seconds.
+        The value of `CONNECT_RETRIED` is the milliseconds until the next attempt.
         """
         took, self._began = now - self._began, now
         ended, self._ended = self._ended, event is zmq.Event.DISCONNECTED

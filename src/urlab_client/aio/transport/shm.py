@@ -19,14 +19,12 @@ from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
+from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats, lost, no_reply
 from urlab_client.aio.transport.shm_channel import RegionChannel, answers, envelope_of, succeeded
 from urlab_client.aio.transport.shm_regions import RegionInUse, ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
 from urlab_client.errors import (
     ClientClosed,
-    ConnectionLost,
-    OutcomeUnknown,
     ProtocolError,
     URLabConnectionError,
     URLabError,
@@ -166,16 +164,13 @@ class ShmTransport:
         loop = asyncio.get_running_loop()
         give_up = loop.time() + _NOT_READY_S
         while self._channel is None and not self._closed:
-            try:
-                self._open()
-            except RegionInUse as error:
-                self._put_off(error)
+            error = self._try_to_open(loop.time())
+            if isinstance(error, RegionInUse):
                 return
-            except (OSError, ProtocolError) as error:
+            if error is not None:
                 if loop.time() < give_up and isinstance(error, (FileNotFoundError, RegionNotReady)):
                     await asyncio.sleep(0.01)
                     continue
-                self._put_off(error)
                 raise URLabConnectionError(
                     f"discover: transport='shm', but the server's shared memory cannot be used: {_reason(error)}",
                     hint="Check that the server is on this machine and uses this directory, or use transport='zmq'.",
@@ -249,10 +244,9 @@ class ShmTransport:
         if channel is None:
             if self._regions.directory is None or now < self._retry_at or not self._inner.connected:
                 return None
-            try:
-                channel = self._open()
-            except (OSError, ProtocolError) as error:
-                self._put_off(error)
+            self._try_to_open(now)
+            channel = self._channel
+            if channel is None:
                 return None
         self._used_at = now
         if channel.dirty and not self._is_clean(channel):
@@ -290,30 +284,36 @@ class ShmTransport:
             if waits and channel.ask_for_sync(asyncio.get_running_loop().time()):
                 self._ring()
         except ProtocolError as error:
-            self._drop("no usable regions")
-            self._put_off(error)
+            self._drop("")
+            self._put_off(error, asyncio.get_running_loop().time())
         return not channel.dirty
 
-    def _open(self) -> RegionChannel:
-        """Open the regions. Raises the same errors as `MappedRegion`."""
-        paths: list[Path] = []
-        for file in (REQUEST_FILE, REPLY_FILE):
-            path = self._regions.find(file)
-            if path is None:
-                paths_tried = ", ".join(map(str, self._regions.candidates(file)))
-                raise FileNotFoundError(f"there is no {paths_tried}")
-            paths.append(path)
-        self._channel = RegionChannel(paths[0], paths[1], self._regions.events(paths[0]))
+    def _try_to_open(self, now: float) -> Exception | None:
+        """Open the regions. Return why they cannot be used."""
+        try:
+            paths: list[Path] = []
+            for file in (REQUEST_FILE, REPLY_FILE):
+                path = self._regions.find(file)
+                if path is None:
+                    paths_tried = ", ".join(map(str, self._regions.candidates(file)))
+                    raise FileNotFoundError(f"there is no {paths_tried}")
+                paths.append(path)
+            self._channel = RegionChannel(paths[0], paths[1], self._regions.events(paths[0]))
+        except (OSError, ProtocolError) as error:
+            self._put_off(error, now)
+            return error
         self._regions.connect_doorbell()
-        self._used_at = asyncio.get_running_loop().time()
+        self._used_at = now
         with_doorbell = "without" if self._regions.doorbell is None else "with"
         log.info("shared memory in %s, %s a doorbell", paths[0].parent, with_doorbell)
-        return self._channel
+        return None
 
-    def _put_off(self, error: Exception) -> None:
+    def _put_off(self, error: Exception, now: float) -> None:
+        before = self._obstacle
         self._obstacle = "regions in use by another client" if isinstance(error, RegionInUse) else "no usable regions"
-        self._retry_at = asyncio.get_running_loop().time() + _RETRY_S
-        log.info("shared memory: %s: %s", self._obstacle, _reason(error))
+        self._retry_at = now + _RETRY_S
+        if self._obstacle != before:
+            log.info("shared memory: %s: %s", self._obstacle, _reason(error))
 
     def _refusal(self, answer: bytes, op: Op) -> str:
         """Return why a reply requires sending the request over ZMQ; empty if the reply is final."""
@@ -425,7 +425,7 @@ class ShmTransport:
         if pending.future.done():
             return
         if expired:
-            pending.future.set_exception(_too_late(pending, self._due))
+            pending.future.set_exception(no_reply(pending.op, "in shared memory", self._due - pending.at))
         elif self._channel is not None and self._channel.replaced():
             self._drop("the regions were replaced")
 
@@ -440,7 +440,7 @@ class ShmTransport:
 
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
-        self._fail(self._lost)
+        self._fail(lambda op: lost(op, f"the server at {self.endpoint}"))
         if self._channel is not None:
             self._channel.close()
             self._channel = None
@@ -450,21 +450,6 @@ class ShmTransport:
         pending = self._pending
         if pending is not None and not pending.future.done():
             pending.future.set_exception(error(pending.op))
-
-    def _lost(self, op: Op) -> URLabError:
-        text = f"{op.name}: the server at {self.endpoint} was lost after the request was sent."
-        if op.effect is Effect.READ:
-            return ConnectionLost(text, op=op.name, hint="The op changes nothing, so it can be sent again.")
-        return OutcomeUnknown(text, op=op.name, hint="It may have been executed: call discover() and check the state.")
-
-
-def _too_late(pending: _Pending, now: float) -> URLabTimeoutError:
-    executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
-    return URLabTimeoutError(
-        f"{pending.op.name}: no reply in shared memory within {1000 * (now - pending.at):.0f} ms.{executed}",
-        op=pending.op.name,
-        hint="The server is busy or blocked; allow more time with timeout=…",
-    )
 
 
 def _reason(error: Exception) -> str:

@@ -71,11 +71,6 @@ def answers(reply: bytes, op: Op) -> bool:
 class RegionChannel:
     """The pair of request and reply regions, for the client that holds the lock.
 
-    Args:
-        requests: File of the request region.
-        replies: File of the reply region.
-        events: Names of their events on Windows.
-
     Attributes:
         limit: Size of the largest payload that fits in both directions, bytes.
         dirty: Whether an old reply may still be to come.
@@ -153,6 +148,7 @@ class RegionChannel:
         """Release both regions."""
         if self._watch is not None:
             self._watch.close()
+            self._watch = None  # it refers to this channel
         self.requests.close()
         self.replies.close()
         self._request_event.close()

@@ -47,10 +47,6 @@ class MappedRegion:
         writable: Whether to map the region for writing, too, and to take the lock that excludes other clients, held
             until `close`.
 
-    Attributes:
-        path: The file.
-        region: The region in it.
-
     Raises:
         RegionNotReady: The region is still being created.
         RegionInUse: Another client holds the lock.
@@ -210,8 +206,7 @@ class ServerRegions:
     def events(self, requests: Path) -> tuple[str, str]:
         """Return the names of the request and reply events on Windows.
 
-        Args:
-            requests: Path of the request region, whose directory determines the names that the server does not report.
+        Those that the server does not report follow from the directory of the request region.
         """
         request, reply = self._events
         session = requests.parent.name
@@ -263,12 +258,6 @@ class ServerRegions:
 
 class Doorbell:
     """The client's end of the doorbell.
-
-    Args:
-        loop: The event loop.
-        path: Path of the socket.
-        on_rings: Called with the rings that have arrived.
-        on_lost: Called when the server is gone.
 
     Raises:
         OSError: No server accepts connections there.

@@ -44,13 +44,7 @@ _WANTS = {Ring.STATE: Ring.WANT_STATE, Ring.CAMERA: Ring.WANT_CAMERAS}
 
 
 class Place(Struct, frozen=True):
-    """Location of a source's publications in shared memory.
-
-    Attributes:
-        file: Name of the region's file.
-        topic: Topic passed to the handlers.
-        ring: Kind of doorbell ring that announces the publications.
-    """
+    """Location of a source's publications in shared memory, and the topic that its handlers get."""
 
     file: str
     topic: bytes
@@ -153,18 +147,14 @@ class _RegionReader:
     def close(self) -> None:
         if self.watch is not None:
             self.watch.close()
+            self.watch = None  # it refers to this reader, whose mapping must not wait for the garbage collector
         with self._lock:
             self._closed = True
             self.mapping.close()
 
 
 class Regions:
-    """Everything that one client receives from shared memory. Except for `view`, use from one event loop.
-
-    Args:
-        location: Location of the regions.
-        subscriptions: Sockets used as a fallback.
-    """
+    """Everything that one client receives from shared memory. Except for `view`, use from one event loop."""
 
     def __init__(self, location: ServerRegions, subscriptions: Subscriptions) -> None:
         self._location = location
@@ -184,10 +174,7 @@ class Regions:
     ) -> None:
         """Deliver publications to `handler`, from the region if it exists, otherwise from the socket.
 
-        Args:
-            handler: Receiver of the publications.
-            subscription: Callback that returns the subscription for the socket.
-            place: Callback that returns the region. Raises `ProtocolError` if there can be none.
+        `place` raises `ProtocolError` if there can be no region.
         """
         if self._closed:
             raise client_closed()

@@ -127,24 +127,14 @@ class Subscription(Struct, frozen=True):
     pictures: bool = False
 
 
-class ConnectionStatus(Struct, frozen=True):
-    """Status of the connection to a publisher.
+class Subscriber:
+    """One SUB socket.
 
     Attributes:
         endpoint: Address of the publisher.
         connected: Whether the publisher is connected.
-        connects: Number of connections opened so far.
         obstacle: Most recent reason for a missing connection.
     """
-
-    endpoint: str
-    connected: bool
-    connects: int
-    obstacle: str
-
-
-class _Subscriber:
-    """One SUB socket."""
 
     def __init__(
         self,
@@ -155,10 +145,10 @@ class _Subscriber:
         pictures: bool,
         keys: ClientKeys | None,
     ) -> None:
-        self.endpoint = endpoint
-        self.connected = False
-        self.connects = 0
-        self.obstacle = UNANSWERED
+        self.endpoint: str = endpoint
+        self.connected: bool = False
+        self.obstacle: str = UNANSWERED
+        self._connects = 0
         self._loop = loop
         self._copy = not pictures
         self._handlers: dict[MessageHandler, Subscription] = {}
@@ -177,6 +167,7 @@ class _Subscriber:
         return not self._handlers
 
     def attach(self, handler: MessageHandler, subscription: Subscription) -> None:
+        """Deliver a subscription of this publisher."""
         for prefix in subscription.filters:
             self._socket.subscribe(prefix)  # the socket counts equal filters of several handlers
         self._handlers[handler] = subscription
@@ -185,12 +176,14 @@ class _Subscriber:
         self._loop.call_soon(self._on_readable)
 
     def detach(self, handler: MessageHandler) -> None:
+        """Stop delivering."""
         for prefix in self._handlers.pop(handler).filters:
             self._socket.unsubscribe(prefix)
         self._routes.clear()
         self._loop.call_soon(self._on_readable)
 
     def close(self) -> None:
+        """Close the socket."""
         self._closed = True
         self._connection.close()
 
@@ -251,7 +244,7 @@ class _Subscriber:
     def _note(self, event: zmq.Event, value: int, obstacle: str | None) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self.connected = True
-            self.connects += 1
+            self._connects += 1
             log.info("receiving from %s", self.endpoint)
             self._tell_line()
             if self._down_since is not None:
@@ -267,7 +260,7 @@ class _Subscriber:
                 self._down_since = self._loop.time()
                 self._connection.revive(was_connected=True)
                 self._tell_line()
-        elif obstacle is not None and self.connects == 0:
+        elif obstacle is not None and self._connects == 0:
             self.obstacle = f"{obstacle}. {SERVER_KEY_HINT}" if event in FAILED_HANDSHAKES else obstacle
             if event is not zmq.Event.CONNECTED:  # the handshake may still follow
                 for handler in tuple(self._handlers):
@@ -282,17 +275,13 @@ class _Subscriber:
 
 
 class Subscriptions:
-    """All subscriptions of one client. Sockets are opened on first use and closed when no handler remains.
-
-    Attributes:
-        closed: Whether `close` was called.
-    """
+    """All subscriptions of one client. Sockets are opened on first use and closed when no handler remains."""
 
     def __init__(self, keys: ClientKeys | None = None) -> None:
         self._keys = keys
         self._context: Context | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
+        self._subscribers: dict[tuple[str, bool], Subscriber] = {}
         self._attached: dict[MessageHandler, tuple[Subscription, Callable[[], Subscription]]] = {}
         self.closed: bool = False
 
@@ -332,13 +321,10 @@ class Subscriptions:
                 self._attached[handler] = after, wanted
                 handler.on_gap(f"moved from {before.endpoint} to {after.endpoint}")
 
-    def line(self, handler: MessageHandler) -> ConnectionStatus | None:
-        """Return the status of the connection that `handler` receives from, or None if it does not receive."""
+    def line(self, handler: MessageHandler) -> Subscriber | None:
+        """Return the socket that `handler` receives from, or None if it does not receive."""
         found = self._attached.get(handler)
-        if found is None:
-            return None
-        subscriber = self._subscribers[_key(found[0])]
-        return ConnectionStatus(subscriber.endpoint, subscriber.connected, subscriber.connects, subscriber.obstacle)
+        return None if found is None else self._subscribers[_key(found[0])]
 
     def close(self) -> None:
         """End every subscription with `ClientClosed` and release the sockets. Idempotent."""
@@ -365,7 +351,7 @@ class Subscriptions:
             if self._context is None:
                 self._context = zmq.Context()
                 _contexts.add(self._context)
-            subscriber = _Subscriber(
+            subscriber = Subscriber(
                 self._context, self._loop, subscription.endpoint, pictures=subscription.pictures, keys=self._keys
             )
             self._subscribers[key] = subscriber

@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Collection
-from typing import Any, ClassVar, Final, Protocol, cast
+from typing import Any, ClassVar, Final, TypeAlias, cast
 from weakref import WeakSet
 
 import zmq
@@ -21,6 +21,8 @@ import zmq
 from urlab_client._platform.processors import crowded
 from urlab_client.aio.background import Tell, background_thread
 from urlab_client.events import ClientEvent
+
+Socket: TypeAlias = zmq.Socket[bytes]
 
 # Interval of the thread's checks whether the loop was closed while clients were open.
 _CHECK_S: Final = 1.0
@@ -34,17 +36,9 @@ _DRAIN_BYTES: Final = 4096
 _POLLIN: Final = int(zmq.POLLIN)
 
 
-class Watchable(Protocol):
-    """A ZeroMQ socket or a socket of the system."""
-
-    def fileno(self) -> int:
-        """Return the descriptor to watch."""
-        ...
-
-
 def watch_socket(
     loop: asyncio.AbstractEventLoop,
-    watched: Watchable,
+    watched: Socket | socket.socket,
     on_readable: Callable[[], object],
     *,
     on_demand: bool = False,
@@ -53,9 +47,6 @@ def watch_socket(
     """Call `on_readable` on the event loop whenever a socket is readable. It may find nothing to read.
 
     Args:
-        loop: The running event loop.
-        watched: The socket.
-        on_readable: Callback to invoke.
         on_demand: Whether a watching thread is active only from `expect` until the socket is readable, because waking
             it would delay a reply that the loop polls for itself.
         tell: Publishes the event that a watching thread died. Another one follows after a pause.
@@ -78,12 +69,9 @@ def watch_memory(
     looks because the loop's timers round up to a millisecond.
 
     Args:
-        loop: The running event loop.
-        has_news: Returns whether there is news. Called on the thread until `close`; must not block or raise.
-        on_news: Callback to invoke.
+        has_news: Called on the thread until `close`; must not block or raise.
         fastest_s: Shortest pause, seconds.
         block: Sleeps until the server signals, for at most the given seconds; None without signals.
-        tell: See `watch_socket`.
     """
     return Watch(loop, on_news, has_news=has_news, block=block, fastest_s=fastest_s, on_demand=True, tell=tell)
 

@@ -12,20 +12,18 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
 import zmq
 from msgspec import Struct
 
 from urlab_client.aio.background import running_loop
-from urlab_client.aio.transport.base import LateReply, TransportStats
+from urlab_client.aio.transport.base import LateReply, TransportStats, lost, no_reply
 from urlab_client.aio.transport.connection import (
     FAILED_HANDSHAKES,
     UNANSWERED,
     ClientKeys,
     Connection,
-    Context,
-    Socket,
     borrow_context,
     give_back_context,
 )
@@ -33,14 +31,12 @@ from urlab_client.aio.transport.waiting import BusyPoll, Watch
 from urlab_client.errors import (
     AuthenticationFailed,
     ClientClosed,
-    ConnectionLost,
-    OutcomeUnknown,
     ServerUnreachable,
     URLabError,
     URLabTimeoutError,
 )
 from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
-from urlab_client.protocol.base import Effect, Op
+from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
 
@@ -64,6 +60,16 @@ _Get = Callable[[int], int]
 _CERTAIN = 3  # a server that is shutting down aborts one handshake; a server with another key aborts all
 
 
+class _Open(NamedTuple):
+    """The open socket, and what each request needs of it."""
+
+    loop: asyncio.AbstractEventLoop
+    connection: Connection
+    replies: Watch
+    send: _Send
+    get: _Get
+
+
 class _Sent(Struct):
     """A request on the wire."""
 
@@ -77,23 +83,23 @@ class ZmqTransport:
     """Transport over one DEALER socket. It connects on first use and reconnects automatically.
 
     Attributes:
+        endpoint: The server's RPC endpoint.
+        connected: Whether a server is connected.
+        state_port: See `RequestTransport.state_port`.
         lost_at: Loop time at which the connection was last lost.
         refused: Whether a connection attempt has been refused since then.
     """
 
     stats: TransportStats
+    state_port: int | None = None
 
     def __init__(self, endpoint: str, keys: ClientKeys | None = None) -> None:
         self.stats = TransportStats()
-        self._endpoint = endpoint
+        self.endpoint: str = endpoint
         self._keys = keys
         self._rejections = 0
         self._given_up = False
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._context: Context | None = None
-        self._connection: Connection | None = None
-        self._socket: Socket | None = None
-        self._replies: Watch | None = None
+        self._open: _Open | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
@@ -102,30 +108,13 @@ class ZmqTransport:
         self._abandoned = b""  # id of the last request whose caller gave up, until a reply shows that it is done
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
-        self._send: _Send | None = None
-        self._get: _Get | None = None
-        self._connected = False
+        self.connected: bool = False
         self._closed = False
         self._obstacle = UNANSWERED
         self.lost_at: float = 0.0
         self.refused: bool = False
         self._silent_since: float | None = None
         self.on_event: Callable[[ClientEvent], None] | None = None
-
-    @property
-    def state_port(self) -> int | None:
-        """See `RequestTransport.state_port`."""
-        return None
-
-    @property
-    def endpoint(self) -> str:
-        """The server's RPC endpoint."""
-        return self._endpoint
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is connected."""
-        return self._connected
 
     @property
     def owed(self) -> bool:
@@ -136,11 +125,12 @@ class ZmqTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`."""
-        loop, send, get = self._loop, self._send, self._get
-        if loop is None or send is None or get is None or asyncio._get_running_loop() is not loop:  # noqa: SLF001
-            loop, send, get = self._open()
+        opened = self._open
+        if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
+            opened = self._connect()
+        loop, _, replies, send, get = opened
         while True:
-            if not self._connected:
+            if not self.connected:
                 await self._wait_connected(loop, op, connect_by)
             started = loop.time()
             if deadline is not None and started >= deadline:
@@ -154,7 +144,7 @@ class ZmqTransport:
             except zmq.Again:
                 # The connection was lost and its event has not been read yet, or the queue is full.
                 self._read_events()
-                if self._connected:
+                if self.connected:
                     raise self._clogged(op) from None
                 continue
             break
@@ -171,11 +161,11 @@ class ZmqTransport:
             elif get(_EVENTS) & _POLLIN:
                 # Sending may have consumed the edge of the descriptor.
                 loop.call_soon(self._on_readable)
-            if not reply.done() and self._replies is not None:
-                self._replies.expect()
+            if not reply.done():
+                replies.expect()
             answer = await reply
         except (asyncio.CancelledError, URLabTimeoutError):
-            if self._connected and not _answered(reply):
+            if self.connected and not _answered(reply):
                 self._abandoned = key
             if late is not None:
                 late(self._reply_to_come(key, reply))
@@ -199,43 +189,41 @@ class ZmqTransport:
         if self._closed:
             return
         self._closed = True
-        self._send = self._get = None
-        self._connected = False
-        closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Create a new client.")
+        self.connected = False
+        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
         if self._timer is not None:
             self._timer.cancel()
-        if self._connection is not None and self._context is not None:
-            self._connection.close()
-            give_back_context(self._context)
+        if self._open is not None:
+            context = self._open.connection.socket.context
+            self._open.connection.close()
+            self._open = None
+            give_back_context(context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, _Send, _Get]:
+    def _connect(self) -> _Open:
         if self._closed:
-            raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Create a new client.")
-        loop = running_loop(self._loop)
-        if self._send is not None and self._get is not None:
-            return loop, self._send, self._get
+            raise ClientClosed(f"The client of {self.endpoint} is closed.", hint="Create a new client.")
+        loop = running_loop(None if self._open is None else self._open.loop)
         context = borrow_context()
         socket = context.socket(zmq.DEALER)
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
         try:
-            connection = Connection(loop, socket, self._endpoint, self._keys, self._note, tell=self._tell)
+            connection = Connection(loop, socket, self.endpoint, self._keys, self._note, tell=self._tell)
         except ValueError:
             give_back_context(context)
             raise
-        self._loop, self._context, self._connection, self._socket = loop, context, connection, socket
-        self._replies = connection.watch(self._on_readable, on_demand=True)
-        send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
-        get = self._get = cast("_Get", socket.get)
-        return loop, send, get
+        replies = connection.watch(self._on_readable, on_demand=True)
+        send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
+        self._open = _Open(loop, connection, replies, send, cast("_Get", socket.get))
+        return self._open
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
         """Return a future for the reply to a request that its caller has abandoned."""
         if _answered(reply):
             return reply  # it arrived in the loop iteration that cancelled the caller
         coming: asyncio.Future[bytes] = reply.get_loop().create_future()
-        if self._connected:
+        if self.connected:
             self._forget_late()
             self._late = key, coming
         else:
@@ -246,17 +234,17 @@ class ZmqTransport:
         waiter: asyncio.Future[None] = loop.create_future()
         started = loop.time()
         self._waiting.add(waiter)
-        if self._given_up and self._connection is not None:
+        if self._given_up and self._open is not None:
             # ZeroMQ does not retry after this rejection, but the server may have learnt the key by now.
             self._given_up = False
-            self._connection.reconnect()
+            self._open.connection.reconnect()
 
         def give_up() -> None:
             self._read_events()  # as in `_expire`
             if not waiter.done():
                 waiter.set_exception(
                     ServerUnreachable(
-                        f"{op.name}: no connection to {self._endpoint} within "
+                        f"{op.name}: no connection to {self.endpoint} within "
                         f"{_ms(loop.time() - started)}: {self._obstacle}. Nothing was sent.",
                         op=op.name,
                         hint="Is the editor (with URLab's bridge) or `urlab serve` running there, on this port?",
@@ -292,36 +280,29 @@ class ZmqTransport:
                     self._expire_at(loop, entry.deadline)
 
     def _give_up(self, entry: _Sent, seconds: float) -> None:
-        executed = "" if entry.op.effect is Effect.READ else " The request was sent and may still be executed."
-        entry.reply.set_exception(
-            URLabTimeoutError(
-                f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
-                op=entry.op.name,
-                hint="The connection is up, so the server is busy or blocked; allow more time with timeout=…",
-            )
-        )
-        if self._loop is not None and self._silent_since is None:
+        entry.reply.set_exception(no_reply(entry.op, f"from {self.endpoint}", seconds))
+        if self._silent_since is None:
             self._silent_since = entry.at
-            self._tell(ServerSilent(endpoint=self._endpoint, op=entry.op.name, waited_s=seconds))
+            self._tell(ServerSilent(endpoint=self.endpoint, op=entry.op.name, waited_s=seconds))
 
     def _look(self) -> None:
         """Poll the socket for a reply."""
-        if self._get is not None and self._get(_EVENTS) & _POLLIN:
+        if self._open is not None and self._open.get(_EVENTS) & _POLLIN:
             self._take()
 
     def _on_readable(self) -> None:
         self._take()
         # A reply may be expected to an abandoned request, too.
         unanswered = self._abandoned or self._silent_since is not None
-        if self._replies is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
-            self._replies.expect()
+        if self._open is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
+            self._open.replies.expect()
 
     def _take(self) -> None:
         """Receive replies until no request waits for one."""
-        socket, get = self._socket, self._get
-        if socket is None or get is None:  # it has been closed
+        if self._open is None:  # it has been closed
             return
-        receive = socket.recv
+        loop, connection, _, _, get = self._open
+        receive = connection.socket.recv
         while True:
             try:
                 key = receive(_NOBLOCK)
@@ -334,9 +315,9 @@ class ZmqTransport:
                     receive(_NOBLOCK)
                 self._drop_stray()
                 continue
-            if (silent := self._silent_since) is not None and self._loop is not None:
+            if (silent := self._silent_since) is not None:
                 self._silent_since = None
-                self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=self._loop.time() - silent))
+                self._tell(ServerAnswers(endpoint=self.endpoint, silent_s=loop.time() - silent))
             if self._abandoned and key >= self._abandoned:
                 self._abandoned = b""  # the server answers the requests of a connection in their order
             if self._late is not None and key > self._late[0]:
@@ -367,18 +348,18 @@ class ZmqTransport:
 
     def _drop_stray(self) -> None:
         self.stats.late += 1
-        log.debug("%s: dropped a reply that no request waits for", self._endpoint)
+        log.debug("%s: dropped a reply that no request waits for", self.endpoint)
 
     def _read_events(self) -> None:
-        if self._connection is not None:
-            self._connection.read_events()
+        if self._open is not None:
+            self._open.connection.read_events()
 
     def _note(self, event: zmq.Event, value: int, obstacle: str | None) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
-            self._connected = True
+            self.connected = True
             self._rejections = 0
             self.stats.connects += 1
-            log.info("connected to %s", self._endpoint)
+            log.info("connected to %s", self.endpoint)
             self._tell_connected()
             for waiter in self._waiting:
                 if not waiter.done():
@@ -408,33 +389,35 @@ class ZmqTransport:
         else:
             return
         self._given_up = event is not zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
-        text = f"No session with {self._endpoint}: {why}. Nothing was sent."
+        text = f"No session with {self.endpoint}: {why}. Nothing was sent."
         self.fail_waiting(AuthenticationFailed(text, hint=hint))
 
     def _lose(self) -> None:
         self._take()  # replies that arrived before the loss still count
-        if self._connected:
-            log.info("lost %s; reconnecting", self._endpoint)
-            if self._loop is not None:
-                self.lost_at = self._loop.time()
+        if self.connected:
+            log.info("lost %s; reconnecting", self.endpoint)
+            self.lost_at = self._now()
             self.refused = False
             self._obstacle = "the connection was lost and not restored"
-            self._tell(ServerLost(endpoint=self._endpoint))
+            self._tell(ServerLost(endpoint=self.endpoint))
         else:
             self.refused = True  # a tunnel accepts connections even if the server is down
-        if self._connection is not None:
+        if self._open is not None:
             # Also after an aborted handshake: ZeroMQ does not retry after invalid data in it.
-            self._connection.revive(was_connected=self._connected)
-        self._connected = False
+            self._open.connection.revive(was_connected=self.connected)
+        self.connected = False
         self._silent_since = None
-        self._fail_sent(self._lost)
+        self._fail_sent(lambda entry: lost(entry.op, f"the connection to {self.endpoint}"))
+
+    def _now(self) -> float:
+        return 0.0 if self._open is None else self._open.loop.time()
 
     def _tell_connected(self) -> None:
-        if self.stats.connects == 1 or self._loop is None:
-            self._tell(ServerConnected(endpoint=self._endpoint))
+        if self.stats.connects == 1:
+            self._tell(ServerConnected(endpoint=self.endpoint))
         else:
-            down_s = self._loop.time() - self.lost_at
-            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=down_s, refused=self.refused))
+            down_s = self._now() - self.lost_at
+            self._tell(ServerReconnected(endpoint=self.endpoint, down_s=down_s, refused=self.refused))
 
     def _tell(self, event: ClientEvent) -> None:
         if self.on_event is not None:
@@ -443,25 +426,16 @@ class ZmqTransport:
             except Exception:  # what waits for this connection must hear of its loss all the same
                 log.exception("%r could not be handled", event)
 
-    def _lost(self, entry: _Sent) -> URLabError:
-        name = entry.op.name
-        text = f"{name}: the connection to {self._endpoint} was lost after the request was sent."
-        if entry.op.effect is Effect.READ:
-            return ConnectionLost(text, op=name, hint="The op changes nothing, so it can be sent again.")
-        return OutcomeUnknown(
-            text, op=name, hint="It may have been executed: client.resync() determines the outcome and recovers."
-        )
-
     def _clogged(self, op: Op) -> ServerUnreachable:
         return ServerUnreachable(
-            f"{op.name}: {self._endpoint} has not read the previous requests. Nothing was sent.",
+            f"{op.name}: {self.endpoint} has not read the previous requests. Nothing was sent.",
             op=op.name,
             hint="The connection is up, but the server does not read from it: restart it.",
         )
 
     def _too_late(self, op: Op) -> URLabTimeoutError:
         return URLabTimeoutError(
-            f"{op.name}: the deadline passed before the request could be sent to {self._endpoint}. Nothing was sent.",
+            f"{op.name}: the deadline passed before the request could be sent to {self.endpoint}. Nothing was sent.",
             op=op.name,
             hint="Other work kept the event loop busy, or the timeout is too short.",
         )

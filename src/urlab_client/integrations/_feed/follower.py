@@ -16,12 +16,12 @@ from msgspec import Struct
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.observer import ClientObserver
+from urlab_client.aio.client_types import ClientObserver
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
-from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
+from urlab_client.integrations._variation import wire_variation
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._portal import Portal
@@ -188,7 +188,7 @@ class Follower(ClientObserver):
             return None
 
     def _unknown_cameras(self) -> str:
-        """Raise if cameras are missing."""
+        """Return which requested cameras are missing; empty if none."""
         wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
         missing = [name for name in wanted if self._camera(name) is None]
         there = ", ".join(self._every_camera()) or "none"
@@ -215,7 +215,7 @@ class Follower(ClientObserver):
         set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
         restarts = isinstance(reply, ResetOk)
         seed = client.reset_seed if restarts else None
-        varied = varied_by_ops(client) if restarts else None
+        varied = wire_variation(client) if restarts else None
         # A reset of somebody else has another seed, or none.
         draws = varied.draws if varied is not None and varied.draws is not None and varied.draws.seed == seed else None
         put(State(scene, reply, set_points, nanoseconds, restarts, wall_ns, not self._live, seed, draws))

@@ -16,7 +16,6 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.integrations._episode_variation import variation_of
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -26,6 +25,7 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
+from urlab_client.integrations._variation import server_variation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 from urlab_client.values.names import cleaned_name
@@ -119,7 +119,7 @@ class FollowedScene:
             entities=entities,
             mocap=mocap,
             cameras={id(view): CameraLayout(name, view, _camera_id(model, prefixes, name)) for name, view in cameras},
-            variation=None if model is None else variation_of(client, model, layouts),
+            variation=None if model is None else server_variation(client, model, layouts),
         )
 
 

@@ -4,12 +4,11 @@ Needs the extra `gym`. Importing this package registers the environments in `tas
 """
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
-from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
-from urlab_client.integrations.gym.shipped_tasks import FixedReach, Push, PushPictures, Reach, Run, Walk
+from urlab_client.integrations.gym.env import URLabEnv
+from urlab_client.integrations.gym.settings import RewardFn, TerminationFn
 from urlab_client.integrations.gym.spaces import SpaceMapping, SpaceMode
-from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import Start, States, Task, TaskScene
-from urlab_client.integrations.gym.tasks import TASKS, register
+from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task, TaskScene
+from urlab_client.integrations.gym.tasks import TASKS, FixedReach, Push, PushPictures, Reach, Run, Walk, register
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 
 __all__ = [

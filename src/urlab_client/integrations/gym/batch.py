@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
@@ -19,40 +18,21 @@ from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import ControllerKind
 from urlab_client.errors import UnknownKeyframe, URLabError
-from urlab_client.integrations.gym.batch_variation import BatchVariation
-from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of, first_camera
-from urlab_client.integrations.gym.late_cameras import LateCameras
+from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
+from urlab_client.integrations.gym.episode import compiled_prefixes, rendered_camera
 from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
-from urlab_client.integrations.gym.spaces import (
-    Field,
-    Observation,
-    SpaceMapping,
-    SpaceMode,
-    with_cameras,
-)
-from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import (
-    EpisodeSettings,
-    Start,
-    States,
-    Task,
-    TaskScene,
-    add_observed,
-    check_alone,
-    with_task,
-)
-from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
-from urlab_client.integrations.gym.warp_batch import WarpBatch
+from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
+from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode, with_cameras
+from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task, TaskScene, add_observed, with_task
+from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.randomise.variation import declared_in
+from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
 from urlab_client.simulation.controller_config import ControllerConfig
-from urlab_client.simulation.controllers import Actuated, Controller, PassthroughController, PDController
+from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import compiled_names
-from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
+from urlab_client.values.pictures import to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 
@@ -133,50 +113,55 @@ class URLabBatchEnv(Vectorized):
             raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
             raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
-        check_render_mode(render_mode)
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
         settings = EpisodeSettings.of(
             task,
             observations=observations,
+            reward_fn=reward_fn,
+            termination_fn=termination_fn,
             n_substeps=n_substeps,
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
             space_mode=space_mode,
             cameras=cameras,
+            render_mode=render_mode,
+            render_camera=render_camera,
         )
-        shown = None if render_mode is None else _Shown(render_camera)
-        fetched = _fetch(with_model_options(address), client_defaults(client_options), settings.cameras, shown)
-        model, prefixes, pictures = fetched.model, fetched.prefixes, fetched.pictures
+        address = with_model_options(address)
+        with URLabClient(address, **client_defaults(client_options)) as client:
+            client.discover()
+            model = client.model
+            if model is None or not client.articulations:
+                raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
+            self._prefixes = compiled_prefixes(client)
+            self._rendered = rendered_camera(aio_of(client), settings)
+            drawn = [*settings.cameras, *([self._rendered] if self._rendered else [])]
+            self._scene = PictureScene.of(aio_of(client), model, drawn)
+            mapping = SpaceMapping(model, self._prefixes, settings.fields, settings.space_mode, settings.articulations)
+            self._controllers = {
+                key: _controller(model, mapping.layout(key), str(found.kind), found.params)
+                for key, articulation in client.articulations.items()
+                if (found := articulation.controller)
+            }
+            self._target_type = np.float64 if client.server.features.exact_controls else np.float32
         declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
-        mapping = SpaceMapping(
-            model, prefixes, fields_of(settings.observations), settings.space_mode, settings.articulations
-        )
         super().__init__(
             num_envs=num_envs,
+            settings=settings,
             mapping=mapping,
             observation_space=with_task(
-                with_cameras(mapping, {name: pictures.space(name) for name in settings.cameras}), task
+                with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}), task
             ),
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
-            task=task,
             randomise=declared,
         )
         self.model = model
         self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
         if task is not None:
             task.setup(TaskScene(model, mapping))
-        self._n_substeps = settings.n_substeps
-        self._noise = settings.reset_noise
-        self._start_keyframe = settings.keyframe
-        self.render_mode = render_mode
-        self._cameras = tuple(settings.cameras)
-        self._rendered = fetched.rendered
-        self._picture_scene = pictures
-        self._pictures = BatchPictures(pictures) if self._cameras else None
+        self._pictures = BatchPictures(
+            self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
+        )
         self._batch: Any = (
             WarpBatch(model, num_envs, **engine_options)
             if engine == "warp"
@@ -185,22 +170,11 @@ class URLabBatchEnv(Vectorized):
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
-        self._late = LateCameras(declared, self._cameras)
-        self._prefixes = prefixes
-        self._target_type = np.float64 if fetched.exact_controls else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
-        self._noisy = {
-            key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
-            for key in mapping.keys
-        }
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
-        self._controllers = {
-            key: _controller(model, mapping.layout(key), kind, params)
-            for key, (kind, params) in fetched.controllers.items()
-        }
         self._varied = None
         if declared is not None and declared.vary:
-            self._varied = BatchVariation(declared, model, self._batch, num_envs, self._controllers)
+            self._varied = _CopyVariation(declared, model, self._batch, num_envs, self._controllers)
         self._bodies = {name: i for i, name in enumerate(model_names(model, "body"))}
         for push in () if declared is None else declared.push:
             self._body(push.body)
@@ -215,10 +189,8 @@ class URLabBatchEnv(Vectorized):
         """
         if self._rendered is None:
             return None
-        copies = np.arange(self.num_envs)
-        mode = self._picture_scene.mode(self._rendered)
-        drawn = self._draw([self._rendered], copies, self._visible_states(copies))
-        return tuple(to_rgb(frame, mode) for frame in drawn[self._rendered])
+        frames = self._pictures.draw([self._rendered], self._copies(np.arange(self.num_envs)))[self._rendered]
+        return tuple(to_rgb(frame, self._scene.mode(self._rendered)) for frame in frames)
 
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return the values drawn for an episode, as in `EpisodeDraws.to_dict`; None if nothing varies."""
@@ -227,76 +199,57 @@ class URLabBatchEnv(Vectorized):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the drawing context."""
-        pictures, self._pictures = self._pictures, None
-        if pictures is not None:
-            pictures.close()
+        self._pictures.close()
 
-    def _seen(self, indices: Indices) -> dict[str, NDArray[Any]]:
-        """Return the camera observations of some copies."""
-        states, late = self._visible_states(indices), self._late
-        drawn = self._draw([name for name in self._cameras if name not in late.names], indices, states)
-        for name in late.names:
-            times = self._arrays["time"][indices].tolist()
-            shown = [late.shown(name, *each) for each in zip(indices.tolist(), times, states, strict=True)]
-            drawn |= self._draw([name], indices, shown)
-        return {
-            name: np.stack([observed_pixels(frame, self._picture_scene.mode(name)) for frame in drawn[name]])
-            for name in self._cameras
-        }
+    def _copies(self, indices: Indices) -> list[Visible]:
+        """Return what pictures of some copies show."""
+        return [
+            Visible(
+                np.concatenate([values[i].ravel() for values in self._visible]),
+                {} if self._varied is None else self._varied.look(i),
+            )
+            for i in indices.tolist()
+        ]
 
-    def _visible_states(self, indices: Indices) -> list[Floats]:
-        """Return the states of some copies in the form of `Visible.state`."""
-        return [np.concatenate([values[i].ravel() for values in self._visible]) for i in indices.tolist()]
+    def _advance(
+        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+    ) -> Mapping[int, Exception]:
+        if len(fresh):
+            self._start(fresh, self._settings.keyframe if keyframe is None else keyframe)
+        if len(acting):
+            self._act(acting, set_points)
+        moved = np.sort(np.concatenate([fresh, acting]))
+        put(self._observations, moved, self._observe(moved))
+        return {}
 
-    def _draw(self, cameras: Sequence[str], indices: Indices, states: Sequence[Floats]) -> dict[str, list[Pixels]]:
-        """Return the pictures of cameras in some copies, given their states."""
-        if not cameras:
-            return {}
-        if self._pictures is None:
-            self._pictures = BatchPictures(self._picture_scene)
-        looks = [{} if self._varied is None else self._varied.look(i) for i in indices.tolist()]
-        return self._pictures.draw(cameras, [Visible(*each) for each in zip(states, looks, strict=True)])
-
-    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
-        nothing: Found = (None, {})
-        return (
-            self._reset_some(fresh, self._keyframe) if len(fresh) else nothing,
-            self._step_some(acting, set_points) if len(acting) else nothing,
-        )
-
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
-        keyframe = self._start_keyframe if keyframe is None else keyframe
+    def _start(self, indices: Indices, keyframe: str | None) -> None:
         key = -1 if keyframe is None else self._keyframe_id(keyframe)
+        qpos, seeds, noise = self._arrays["qpos"], self.episode_seeds(), self._settings.reset_noise
         if self._varied is not None:
-            self._varied.begin(indices, self.episode_seeds())
+            self._varied.begin(indices, seeds)
         self._batch.reset(indices, key)
         if self._varied is not None:
             for i in map(int, indices):
-                self._varied.start(i, self._arrays["qpos"][i])
+                self._varied.start(i, qpos[i])
             self._batch.forward(indices)
-        if self._noise:
-            qpos = self._arrays["qpos"]
+        if noise:
+            noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
             for i in map(int, indices):
-                for key in self.mapping.keys:
-                    joints = self._noisy[key]
-                    address = self.model.jnt_qposadr[joints]
-                    qpos[i, address] = self._noise.drawn(self._rngs[i], self.model, joints, qpos[i, address])
+                for joints in noisy:
+                    noise.add(self._rngs[i], self.model, joints, qpos[i])
             self._batch.forward(indices)
         if self.task is not None:
-            qpos = self._arrays["qpos"]
             for i in map(int, indices):
                 start = Start(self.task.scene, qpos[i].copy())
                 self.task.reset(self._rngs[i], start)
                 qpos[i], self._goals[i] = start.qpos, start.goal
             self._batch.forward(indices)
         self._step_count[indices] = 0
-        if self._late.names:
-            seeds = self.episode_seeds()
-            for i, state in zip(indices.tolist(), self._visible_states(indices), strict=True):
-                self._late.begin(i, int(seeds[i]), state)
-        return self._observe(indices), {}
+        if self._pictures.delays:
+            for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):
+                self._pictures.begin(i, int(seeds[i]), visible)
 
-    def _step_some(self, indices: Indices, set_points: Mapping[str, Floats]) -> Found:
+    def _act(self, indices: Indices, set_points: Mapping[str, Floats]) -> None:
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
         for key, values in set_points.items():
@@ -310,14 +263,13 @@ class URLabBatchEnv(Vectorized):
             for body, force in pushed.items():
                 pushes[i, self._body(body), :3] = force
         if targets:
-            for _ in range(self._n_substeps):
+            for _ in range(self._settings.n_substeps):
                 self._control(indices, targets)
                 self._batch.step(indices, nstep=1)
         else:
-            self._batch.step(indices, nstep=self._n_substeps)
+            self._batch.step(indices, nstep=self._settings.n_substeps)
         pushes[list(forces)] = 0.0
-        self._step_count[indices] += self._n_substeps
-        return self._observe(indices), {}
+        self._step_count[indices] += self._settings.n_substeps
 
     def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
         """Compute the controls from the controllers' targets and the current state."""
@@ -338,8 +290,9 @@ class URLabBatchEnv(Vectorized):
         observation = self.mapping.observe(read)
         if self.task is not None:
             observation = add_observed(observation, self.task, self.task.observe(self._states(indices)))
-        if self._cameras:
-            observation["cameras"] = self._seen(indices)
+        if self._settings.cameras:
+            times = self._arrays["time"][indices].tolist()
+            observation["cameras"] = self._pictures.observe(indices.tolist(), times, self._copies(indices))
         return observation
 
     def _states(self, indices: Indices) -> States:
@@ -380,66 +333,63 @@ class URLabBatchEnv(Vectorized):
         return self._keyframes[found[0]]
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """Request to render a camera; None selects the first colour camera."""
+class _CopyVariation:
+    """What varies in the copies of a batch, equal to the variation of a server's scene."""
 
-    camera: str | None
+    def __init__(
+        self,
+        declaration: Randomisation,
+        model: mujoco.MjModel,
+        batch: Any,
+        nsim: int,
+        controllers: Mapping[str, Controller],
+    ) -> None:
+        self._pd = {key: found for key, found in controllers.items() if isinstance(found, PDController)}
+        controlled = frozenset(int(i) for found in self._pd.values() for i in found.bound_actuators)
+        self._variation = Variation(declaration, model, controlled)
+        self._batch = batch
+        self._fields: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.fields}
+        self._visible: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.visible_fields}
+        self._factors: dict[str, dict[str, NDArray[np.float32]]] = {}
+        for key, found in self._pd.items():
+            shape = (nsim, len(found.bound_actuators))
+            self._factors[key] = {name: np.ones(shape, dtype=np.float32) for name in self._variation.varied_gains}
+        self.draws: list[EpisodeDraws | None] = [None] * nsim
 
+    def begin(self, indices: Indices, seeds: NDArray[np.int64]) -> None:
+        """Write the models for the next episodes of some copies, which must then be reset."""
+        for i in map(int, indices):
+            draws = self.draws[i] = self._variation.draw(int(seeds[i]))
+            self._variation.write(draws, {name: values[i] for name, values in self._fields.items()}.__getitem__)
+            for key, found in self._pd.items():
+                for name, factors in self._variation.gain_factors(draws, found.bound_actuators).items():
+                    self._factors[key][name][i] = factors
+        if self._variation.derives:
+            self._batch.set_const(indices)
 
-@dataclass(frozen=True, kw_only=True)
-class _Fetched:
-    """What a batch needs from the server's scene.
+    def start(self, i: int, qpos: Floats) -> None:
+        """Vary the start positions of a copy's episode in place, shape (nq,)."""
+        draws = self.draws[i]
+        if draws is not None:
+            self._variation.start(draws, qpos)
 
-    Attributes:
-        model: The compiled scene.
-        prefixes: Prefixes of the compiled names of articulations, by key.
-        controllers: Kind and parameters of the attached controllers, by key.
-        exact_controls: Whether the controllers receive set-points without rounding.
-        pictures: What is needed to draw the scene.
-        rendered: Camera that `render` shows, or None.
-    """
+    def use_factors(self, key: str, indices: Indices) -> None:
+        """Set the gain factors of some copies in the controller of an articulation."""
+        found = self._pd.get(key)
+        if found is not None:
+            found.factors = {name: factors[indices] for name, factors in self._factors[key].items()}
 
-    model: mujoco.MjModel
-    prefixes: Mapping[str, str]
-    controllers: Mapping[str, tuple[str, Mapping[str, Any]]]
-    exact_controls: bool
-    pictures: PictureScene
-    rendered: str | None
-
-
-def _fetch(address: str, client_options: Mapping[str, Any], cameras: Sequence[str], shown: _Shown | None) -> _Fetched:
-    """Fetch a scene.
-
-    Raises:
-        URLabError: The scene cannot be fetched or has no articulation.
-        KeyError: A camera is unknown.
-        ValueError: The scene has no camera to render.
-    """
-    with URLabClient(address, **client_options) as client:
-        client.discover()
-        model = client.model
-        if model is None or not client.articulations:
-            raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
-        attached = {key: articulation.controller for key, articulation in client.articulations.items()}
-        rendered = None if shown is None else shown.camera or first_camera(aio_of(client))
-        return _Fetched(
-            model=model,
-            prefixes=compiled_prefixes(client),
-            controllers={key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found},
-            exact_controls=client.server.features.exact_controls,
-            pictures=PictureScene.of(aio_of(client), model, [*cameras, *([rendered] if rendered else [])]),
-            rendered=rendered,
-        )
+    def look(self, i: int) -> dict[str, NDArray[Any]]:
+        """Return the varying fields of a copy's model that affect pictures, by name."""
+        return {name: values[i].copy() for name, values in self._visible.items()}
 
 
 def _controller(
     model: mujoco.MjModel, layout: ArticulationLayout, kind: str, params: Mapping[str, object]
 ) -> Controller:
     actuated = Actuated(np.array([*layout.actuators.values()], dtype=np.intp), (*layout.actuators,), layout.ctrl_adr)
-    if kind != ControllerKind.PD:
-        return PassthroughController(model, actuated)
-    controller = PDController(model, actuated, ControllerConfig())
+    config = ControllerConfig(ControllerKind.PD if kind == ControllerKind.PD else ControllerKind.PASSTHROUGH)
+    controller = attach_controller(model, actuated, config)
     controller.configure(params)
     return controller
 

@@ -13,13 +13,17 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
-from urlab_client.randomise.variation import draw_range, stream
-
-_NOISE, _PUSH, _LATE, _DROP = 1, 2, 3, 4
-"""Keys of the random streams, besides `MODEL_STREAM`."""
+from urlab_client.randomise.variation import (
+    DELAY_STREAM,
+    DROP_STREAM,
+    NOISE_STREAM,
+    PUSH_STREAM,
+    draw_range,
+    stream,
+)
 
 _SEED_END: Final = 2**31
 """Exclusive upper bound of episode seeds: servers may store them in 32 bits."""
@@ -32,9 +36,6 @@ class Disturbances:
         declaration: The declaration.
         mapping: The articulations as spaces.
         n_task: Length of what a task adds to an observation.
-
-    Raises:
-        ValueError: Noise is declared on a field that is not observed.
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
@@ -45,27 +46,23 @@ class Disturbances:
         self._targets = [self._noisy(noise) for noise in declaration.noise]
         self._pushes: list[_PushSchedule] = []
         self._noises: list[tuple[np.random.Generator, list[Floats]]] = []
-        self._drops = stream(0, _DROP)
+        self._drops = stream(0, DROP_STREAM)
         self._samples: deque[Observation] = deque(maxlen=1)
         self._shown: Observation = None
         self._actions: deque[Any] = deque()
         self._late_actions = 0
 
     def begin(self, rng: np.random.Generator) -> int:
-        """Draw the disturbances of an episode and return its seed.
-
-        Args:
-            rng: The environment's generator, which draws the seed.
-        """
+        """Draw the disturbances of an episode and return its seed, which the environment's generator draws."""
         self.seed: int = int(rng.integers(_SEED_END))
         seed = self.seed
         declared = self._declaration
-        self._pushes = [_PushSchedule(push, stream(seed, _PUSH, i)) for i, push in enumerate(declared.push)]
+        self._pushes = [_PushSchedule(push, stream(seed, PUSH_STREAM, i)) for i, push in enumerate(declared.push)]
         self._noises = []
         for i, (noise, widths) in enumerate(zip(declared.noise, self._widths, strict=True)):
-            generator = stream(seed, _NOISE, i)
+            generator = stream(seed, NOISE_STREAM, i)
             self._noises.append((generator, [generator.uniform(-noise.bias, noise.bias, n) for n in widths]))
-        late = stream(seed, _LATE)
+        late = stream(seed, DELAY_STREAM)
         observation, action = (
             int(late.integers(low, high, endpoint=True))
             for low, high in (steps_range(declared.delay.observation), steps_range(declared.delay.action))
@@ -74,7 +71,7 @@ class Disturbances:
         self._shown = None
         self._late_actions = action
         self._actions.clear()
-        self._drops = stream(seed, _DROP)
+        self._drops = stream(seed, DROP_STREAM)
         return seed
 
     def delayed(self, action: Any) -> Any:
@@ -82,7 +79,7 @@ class Disturbances:
         if not self._late_actions:
             return action
         self._actions.append(_copied(action))
-        return self._actions.popleft() if len(self._actions) > self._late_actions else _zero(action)
+        return self._actions.popleft() if len(self._actions) > self._late_actions else mapped(np.zeros_like, action)
 
     def forces(self) -> dict[str, Floats]:
         """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""
@@ -96,8 +93,7 @@ class Disturbances:
     def seen(self, truth: Observation) -> Observation:
         """Return an observation with noise, delay and lost samples. Pictures have their own latency and are unchanged.
 
-        Args:
-            truth: The next observation of the episode, of this environment only. It is not modified.
+        `truth`, the next observation of the episode, is not modified.
         """
         sample = _copied(truth)
         for noise, targets, (generator, biases) in zip(
@@ -183,9 +179,3 @@ def _copied(tree: Any) -> Any:
         entries = cast("Mapping[str, Any]", tree)
         return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}
     return np.array(tree)
-
-
-def _zero(action: Any) -> Any:
-    if isinstance(action, Mapping):
-        return {key: np.zeros_like(values) for key, values in cast("Mapping[str, Any]", action).items()}
-    return np.zeros_like(action)

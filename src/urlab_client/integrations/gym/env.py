@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
 
@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.disturbances import Disturbances
-from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
+from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.settings import (
+    EpisodeSettings,
+    RewardFn,
+    TerminationFn,
+    client_defaults,
+    keyframe_option,
+)
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
-from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone
+from urlab_client.integrations.gym.task import ResetNoise, States, Task
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import NameMap
-
-RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
-"""`(observation, action, next_observation, info) -> reward`."""
-
-TerminationFn = Callable[[Observation, dict[str, Any]], Any]
-"""`(observation, info) -> terminated`."""
 
 _FALLBACK_FPS: Final = 50.0
 
@@ -116,28 +116,24 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             KeyError: A camera or a body to push is unknown.
             ValueError: An option is out of range, or the scene has no camera to render.
         """
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
         settings = EpisodeSettings.of(
             task,
             observations=observations,
+            reward_fn=reward_fn,
+            termination_fn=termination_fn,
             n_substeps=n_substeps,
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
             space_mode=space_mode,
             cameras=cameras,
+            render_mode=render_mode,
+            render_camera=render_camera,
         )
         self.client = client
         self.render_mode = render_mode
-        self._rendered = () if render_mode is None else (render_camera or first_camera(aio_of(client)),)
         self._episode = EnvEpisode(
-            aio_of(client),
-            settings=settings,
-            rendered=self._rendered,
-            task=task,
-            randomise=None if randomise is None else Randomisation.of(randomise),
+            aio_of(client), settings=settings, randomise=None if randomise is None else Randomisation.of(randomise)
         )
         self.randomise: Randomisation | None = self._episode.randomise
         n_task = 0 if task is None else task.n_observed
@@ -230,12 +226,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         before = self._observation
+        set_points = self.mapping.set_points(action)  # validates before anything is drawn
         forces: dict[str, Floats] = {}
-        given, disturbances = action, self._disturbances
+        disturbances = self._disturbances
         if disturbances is not None:
-            self.mapping.set_points(action)  # validates before anything is drawn
-            given, forces = disturbances.delayed(action), disturbances.forces()
-        after = self._observation = portal_of(self.client).call(self._episode.step, given, forces)
+            set_points, forces = self.mapping.set_points(disturbances.delayed(action)), disturbances.forces()
+        after = self._observation = portal_of(self.client).call(self._episode.step, set_points, forces)
         self._elapsed += 1
         info = self._info()
         if self.task is not None:
@@ -258,10 +254,10 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called yet.
         """
-        if not self._rendered:
+        if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
             return None
-        picture = self._episode.rendered(self._rendered[0])
+        picture = self._episode.rendered()
         if picture is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         return picture
@@ -302,15 +298,3 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
     def _seen(self) -> Observation:
         return self._observation if self._disturbances is None else self._disturbances.seen(self._observation)
-
-
-def keyframe_option(options: dict[str, Any] | None) -> str | None:
-    """Return the keyframe named in the options of a reset.
-
-    Raises:
-        ValueError: An option is unknown.
-    """
-    unknown = set(options or {}) - {"keyframe"}
-    if unknown:
-        raise ValueError(f"unknown reset options {', '.join(map(str, unknown))}; the only option is 'keyframe'")
-    return None if options is None else options.get("keyframe")

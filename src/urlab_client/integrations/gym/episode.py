@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import fnmatch
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -18,7 +16,8 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._episode_variation import variation_of
+from urlab_client.integrations._variation import WireVariation, server_variation
+from urlab_client.integrations.gym.settings import EpisodeSettings
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
     Field,
@@ -28,8 +27,7 @@ from urlab_client.integrations.gym.spaces import (
     camera_space,
     with_cameras,
 )
-from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
-from urlab_client.integrations.gym.wire_variation import WireVariation
+from urlab_client.integrations.gym.task import Start, States, TaskScene, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
@@ -39,37 +37,10 @@ from urlab_client.sync.client import URLabClient as BlockingClient
 from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
 
-def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return client options with the defaults of environments filled in.
-
-    Environments step physics themselves. A MuJoCo version other than the server's does not stop them; the client only
-    warns about it.
-    """
-    return {"step_mode": "direct", "mujoco_version_check": False, **options}
-
-
-def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
-    """Return the fields of an observation level, or the given field names.
-
-    Raises:
-        ValueError: The level is unknown.
-    """
-    if not isinstance(observations, str):
-        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
-    if observations not in LEVELS:
-        raise ValueError(
-            f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
-        )
-    return LEVELS[observations]
-
-
 class EnvEpisode:
     """One client that is reset and stepped as an environment.
 
     Attributes:
-        client: The client, discovered and in `direct` or `puppet` mode.
-        mapping: Its articulations as spaces.
-        observation_space: Space of the mapping, with `cameras` added if cameras are observed.
         frames: The last frame of each requested camera.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
@@ -80,27 +51,22 @@ class EnvEpisode:
         client: URLabClient,
         *,
         settings: EpisodeSettings,
-        rendered: Sequence[str],
-        task: Task | None = None,
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
     ) -> None:
-        """Set up the episodes of a client.
+        """Set up the episodes of a client, and the task unless it already is.
 
         Args:
-            client: The client.
+            client: The client, discovered and in `direct` or `puppet` mode.
             settings: Settings of the episodes.
-            rendered: Further cameras whose frames `frames` must hold.
-            task: Task that chooses the start and extends observations; set up here unless it already is.
             randomise: What varies from episode to episode. If None, the server's own declaration applies.
             earlier: Episodes of the earlier client that this client replaces.
 
         Raises:
-            URLabError: The client has no model or no articulation, the client is in live mode, or the server varies
-                its scene differently.
+            URLabError: The client cannot serve an environment, or its server varies the scene differently.
             UnsupportedRandomisation: The server varies nothing itself, and no op does.
             KeyError: A camera is unknown.
-            ValueError: An option is out of range.
+            ValueError: An option is out of range, or the scene has no camera to render.
         """
         model = client.model
         if model is None or not client.articulations:
@@ -116,54 +82,46 @@ class EnvEpisode:
         self.client = client
         self.frames: dict[str, Pixels] = {}
         self._model = model
-        fields = fields_of(settings.observations)
+        self._settings = settings
         self.mapping: SpaceMapping = SpaceMapping(
-            model, compiled_prefixes(client), fields, settings.space_mode, settings.articulations
+            model, compiled_prefixes(client), settings.fields, settings.space_mode, settings.articulations
         )
-        cameras = settings.cameras
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
-        minimal = set(fields) <= set(LEVELS["minimal"])
-        self._observed_cameras = tuple(cameras)
+        minimal = set(settings.fields) <= set(LEVELS["minimal"])
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
-        self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
-        images = {name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in cameras}
+        self._rendered = rendered_camera(client, settings)
+        self._cameras = {
+            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self._rendered))
+        }
+        images = {
+            name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
+        }
         self.observation_space: Space = with_cameras(self.mapping, images)
-        self._n_substeps = settings.n_substeps
-        self._noise = settings.reset_noise
-        self._keyframe = settings.keyframe
-        self._task = task
         self._goal: dict[str, Floats] = {}
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
-        self._variation = variation_of(client, model, layouts)
+        self._variation = server_variation(client, model, layouts)
         self.over_wire: WireVariation | None = None
         if self._variation is None and self.randomise is not None and self.randomise.vary:
             before = None if earlier is None else earlier.over_wire
             self.over_wire = WireVariation(client, model, layouts, self.randomise, before)
             self._variation = self.over_wire.variation
-        latencies = () if self.randomise is None else self.randomise.camera
-        self._latencies = {
-            name: late for late in latencies for name in self._cameras if fnmatch.fnmatchcase(name, late.camera)
-        }
+        self._latencies = {} if self.randomise is None else self.randomise.latencies(self._cameras)
         self._draws: EpisodeDraws | None = None
         for push in () if self.randomise is None else self.randomise.push:
             self._pushed(push.body)
-        if task is not None:
-            if not hasattr(task, "scene"):
-                task.setup(TaskScene(model, self.mapping))
-            self.observation_space = with_task(self.observation_space, task)
+        if settings.task is not None:
+            if not hasattr(settings.task, "scene"):
+                settings.task.setup(TaskScene(model, self.mapping))
+            self.observation_space = with_task(self.observation_space, settings.task)
 
     def states(self) -> States:
-        """Return the current state in the form passed to tasks, with n = 1.
-
-        Raises:
-            URLabError: The environment has no task, or the client has no local data.
-        """
+        """Return the current state in the form passed to tasks, with n = 1."""
         data = self.client.data
-        if self._task is None or data is None:
+        if self._settings.task is None or data is None:
             raise URLabError("This environment has no task.")
         qpos, qvel = np.array(data.qpos)[None], np.array(data.qvel)[None]
-        return States(self._task.scene, qpos, qvel, np.array([data.time]), [self._goal])
+        return States(self._settings.task.scene, qpos, qvel, np.array([data.time]), [self._goal])
 
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""
@@ -174,13 +132,10 @@ class EnvEpisode:
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        Args:
-            rng: The environment's generator.
-            keyframe: Keyframe to start from instead of the one in the settings.
-            seed: Seed of what varies; None if nothing varies.
+        `keyframe` replaces the one in the settings. `seed` determines what varies; None if nothing varies.
         """
         client = self.client
-        keyframe = self._keyframe if keyframe is None else keyframe
+        keyframe = self._settings.keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
         if self._variation is not None and seed is not None:
@@ -189,12 +144,15 @@ class EnvEpisode:
                 await self.over_wire.apply(self._draws)
         await client.reset(keyframe, seed)
         placed = await self._start_over_wire()
-        overrides = self._noisy_positions(rng) if self._noise else None
-        if overrides and self.over_wire is None:
-            await client.reset(keyframe, seed, overrides)
-        elif overrides:  # another reset would undo the start
-            placed |= await self._place_joints(overrides)
-            overrides = None
+        overrides: dict[str, dict[str, float]] | None = None
+        if self._settings.reset_noise and client.data is not None:
+            qpos = np.array(client.data.qpos)
+            overrides = self._add_noise(rng, qpos)
+            if self.over_wire is None:
+                await client.reset(keyframe, seed, overrides)
+            else:  # another reset would undo the start
+                placed |= await self._place_changed(qpos)
+                overrides = None
         placed |= await self._start_task(rng)
         if self._cameras:
             await self._delay_cameras(seed)
@@ -207,46 +165,38 @@ class EnvEpisode:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 
-    async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
-        """Apply an action for `n_substeps` and return the observation after it.
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+        """Apply set-points for `n_substeps` and return the observation after them.
 
         Args:
-            action: The action.
-            forces: Forces applied during the action, by body, N, world frame, shape (3,).
-
-        Raises:
-            ValueError: The action has the wrong shape or is not finite. Nothing was sent.
+            set_points: Set-points of each articulation, shape (n_ctrl,).
+            forces: Forces on bodies meanwhile, N, world frame, shape (3,).
         """
-        return await self.act(self.mapping.set_points(action), forces)
-
-    async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
-        """Step like `step`, given the set-points of each articulation, shape (n_ctrl,)."""
         for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)
             articulation.apply_xfrc(name, force=force.tolist())
         cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
-        reply = await self.client.step(self._n_substeps, include_cameras=cameras or False, observations=self._level)
+        reply = await self.client.step(
+            self._settings.n_substeps, include_cameras=cameras or False, observations=self._level
+        )
         self._take_frames()
         return self._observe(reply)
 
-    def _noisy_positions(self, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-        """Return the current joint positions with noise added."""
-        positions: dict[str, dict[str, float]] = {}
+    def _add_noise(self, rng: np.random.Generator, qpos: Floats) -> dict[str, dict[str, float]]:
+        """Add noise to the positions of joints in place; return the new positions by articulation."""
+        noisy: dict[str, dict[str, float]] = {}
         for key in self.mapping.keys:
-            articulation = self.client.articulations[key]
-            names = self.mapping.joint_names(key, self._model)
-            joints = self.mapping.layout(key).joints
-            ids = np.array([joints[name] for name in names], dtype=np.intp)
-            present = articulation.get_qpos()
-            drawn = self._noise.drawn(rng, self._model, ids, np.array([present[name] for name in names]))
-            positions[key] = dict(zip(names, drawn.tolist(), strict=True))
-        return positions
+            joints = self.mapping.scalar_joints(key, self._model)
+            self._settings.reset_noise.add(rng, self._model, joints, qpos)
+            positions = qpos[self._model.jnt_qposadr[joints]].tolist()
+            noisy[key] = dict(zip(self.mapping.joint_names(key, self._model), positions, strict=True))
+        return noisy
 
     async def _start_task(self, rng: np.random.Generator) -> dict[str, Floats]:
         """Let the task choose the start; return the positions of each articulation that it moved."""
-        task, data = self._task, self.client.data
+        task, data = self._settings.task, self.client.data
         if task is None or data is None:
             return {}
         start = Start(task.scene, np.array(data.qpos))
@@ -260,19 +210,7 @@ class EnvEpisode:
         if self.over_wire is None or self._draws is None or data is None:
             return {}
         qpos = np.array(data.qpos)
-        self.over_wire.start(self._draws, qpos)
-        return await self._place_changed(qpos)
-
-    async def _place_joints(self, positions: Mapping[str, Mapping[str, float]]) -> dict[str, Floats]:
-        """Set the positions of hinge and slide joints; return the positions of each articulation that moved."""
-        data = self.client.data
-        if data is None:
-            return {}
-        qpos = np.array(data.qpos)
-        for key, by_name in positions.items():
-            joints = self.mapping.layout(key).joints
-            for name, position in by_name.items():
-                qpos[self._model.jnt_qposadr[joints[name]]] = position
+        self.over_wire.variation.start(self._draws, qpos)
         return await self._place_changed(qpos)
 
     async def _place_changed(self, qpos: Floats) -> dict[str, Floats]:
@@ -294,11 +232,7 @@ class EnvEpisode:
             await runtime.forward()
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
-        """Return the articulation of a body, and the body's name in it.
-
-        Raises:
-            KeyError: The scene has no such body.
-        """
+        """Return the articulation of a body, and the body's name in it."""
         key, _, name = body.partition("/")
         articulation = self.client.articulations[key]
         articulation.bodies[name]
@@ -358,18 +292,19 @@ class EnvEpisode:
             return np.array([n for name in self._sensors[key] for n in value[name]]) if field == "sensors" else value
 
         observation = self.mapping.observe(read)
-        if self._task is not None:
-            observation = add_observed(observation, self._task, self._task.observe(self.states())[0])
-        if self._observed_cameras:
+        task, cameras = self._settings.task, self._settings.cameras
+        if task is not None:
+            observation = add_observed(observation, task, task.observe(self.states())[0])
+        if cameras:
             observation["cameras"] = {
-                name: observed_pixels(self.frames[name], self._cameras[name].mode) for name in self._observed_cameras
+                name: observed_pixels(self.frames[name], self._cameras[name].mode) for name in cameras
             }
         return observation
 
-    def rendered(self, name: str) -> NDArray[np.uint8] | None:
-        """Return the last picture of a camera for `render`, shape (H, W, 3), RGB; None if there is none yet."""
-        frame = self.frames.get(name)
-        return None if frame is None else to_rgb(frame, self._cameras[name].mode)
+    def rendered(self) -> NDArray[np.uint8] | None:
+        """Return the last picture for `render`, shape (H, W, 3), RGB; None if there is none yet."""
+        frame = self.frames.get(self._rendered or "")
+        return None if frame is None or self._rendered is None else to_rgb(frame, self._cameras[self._rendered].mode)
 
     def _read(self, key: str, field: Field) -> Floats:
         articulation = self.client.articulations[key]
@@ -389,11 +324,7 @@ class EnvEpisode:
 
 
 def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisation | None) -> Randomisation | None:
-    """Return what varies: the given declaration, or the server's own.
-
-    Raises:
-        URLabError: The server has a different declaration of its own.
-    """
+    """Return what varies: the given declaration, or the server's own, which must not differ from it."""
     declared = declared_in(model)
     if randomise is None:
         return declared
@@ -411,23 +342,19 @@ def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:
-    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name.
-
-    Raises:
-        KeyError: The camera does not exist.
-    """
+    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name."""
     key, slash, camera = text("the name of a camera", name).partition("/")
     if slash:
         return client.articulations[key].cameras[camera]
     return client.global_cameras[name]
 
 
-def first_camera(client: URLabClient) -> str:
-    """Return the first colour camera.
-
-    Raises:
-        ValueError: The scene has no colour camera.
-    """
+def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
+    """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
+    if settings.render_mode is None:
+        return None
+    if settings.render_camera:
+        return settings.render_camera
     for key, articulation in client.articulations.items():
         for name, view in articulation.cameras.items():
             if view.mode == CameraMode.REAL:

@@ -24,18 +24,22 @@ from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.episode import client_camera
 from urlab_client.integrations.gym.spaces import Space, camera_space
 from urlab_client.protocol.base import Floats
-from urlab_client.simulation.appearance import Appearance
-from urlab_client.simulation.cameras import SceneCamera
+from urlab_client.protocol.messages.cameras import CameraDelayInForce
+from urlab_client.randomise.declaration import CameraLatency
+from urlab_client.simulation.appearance import Appearance, Tints
+from urlab_client.simulation.cameras import Instant, Latency, SceneCamera
 from urlab_client.simulation.drawing import Stage
 from urlab_client.simulation.opengl import Backend, need_backend
-from urlab_client.simulation.tints import Tints
 from urlab_client.values.names import cleaned_name
-from urlab_client.values.pictures import Pixels, decode_camera
+from urlab_client.values.pictures import Pixels, decode_camera, observed_pixels
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""
 
 _JOIN_S: Final = 1.0
+
+_UNSEEN: Final = 0
+"""Snapshot number; unused here."""
 
 VISIBLE: Final = ("qpos", "mocap_pos", "mocap_quat")
 """Fields of the state that pictures depend on, in MuJoCo's order."""
@@ -76,17 +80,7 @@ class PictureScene:
 
     @classmethod
     def of(cls, client: URLabClient, model: mujoco.MjModel, cameras: Sequence[str]) -> PictureScene:
-        """Return the scene of a client.
-
-        Args:
-            client: A client after `discover()`.
-            model: The client's model.
-            cameras: The cameras, as `ARTICULATION/CAMERA` or as the name of a scene-level camera.
-
-        Raises:
-            KeyError: A camera does not exist.
-            URLabError: The compiled scene lacks a camera that the server lists.
-        """
+        """Return the scene of a client, with cameras by `ARTICULATION/CAMERA` or the name of a scene-level one."""
         owners = {
             body.id: articulation.compiled_prefix
             for articulation in client.articulations.values()
@@ -104,34 +98,62 @@ class PictureScene:
 
 
 class BatchPictures:
-    """Draws camera pictures of given states of a scene, with the same code, and so the same pixels, as its server.
+    """The cameras of a batch. Draws given states with the same code, and so the same pixels, as their server.
 
     An OpenGL context belongs to one thread, so this object draws in a dedicated thread; its methods may be called from
     any thread. More threads would not speed up software rendering, which already uses all processors.
-
-    Args:
-        scene: The scene.
-
-    Raises:
-        RenderingUnavailable: This machine cannot draw.
     """
 
-    def __init__(self, scene: PictureScene) -> None:
-        self._thread = _Thread(scene, need_backend())
-        finalizer = weakref.finalize(self, self._thread.stop)
-        finalizer.atexit = False  # the thread registers its own exit hook, which must run before the driver's
+    def __init__(self, scene: PictureScene, observed: Sequence[str], latencies: Mapping[str, CameraLatency]) -> None:
+        """Look up the cameras that `observe` shows, some of which have a latency.
+
+        Raises:
+            RenderingUnavailable: There are such cameras, and this machine cannot draw.
+        """
+        self._scene = scene
+        self._observed = observed
+        self.delays: dict[str, CameraDelayInForce] = {
+            name: CameraDelayInForce(
+                delay_s=late.delay_s, jitter_s=late.jitter_s, clock="sim", on_state_change=True, max_fps=0.0
+            )
+            for name, late in latencies.items()
+        }
+        self._latencies: dict[tuple[str, int], Latency] = {}
+        self._shown: dict[tuple[str, int], Floats] = {}
+        self._thread: _Thread | None = None
+        if observed:
+            self._drawing()
+
+    def begin(self, i: int, seed: int, visible: Visible) -> None:
+        """Begin an episode of copy `i`. Delayed cameras show its start without delay; `seed` is that of the jitter."""
+        for name, delay in self.delays.items():
+            self._latencies[name, i] = Latency(delay, seed)
+            self._shown[name, i] = visible.state
+
+    def observe(self, indices: Sequence[int], times: Sequence[float], copies: Sequence[Visible]) -> dict[str, Any]:
+        """Return the camera observations of some copies after an action, by camera, at these simulation times."""
+        drawn = self.draw([name for name in self._observed if name not in self.delays], copies)
+        for name in self.delays:
+            shown = [
+                Visible(self._revealed(name, i, time, visible), visible.look)
+                for i, time, visible in zip(indices, times, copies, strict=True)
+            ]
+            drawn |= self.draw([name], shown)
+        return {
+            name: np.stack([observed_pixels(frame, self._scene.mode(name)) for frame in drawn[name]])
+            for name in self._observed
+        }
 
     def draw(self, cameras: Sequence[str], copies: Sequence[Visible]) -> dict[str, list[Pixels]]:
         """Return the pictures of some copies by camera, in the format of `URLabCameraView.latest_frame`.
 
-        Args:
-            cameras: Names in `PictureScene.cameras`.
-            copies: State and appearance of each copy.
-
         Raises:
+            RenderingUnavailable: This machine cannot draw.
             TimeoutError: A picture took too long.
         """
-        drawn = [self._thread.submit(cameras, visible) for visible in copies]
+        if not cameras:
+            return {}
+        drawn = [self._drawing().submit(cameras, visible) for visible in copies]
         try:
             pictures = [picture.result(_DEADLINE_S) for picture in drawn]
         except TimeoutError:
@@ -142,8 +164,29 @@ class BatchPictures:
         return {name: [of[number] for of in pictures] for number, name in enumerate(cameras)}
 
     def close(self) -> None:
-        """Free the context. Safe to call twice."""
-        self._thread.close()
+        """Free the context, until something is drawn again."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.close()
+
+    def _drawing(self) -> _Thread:
+        if self._thread is None:
+            self._thread = _Thread(self._scene, need_backend())
+            finalizer = weakref.finalize(self, self._thread.stop)
+            finalizer.atexit = False  # the thread registers its own exit hook, which must run before the driver's
+        return self._thread
+
+    def _revealed(self, name: str, i: int, time: float, visible: Visible) -> Floats:
+        """Record the state of a copy for a delayed camera, and return the state that the camera shows now."""
+        latency, now = self._latencies[name, i], Instant(time, 0.0)
+        if not latency.withholds:
+            return visible.state
+        if not latency.skips(now):
+            latency.see(_UNSEEN, now, 0.0, visible.state)
+        seen = latency.revealed(now)
+        if seen is not None:
+            self._shown[name, i] = seen.state
+        return self._shown[name, i]
 
 
 class _Thread:
@@ -227,12 +270,7 @@ class _Painter:
 
 
 def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamera:
-    """Return a camera as the server draws it.
-
-    Raises:
-        KeyError: The camera does not exist.
-        URLabError: The compiled scene lacks the camera.
-    """
+    """Return a camera as the server draws it."""
     view = client_camera(client, name)
     key, slash, _ = name.partition("/")
     prefix = f"{client.articulations[key].compiled_prefix}_" if slash else ""

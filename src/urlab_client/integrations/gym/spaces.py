@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.enums import CameraMode
@@ -36,6 +37,17 @@ class _Articulation:
     low: Floats
     high: Floats
     widths: Mapping[Field, int]
+
+
+def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
+    """Return the fields of an observation level, or the given field names."""
+    if not isinstance(observations, str):
+        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
+    if observations not in LEVELS:
+        raise ValueError(
+            f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
+        )
+    return LEVELS[observations]
 
 
 class SpaceMapping:
@@ -110,6 +122,11 @@ class SpaceMapping:
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
         """Return the names of the hinge and slide joints of an articulation: joints with a scalar position."""
         return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
+
+    def scalar_joints(self, key: str, model: mujoco.MjModel) -> NDArray[np.intp]:
+        """Return the ids of the joints in `joint_names`."""
+        joints = self._parts[key].layout.joints
+        return np.array([joints[name] for name in self.joint_names(key, model)], dtype=np.intp)
 
     def set_points(self, action: Any) -> dict[str, Floats]:
         """Return the set-points of each articulation, shape (…, n_ctrl), from an action.
@@ -210,17 +227,20 @@ def _unbounded(n: int) -> Space:
     return spaces.Box(-np.inf, np.inf, (n,), dtype=np.float64)
 
 
+def mapped(function: Callable[[NDArray[Any]], NDArray[Any]], tree: Any) -> Any:
+    """Return a tree of dictionaries with a function applied to its arrays."""
+    if isinstance(tree, Mapping):
+        return {key: mapped(function, entry) for key, entry in cast("Mapping[str, Any]", tree).items()}
+    return function(tree)
+
+
 def dict_space(entries: Mapping[str, Space]) -> Space:
     """Return a `Dict` of spaces, in the given order."""
     return spaces.Dict(dict(entries))
 
 
 def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
-    """Return a mapping's observation space with an entry `cameras` that holds the pictures by camera.
-
-    Raises:
-        ValueError: The space is flat, or an articulation is named `cameras`.
-    """
+    """Return a mapping's observation space with an entry `cameras` that holds the pictures by camera."""
     if not cameras:
         return mapping.observation_space
     if mapping.mode != "dict":
@@ -232,12 +252,7 @@ def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
 
 
 def camera_space(mode: CameraMode | str, resolution: tuple[int, int]) -> Space:
-    """Return the space of `observed_pixels`: depth in metres, RGB as in `render`, or BGRA of segmentations.
-
-    Args:
-        mode: Meaning of the pixels.
-        resolution: Width and height, pixels.
-    """
+    """Return the space of `observed_pixels`: depth in metres, RGB as in `render`, or BGRA of segmentations."""
     width, height = resolution
     if mode == CameraMode.DEPTH:
         return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)

@@ -5,21 +5,55 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, cast
+from numbers import Real
+from typing import Any, ClassVar, cast
 
 import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client.aio.arguments import collection, integer, require, text
+from urlab_client.aio.arguments import require
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
-from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 from urlab_client.values.names import unknown_name
 
 Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class ResetNoise:
+    """Largest deviation of joints at a reset. A joint with a range stays within it.
+
+    Attributes:
+        hinge: Largest deviation of hinge joints, radians.
+        slide: Largest deviation of slide joints, metres.
+    """
+
+    hinge: float = 0.0
+    slide: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("hinge", self.hinge), ("slide", self.slide)):
+            require("reset_noise", value, Real, "a ResetNoise or a number")
+            if not 0 <= value < np.inf:
+                raise ValueError(f"reset_noise must be 0 or more, not {value} for {name} joints")
+
+    def __bool__(self) -> bool:
+        return self.hinge > 0 or self.slide > 0
+
+    def add(self, rng: np.random.Generator, model: mujoco.MjModel, joints: NDArray[np.intp], qpos: Floats) -> None:
+        """Add random noise in place to the positions of hinge and slide joints, given their ids; shape (nq,)."""
+        address = model.jnt_qposadr[joints]
+        positions: Floats = qpos[address]
+        scale = np.where(model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE, self.slide, self.hinge)
+        limited = model.jnt_limited[joints].astype(bool)
+        lower, upper = model.jnt_range[joints].T
+        # A joint that is already outside its range, for example after a keyframe, must not move further out.
+        low = np.where(limited, np.clip(positions - scale, np.minimum(lower, positions), None), positions - scale)
+        high = np.where(limited, np.clip(positions + scale, None, np.maximum(upper, positions)), positions + scale)
+        qpos[address] = rng.uniform(low, high)
 
 
 class TaskScene:
@@ -104,11 +138,8 @@ class Start:
 
     def noise(self, rng: np.random.Generator, key: str, noise: ResetNoise) -> None:
         """Add random noise to the hinge and slide joints of an articulation, within their ranges."""
-        model, mapping = self.scene.model, self.scene.mapping
-        joints = mapping.layout(key).joints
-        ids = np.array([joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
-        address = model.jnt_qposadr[ids]
-        self.qpos[address] = noise.drawn(rng, model, ids, self.qpos[address])
+        model = self.scene.model
+        noise.add(rng, model, self.scene.mapping.scalar_joints(key, model), self.qpos)
 
 
 class States:
@@ -199,11 +230,7 @@ class States:
 
 
 def joined(parts: Sequence[States | None]) -> States:
-    """Return the states of several environments as one. A missing state (None) repeats the first known one.
-
-    Raises:
-        ValueError: All states are missing.
-    """
+    """Return the states of several environments as one. A missing state (None) repeats the first known one."""
     known = next((part for part in parts if part is not None), None)
     if known is None:
         raise ValueError("no environment has a state")
@@ -228,11 +255,7 @@ def with_task(space: Space, task: Task | None) -> Space:
 
 
 def add_observed(observation: Observation, task: Task, observed: Floats) -> Observation:
-    """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes.
-
-    Raises:
-        ValueError: `observed` has the wrong shape.
-    """
+    """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes."""
     if observed.shape[-1:] != (task.n_observed,):
         raise ValueError(
             f"{type(task).__name__}.observe() returned {observed.shape[-1]} numbers; n_observed is {task.n_observed}"
@@ -242,86 +265,6 @@ def add_observed(observation: Observation, task: Task, observed: Floats) -> Obse
     if isinstance(observation, dict):
         return {**cast("dict[str, Observation]", observation), "task": observed}
     return np.concatenate([observation, observed], axis=-1)
-
-
-def check_alone(task: Task | None, **others: object) -> None:
-    """Reject reward and termination functions beside a task, which replaces them.
-
-    Raises:
-        ValueError: A task and one of the functions are both given.
-    """
-    given = [name for name, value in others.items() if value]
-    if task is not None and given:
-        raise ValueError(f"{', '.join(given)} cannot be given together with a task: override the task's method instead")
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeSettings:
-    """Settings of episodes: the arguments of an environment, else the values of its task, else the defaults.
-
-    Attributes:
-        observations: Observed fields, or an observation level.
-        n_substeps: Physics steps per action.
-        max_episode_steps: Actions per episode, or None for no limit.
-        keyframe: Keyframe in which episodes start, or None for the initial state.
-        reset_noise: Largest deviation of joints from the start.
-        space_mode: `flat` or `dict`.
-        cameras: Cameras whose pictures are observed.
-        articulations: Articulations that are observed, or None for all.
-    """
-
-    observations: str | Sequence[str]
-    n_substeps: int
-    max_episode_steps: int | None
-    keyframe: str | None
-    reset_noise: ResetNoise
-    space_mode: SpaceMode
-    cameras: Sequence[str]
-    articulations: Sequence[str] | None
-
-    @classmethod
-    def of(
-        cls,
-        task: Task | None,
-        *,
-        observations: str | Sequence[str] | None,
-        n_substeps: int | None,
-        max_episode_steps: int | None,
-        keyframe: str | None,
-        reset_noise: float | ResetNoise | None,
-        space_mode: SpaceMode | None,
-        cameras: Sequence[str] | None = None,
-    ) -> EpisodeSettings:
-        """Return the effective settings. None selects the value of the task, or the default without a task.
-
-        Raises:
-            TypeError: An argument has a wrong type.
-            ValueError: A number is below 1, or the noise is negative.
-        """
-        if task is not None:
-            require("task", task, Task, "a Task")
-        if not isinstance(observations, str | None):
-            collection("observations", observations)
-        defaults = _NO_TASK if task is None else task
-        most = defaults.max_episode_steps if max_episode_steps is None else max_episode_steps
-        settings = cls(
-            observations=defaults.observations if observations is None else observations,
-            n_substeps=integer("n_substeps", defaults.n_substeps if n_substeps is None else n_substeps),
-            max_episode_steps=None if most is None else integer("max_episode_steps", most),
-            keyframe=defaults.keyframe if keyframe is None else text("keyframe", keyframe),
-            reset_noise=noise_of(defaults.reset_noise if reset_noise is None else reset_noise),
-            space_mode=defaults.space_mode if space_mode is None else space_mode,
-            cameras=tuple(collection("cameras", defaults.cameras if cameras is None else cameras)),
-            articulations=defaults.articulations,
-        )
-        if settings.n_substeps < 1:
-            raise ValueError(f"n_substeps must be at least 1, not {settings.n_substeps}")
-        if settings.max_episode_steps is not None and settings.max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1 or None, not {settings.max_episode_steps}")
-        return settings
-
-
-_NO_TASK: Final = EpisodeSettings("standard", 1, None, None, ResetNoise(), "flat", (), None)
 
 
 class Task:

@@ -5,44 +5,32 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
 from urlab_client.errors import URLabError, refused_for_good
-from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
+from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
-from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone, joined
-from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
+from urlab_client.integrations.gym.task import ResetNoise, States, Task, joined
+from urlab_client.integrations.gym.vectorized import Indices, Vectorized, put
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
-
-T = TypeVar("T")
 
 
 def _processors() -> int:
     """Return how many servers may start at the same time: each occupies a processor until it is up."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@dataclass(frozen=True)
-class _Rendered:
-    """Request to draw pictures of a camera; None selects the first colour camera."""
-
-    camera: str | None
 
 
 class _Session:
@@ -53,17 +41,16 @@ class _Session:
         address: str,
         starts: asyncio.Semaphore,
         client_options: Mapping[str, Any],
-        episode_options: Mapping[str, Any],
-        rendered: _Rendered | None,
+        settings: EpisodeSettings,
+        randomise: Randomisation | None,
     ) -> None:
         self.address = address
         self.restarts = -1
-        self.shown: tuple[str, ...] = ()
         self.episode: EnvEpisode | None = None
         self._starts = starts
         self._client_options = client_options
-        self._episode_options = episode_options
-        self._rendered = rendered
+        self._settings = settings
+        self._randomise = randomise
         self._opening: asyncio.Task[None] | None = None
         self._earlier: EnvEpisode | None = None
 
@@ -80,7 +67,7 @@ class _Session:
         """Apply set-points and forces for one action."""
         if self.episode is None:
             raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
-        return await self.episode.act(set_points, forces)
+        return await self.episode.step(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
@@ -104,11 +91,9 @@ class _Session:
             client = URLabClient(with_model_options(self.address), **self._client_options)
             try:
                 await client.discover()
-                wanted = self._rendered
-                shown = () if wanted is None else (wanted.camera or first_camera(client),)
-                options = self._episode_options
-                self.episode = self._earlier = EnvEpisode(client, rendered=shown, earlier=self._earlier, **options)
-                self.shown = shown
+                self.episode = self._earlier = EnvEpisode(
+                    client, settings=self._settings, randomise=self._randomise, earlier=self._earlier
+                )
             except BaseException:
                 await client.close()
                 raise
@@ -202,34 +187,30 @@ class URLabVectorEnv(Vectorized):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
-        check_render_mode(render_mode)
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
         settings = EpisodeSettings.of(
             task,
             observations=observations,
+            reward_fn=reward_fn,
+            termination_fn=termination_fn,
             n_substeps=n_substeps,
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
             space_mode=space_mode,
             cameras=cameras,
+            render_mode=render_mode,
+            render_camera=render_camera,
         )
         declared = None if randomise is None else Randomisation.of(randomise)
         if declared is not None:
             text = declared.to_json()
             addresses = [with_option(a, "randomise", text) if a.startswith(SCHEME) else a for a in addresses]
-        episode_options = {
-            "settings": settings,
-            "task": task,
-            "randomise": declared,
-        }
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
         client_options = client_defaults(client_options)
-        rendered = None if render_mode is None else _Rendered(render_camera)
         starts = asyncio.Semaphore(_processors())
         self._sessions = [
-            _Session(with_start_timeout(address, start_timeout), starts, client_options, episode_options, rendered)
+            _Session(with_start_timeout(address, start_timeout), starts, client_options, settings, declared)
             for address in addresses
         ]
         self._portal = Portal()
@@ -240,16 +221,12 @@ class URLabVectorEnv(Vectorized):
             raise
         super().__init__(
             num_envs=len(addresses),
+            settings=settings,
             mapping=first.mapping,
             observation_space=first.observation_space,
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
-            task=task,
             randomise=first.randomise,
         )
-        self.render_mode = render_mode
         self._seen: dict[int, States] = {}
         self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._sim_time = np.zeros(self.num_envs)
@@ -266,8 +243,7 @@ class URLabVectorEnv(Vectorized):
         if self.render_mode is None:
             return None
         for i, session in enumerate(self._sessions):
-            episode = session.episode
-            if episode is not None and session.shown and (picture := episode.rendered(session.shown[0])) is not None:
+            if session.episode is not None and (picture := session.episode.rendered()) is not None:
                 self._pictures[i] = picture
         if not self._pictures:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
@@ -293,33 +269,29 @@ class URLabVectorEnv(Vectorized):
     async def _close_all(self) -> None:
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
-        calls = {
-            i: partial(self._sessions[i].reset, self._rngs[i], keyframe, self._episode_seed(i))
-            for i in map(int, indices)
-        }
-        return self._found(self._portal.call(self._all, calls))
-
-    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
-        sessions = self._sessions
-        resets = {
-            i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i)) for i in map(int, fresh)
-        }
+    def _advance(
+        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+    ) -> Mapping[int, Exception]:
+        calls: dict[int, Callable[[], Coroutine[Any, Any, Observation]]] = {}
+        for i in map(int, fresh):
+            seed = self._disturbances[i].seed if self._disturbances else None
+            calls[i] = partial(self._sessions[i].reset, self._rngs[i], keyframe, seed)
         forces = self._forces(acting)
-        steps = {
-            i: partial(sessions[i].step, {key: of[i] for key, of in set_points.items()}, forces.get(i, {}))
-            for i in map(int, acting)
-        }
-        results = self._portal.call(self._all, {**resets, **steps})
-        return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
+        for i in map(int, acting):
+            own = {key: values[i] for key, values in set_points.items()}
+            calls[i] = partial(self._sessions[i].step, own, forces.get(i, {}))
+        errors: dict[int, Exception] = {}
+        for i, result in self._portal.call(self._all, calls).items():
+            if isinstance(result, Exception):
+                errors[i] = result
+            else:
+                put(self._observations, i, result)
+        return errors
 
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return the values drawn for the episode of an environment; see `URLabEnv.draws`."""
         episode = self._sessions[index].episode
         return None if episode is None else episode.draws()
-
-    def _episode_seed(self, index: int) -> int | None:
-        return self._disturbances[index].seed if self._disturbances else None
 
     def _states(self, indices: Indices) -> States:
         for i in map(int, indices):
@@ -336,20 +308,10 @@ class URLabVectorEnv(Vectorized):
         restarts = np.array([session.restarts for session in self._sessions], dtype=np.int64)
         return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
 
-    def _found(self, results: Mapping[int, Observation | Exception]) -> Found:
-        if not results:
-            return None, {}
-        errors = {i: result for i, result in results.items() if isinstance(result, Exception)}
-        single = self.single_observation_space
-        rows = [
-            _row(single, self._observations, i) if isinstance(result, Exception) else result
-            for i, result in results.items()
-        ]
-        return concatenate(single, rows, create_empty_array(single, len(rows))), errors
-
-    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, T]]]) -> dict[int, T | Exception]:
+    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, Observation]]]) -> dict[int, Any]:
+        """Return the observation or the failure of each environment; begin to replace those that were lost."""
         tasks = {i: asyncio.create_task(call()) for i, call in calls.items()}
-        late: set[asyncio.Task[T]] = set()
+        late: set[asyncio.Task[Observation]] = set()
         try:
             # One deadline for all: a deadline per environment would cost a tenth of the client's work.
             await asyncio.wait(tasks.values(), timeout=self._step_timeout)
@@ -360,7 +322,7 @@ class URLabVectorEnv(Vectorized):
                     task.cancel()
             if late:
                 await asyncio.wait(late)
-        results: dict[int, T | Exception] = {}
+        results: dict[int, Any] = {}
         for i, task in tasks.items():
             if task in late and task.cancelled():
                 what = "did not answer" if self._sessions[i].episode else "is still starting"
@@ -375,7 +337,3 @@ class URLabVectorEnv(Vectorized):
             if isinstance(result, Exception) and not refused_for_good(result):
                 self._sessions[i].reopen()
         return results
-
-
-def _row(space: Any, observations: Observation, index: int) -> Observation:
-    return next(row for i, row in enumerate(iterate(space, observations)) if i == index)

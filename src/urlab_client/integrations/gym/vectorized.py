@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, cast
 
 import gymnasium
@@ -14,16 +15,15 @@ from numpy.typing import NDArray
 
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
-from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
-from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
+from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
+from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
 from urlab_client.integrations.gym.task import States, Task
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Found = tuple[Observation, Mapping[int, Exception]]
-"""Batched observations of some environments, and the failures by index."""
+_NONE = np.zeros(0, dtype=np.intp)
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
@@ -55,23 +55,24 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self,
         *,
         num_envs: int,
+        settings: EpisodeSettings,
         mapping: SpaceMapping,
         observation_space: Space,
-        reward_fn: RewardFn | None,
-        termination_fn: TerminationFn | None,
-        max_episode_steps: int | None,
         autoreset_mode: AutoresetMode,
-        task: Task | None,
         randomise: Randomisation | None,
     ) -> None:
         self.mapping = mapping
         self.randomise = randomise
-        n_task = 0 if task is None else task.n_observed
+        self.task: Task | None = settings.task
+        self.reward_fn: RewardFn | None = settings.reward_fn
+        self.termination_fn: TerminationFn | None = settings.termination_fn
+        self.render_mode = settings.render_mode
+        self._settings = settings
+        n_task = 0 if self.task is None else self.task.n_observed
         self._disturbances: list[Disturbances] = []
         if randomise is not None:
             self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
         self._observations_disturbed = randomise is not None and randomise.disturbs_observations
-        self.task = task
         self.num_envs = num_envs
         self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
@@ -79,9 +80,6 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.single_action_space = mapping.action_space
         self.observation_space = batch_space(observation_space, num_envs)
         self.action_space = batch_space(mapping.action_space, num_envs)
-        self.reward_fn = reward_fn
-        self.termination_fn = termination_fn
-        self._max_episode_steps = max_episode_steps
         self._observations: Observation = create_empty_array(observation_space, num_envs)
         self._sensed: Observation = None
         if self._observations_disturbed:
@@ -93,12 +91,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
 
     @abstractmethod
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
-        """Reset some environments."""
+    def _advance(
+        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+    ) -> Mapping[int, Exception]:
+        """Reset some environments and step others, given the set-points of all; return the failures by index.
 
-    @abstractmethod
-    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
-        """Reset some environments to `_keyframe` and step others, given the set-points of all."""
+        `put` the observations of the others into `_observations`.
+        """
 
     @abstractmethod
     def _states(self, indices: Indices) -> States:
@@ -138,7 +137,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
                 self._rngs[i] = np.random.default_rng(seeds[i])
-        errors = self._start(np.flatnonzero(mask), keyframe)
+        errors = self._move(np.flatnonzero(mask), keyframe)
         self._started = True
         refusal = next(filter(refused_for_good, errors.values()), None)
         if refusal is not None:
@@ -165,26 +164,18 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
         fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
         before = None if self.reward_fn is None else self._true_observations()
-        self._begin(fresh)
         delayed = self._delayed(acting, actions)
         if delayed is not actions:
             set_points = self._set_points(delayed)
-        started, moved = self._reset_and_step(fresh, acting, set_points)
-        if len(fresh):
-            self._store_reset(fresh, started)
-        if len(acting):
-            _put(self._observations, acting, moved[0])
-            self._see(acting)
-        errors = {**started[1], **moved[1]}
-        self._elapsed[acting] += 1
+        errors = self._move(fresh, self._keyframe, acting, set_points)
         infos = self._infos(errors)
         stepped = np.zeros(self.num_envs, dtype=bool)
         stepped[acting] = True
         stepped[list(errors)] = False
         rewards, terminated = self._judge(before, actions, stepped, infos)
         truncated = np.zeros(self.num_envs, dtype=bool)
-        if self._max_episode_steps is not None:
-            truncated[acting] = self._elapsed[acting] >= self._max_episode_steps
+        if self.max_episode_steps is not None:
+            truncated[acting] = self._elapsed[acting] >= self.max_episode_steps
         truncated[list(errors)] = True
         self._ended = terminated | truncated
         if self.task is not None:
@@ -198,7 +189,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     @property
     def max_episode_steps(self) -> int | None:
         """Actions after which an episode is truncated, or None."""
-        return self._max_episode_steps
+        return self._settings.max_episode_steps
 
     def episode_seeds(self) -> NDArray[np.int64]:
         """Return the seed of each environment's episode, from which all variation follows; -1 if nothing varies."""
@@ -206,19 +197,24 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         found[: len(self._disturbances)] = [disturbances.seed for disturbances in self._disturbances]
         return found
 
-    def _start(self, indices: Indices, keyframe: str | None) -> Mapping[int, Exception]:
-        self._begin(indices)
-        found = self._reset_some(indices, keyframe)
-        self._store_reset(indices, found)
-        return found[1]
-
-    def _store_reset(self, indices: Indices, found: Found) -> None:
-        observations, errors = found
-        _put(self._observations, indices, observations)
-        self._see(indices)
-        self._elapsed[indices] = 0
-        self._ended[indices] = False
+    def _move(
+        self,
+        fresh: Indices,
+        keyframe: str | None,
+        acting: Indices = _NONE,
+        set_points: Mapping[str, Floats] = MappingProxyType({}),
+    ) -> Mapping[int, Exception]:
+        """Start episodes and continue others; return the failures by index."""
+        for i, disturbances in self._disturbed(fresh):
+            disturbances.begin(self._rngs[i])
+        errors = self._advance(fresh, keyframe, acting, set_points)
+        for i, disturbances in self._disturbed(np.concatenate([fresh, acting])) if self._observations_disturbed else ():
+            put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
+        self._elapsed[fresh] = 0
+        self._elapsed[acting] += 1
+        self._ended[fresh] = False
         self._ended[list(errors)] = True
+        return errors
 
     def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
         rewards = np.zeros(self.num_envs)
@@ -243,7 +239,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             final[i] = _pick(self._sensed if self._observations_disturbed else self._observations, int(i))
-        errors = self._start(np.flatnonzero(ended), self._keyframe)
+        errors = self._move(np.flatnonzero(ended), self._keyframe)
         after = self._infos({**_errors_in(infos), **errors})
         if "success" in infos:
             after["success"], after["_success"] = infos["success"].copy(), infos["_success"].copy()
@@ -287,27 +283,19 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _true_observations(self) -> Observation:
         """Return the true observations, from which rewards and terminations are computed."""
-        return _map(np.copy, self._observations)
+        return mapped(np.copy, self._observations)
 
     def _disturbed_observations(self) -> Observation:
         """Return the observations with all disturbances."""
-        return _map(np.copy, self._sensed if self._observations_disturbed else self._observations)
-
-    def _begin(self, indices: Indices) -> None:
-        for i, disturbances in self._disturbed(indices):
-            disturbances.begin(self._rngs[i])
-
-    def _see(self, indices: Indices) -> None:
-        for i, disturbances in self._disturbed(indices) if self._observations_disturbed else ():
-            _put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
+        return mapped(np.copy, self._sensed if self._observations_disturbed else self._observations)
 
     def _delayed(self, indices: Indices, actions: Any) -> Any:
         """Return the actions that take effect now; those of other environments are unchanged."""
         if self.randomise is None or not self.randomise.delays_actions:
             return actions
-        delayed = _map(np.array, actions)
+        delayed = mapped(np.array, actions)
         for i, disturbances in self._disturbed(indices):
-            _put(delayed, i, disturbances.delayed(_pick(delayed, i)))
+            put(delayed, i, disturbances.delayed(_pick(delayed, i)))
         return delayed
 
     def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
@@ -322,38 +310,19 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return [(i, self._disturbances[i]) for i in indices.tolist()] if self._disturbances else []
 
 
-def check_render_mode(render_mode: str | None) -> None:
-    """Check a render mode.
-
-    Raises:
-        ValueError: The mode is neither None nor `rgb_array`.
-    """
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-
-
 def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:
     return {int(i): infos["error"][i] for i in np.flatnonzero(infos["_error"])} if "error" in infos else {}
 
 
-def _map(function: Any, observations: Observation) -> Observation:
-    if isinstance(observations, dict):
-        entries = cast("dict[str, Observation]", observations)
-        return {key: _map(function, entry) for key, entry in entries.items()}
-    return function(observations)
-
-
-def _put(observations: Observation, indices: Indices | int, found: Observation) -> None:
+def put(observations: Observation, indices: Indices | int, found: Observation) -> None:
+    """Write observations of some environments into those of all."""
     if isinstance(observations, dict):
         entries = cast("dict[str, Observation]", observations)
         for key, entry in entries.items():
-            _put(entry, indices, found[key])
+            put(entry, indices, found[key])
     else:
         observations[indices] = found
 
 
 def _pick(observations: Observation, index: int) -> Observation:
-    def row(array: Floats) -> Floats:
-        return array[index].copy()
-
-    return _map(row, observations)
+    return mapped(lambda array: array[index].copy(), observations)

@@ -92,18 +92,6 @@ class RobotState(NamedTuple):
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-class Input(NamedTuple):
-    """Shape and type of one network input.
-
-    Attributes:
-        shape: Shape without the batch axis.
-        dtype: uint8 for colours; float32 for other pictures and numbers.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-
 class _Moment(NamedTuple):
     """The values that terms can read."""
 
@@ -234,10 +222,10 @@ class PolicyMapping:
         return inputs
 
     @property
-    def inputs(self) -> dict[str, Input]:
-        """Shape and type of the network inputs, by name, if the declaration names them."""
-        numbers = {
-            name: Input((len(columns) * self.spec.history,), np.dtype(np.float32))
+    def inputs(self) -> dict[str, NDArray[Any]]:
+        """Empty network inputs, by name, if the declaration names them: their shapes, without batch axis, and types."""
+        numbers: dict[str, NDArray[Any]] = {
+            name: np.empty(len(columns) * self.spec.history, dtype=np.float32)
             for name, columns in self._columns.items()
         }
         return numbers | {term.input: _picture(term) for term in self.spec.pictures}
@@ -373,11 +361,11 @@ class PolicyMapping:
         return PolicyMismatch(f"{self._source}: {where}: {problem}.")
 
 
-def _picture(term: PictureTerm) -> Input:
+def _picture(term: PictureTerm) -> NDArray[Any]:
     width, height = term.size
     if term.mode is CameraMode.DEPTH:
-        return Input((height, width), np.dtype(np.float32))
-    return Input((height, width, 3 if term.mode is CameraMode.REAL else 4), np.dtype(np.uint8))
+        return np.empty((height, width), dtype=np.float32)
+    return np.empty((height, width, 3 if term.mode is CameraMode.REAL else 4), dtype=np.uint8)
 
 
 def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:

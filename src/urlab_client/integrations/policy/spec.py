@@ -394,11 +394,7 @@ def _listed(value: Numbers) -> list[float]:
 
 
 def _check_numbers(name: str, value: Numbers, length: int | None = None) -> None:
-    """Check that numbers are present, finite, and either a single one or as many as expected.
-
-    Raises:
-        ValueError: A check fails.
-    """
+    """Check that numbers are present, finite, and either a single one or as many as expected."""
     if not value and isinstance(value, list):
         raise ValueError(f"{name} is empty")
     if not all(map(math.isfinite, _listed(value))):
@@ -408,11 +404,7 @@ def _check_numbers(name: str, value: Numbers, length: int | None = None) -> None
 
 
 def _check_clip(clip: tuple[float, float] | None) -> None:
-    """Check that the limits are in order.
-
-    Raises:
-        ValueError: The lower limit is not below the upper one.
-    """
+    """Check that the lower limit is below the upper one."""
     if clip is not None and not clip[0] < clip[1]:
         raise ValueError(f"clip must be [low, high] with low < high, not {list(clip)}")
 
@@ -473,11 +465,9 @@ def _advice(raw: dict[str, Any], problem: str, where: str) -> str | None:
         index = where.partition("[")[2].partition("]")[0]
         given: Any = raw["observation"][int(index)] if index.isdigit() else None
         term = _TERMS.get(str(cast("dict[str, Any]", given).get("term"))) if isinstance(given, dict) else None
-        return (
-            None
-            if term is None or "field" not in problem
-            else f"Its keys are term, {', '.join(term.__struct_fields__)}."
-        )
+        if term is None or "field" not in problem:
+            return None
+        return f"Its keys are term, {', '.join(term.__struct_fields__)}."
     if not where and any(key in problem for key in ("normal", "obs_rms", "vec_norm")):
         return (
             "Observations are normalised by the `offset` and `scale` of each term, clip((value - offset) * scale): the "

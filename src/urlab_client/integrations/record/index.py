@@ -20,7 +20,7 @@ import zlib
 from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 
@@ -113,9 +113,12 @@ class _Contents:
     positions: Positions
 
 
-@dataclass
 class RecordingIndex:
     """Contents of a file and their positions. Thread-safe.
+
+    Args:
+        path: The file.
+        progress: Called occasionally with the number of bytes read so far of a file without an index.
 
     Attributes:
         path: The file.
@@ -125,43 +128,32 @@ class RecordingIndex:
         metadata: By name.
     """
 
-    path: Path
-    complete: bool = False
-    damage: str = ""
-    channels: dict[int, IndexedChannel] = field(default_factory=dict[int, IndexedChannel])
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    _blocks: list[_Block] = field(default_factory=list[_Block])
-    _schemas: dict[int, str] = field(default_factory=dict[int, str])
-    _declared: int = 0
-    _kept: OrderedDict[int, _Contents] = field(default_factory=OrderedDict[int, _Contents])
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    @classmethod
-    def of(cls, path: Path, progress: Progress | None = None) -> RecordingIndex:
-        """Read the index of a file.
-
-        Args:
-            path: The file.
-            progress: Called occasionally with the number of bytes read so far of a file without an index.
-        """
+    def __init__(self, path: Path, progress: Progress | None = None) -> None:
+        self.path = path
+        self._kept: OrderedDict[int, _Contents] = OrderedDict()
+        self._lock = threading.Lock()
+        self._forget()
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: {UNKNOWN}")
-            index = cls(path, complete=True)
             try:
-                found = index._read_summary(file, size)
+                self.complete = self._read_summary(file, size)
             except (OSError, *_BROKEN):
-                found = False
-            if not found:
-                index = cls(path)
-                index._scan(file, size, progress)
-        first = np.array([block.first_ns for block in index._blocks], dtype=np.uint64)
-        index._earliest = np.minimum.accumulate(first[::-1])[::-1]  # of a block and all after it
-        return index
+                self.complete = False
+            if not self.complete:
+                self._forget()
+                self._scan(file, size, progress)
+        first = np.array([block.first_ns for block in self._blocks], dtype=np.uint64)
+        self._earliest = np.minimum.accumulate(first[::-1])[::-1]  # of a block and all after it
 
-    def __post_init__(self) -> None:
-        self._earliest: NDArray[np.uint64] = np.zeros(0, np.uint64)
+    def _forget(self) -> None:
+        self.damage = ""
+        self.channels: dict[int, IndexedChannel] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._blocks: list[_Block] = []
+        self._schemas: dict[int, str] = {}
+        self._declared = 0
 
     def channels_of(self, *schemas: str) -> list[IndexedChannel]:
         """Return the channels whose messages have one of these schemas, by topic."""
@@ -174,8 +166,7 @@ class RecordingIndex:
         with self.path.open("rb") as file:
             for block in self._blocks:
                 if channels is None or not block.channels.isdisjoint(channels):
-                    with self._locating_damage(block):
-                        positions = self._positions(file, block)
+                    positions = self._positions(file, block)
                     walked += 0 if block.index_size else sum(map(len, positions.values()))
                     if walked > _MOST_WALKED:
                         raise RecordingError(f"{self.path}: more than {_MOST_WALKED} messages are in no index.")
@@ -194,19 +185,13 @@ class RecordingIndex:
         topic, number = message.channel.topic, 1
         with self.path.open("rb") as file:
             for at, block in enumerate(self._blocks[: message.block + 1]):
-                with self._locating_damage(block):
-                    rows = self._positions(file, block).get(message.channel.id)
+                rows = self._positions(file, block).get(message.channel.id)
                 if rows is not None:
                     number += int((rows[:, 1] < message.offset).sum()) if at == message.block else len(rows)
         return RecordingError(f"{self.path}: message {number} of {topic} cannot be read: {str(reason).rstrip('.')}.")
 
     def messages(self, channels: Collection[int], progress: Progress | None = None) -> Iterator[RecordedMessage]:
-        """Iterate over the messages of some channels in the file's order, up to the first damage, which `damage` names.
-
-        Args:
-            channels: Ids of the channels.
-            progress: Called occasionally with the number of bytes read so far.
-        """
+        """Iterate over the messages of some channels in the file's order, up to damage, which `damage` names."""
         wanted = frozenset(channels)
         with self.path.open("rb") as file:
             for number, block in enumerate(self._blocks):
@@ -298,20 +283,22 @@ class RecordingIndex:
         return _unpacked(Chunk.read(_stream(raw[_RECORD.size :]))) if block.chunked else raw
 
     def _positions(self, file: BinaryIO, block: _Block) -> Positions:
-        if not block.index_size:
-            return _walked(self._data(file, block))
-        file.seek(block.start + block.size)
-        raw = file.read(block.index_size)
-        found: Positions = {}
-        at = 0
-        while at < len(raw):
-            _, length = _RECORD.unpack_from(raw, at)
-            channel, size = _INDEX.unpack_from(raw, at + _RECORD.size)
-            rows = np.frombuffer(raw, "<u8", size // 8, at + _RECORD.size + _INDEX.size).reshape(-1, 2)
-            if len(rows):
-                found[channel] = rows
-            at += _RECORD.size + length
-        return found
+        """Return the positions in a block: from the index that follows it, or else from its messages."""
+        with self._locating_damage(block):
+            if not block.index_size:
+                return _walked(self._data(file, block))
+            file.seek(block.start + block.size)
+            raw = file.read(block.index_size)
+            found: Positions = {}
+            at = 0
+            while at < len(raw):
+                _, length = _RECORD.unpack_from(raw, at)
+                channel, size = _INDEX.unpack_from(raw, at + _RECORD.size)
+                rows = np.frombuffer(raw, "<u8", size // 8, at + _RECORD.size + _INDEX.size).reshape(-1, 2)
+                if len(rows):
+                    found[channel] = rows
+                at += _RECORD.size + length
+            return found
 
     # Opening
 

@@ -57,13 +57,16 @@ _NAMES_CHARS = 32 << 20
 _T = TypeVar("_T")
 
 
-class _State(msgspec.Struct):
-    """An articulation's message as decoded; numbers that JSON cannot represent are text."""
+class _Sample(msgspec.Struct):
+    """A part of a sample as decoded; numbers that JSON cannot represent are text."""
 
     sim_time: Number
     sample: Count
     step: Count
     episode: Count
+
+
+class _State(_Sample):
     qpos: list[Number]
     qvel: list[Number]
     set_points: list[Number] = []
@@ -72,11 +75,7 @@ class _State(msgspec.Struct):
     sensors: dict[str, list[Number]] = {}
 
 
-class _Entity(msgspec.Struct):
-    sim_time: Number
-    sample: Count
-    step: Count
-    episode: Count
+class _Entity(_Sample):
     position: Annotated[list[Number], msgspec.Meta(min_length=3, max_length=3)]
     orientation: Annotated[list[Number], msgspec.Meta(min_length=4, max_length=4)]
     qvel: Annotated[list[Number], msgspec.Meta(max_length=6)] = []
@@ -207,29 +206,33 @@ class Run:
         """
         index = self._index()
         found = [_newest(index, [channel], time) for channel in index.channels_of(_STATES, _ENTITIES)]
-        states: dict[str, tuple[RecordedMessage, _State]] = {}
-        entities: dict[str, tuple[RecordedMessage, _Entity]] = {}
-        for message in found:
-            if message is not None and message.channel.schema == _STATES:
-                states[message.channel.topic.removeprefix(_ARTICULATION)] = message, _decoded(index, message, _state)
-            elif message is not None:
-                entities[message.channel.topic.removeprefix(_ENTITY)] = message, _decoded(index, message, _entity)
-        every = [*states.values(), *entities.values()]
+        every = [
+            (one, _decoded(index, one, _state if one.channel.schema == _STATES else _entity))
+            for one in found
+            if one is not None
+        ]
         if not every:
             return None
         message, newest = max(every, key=lambda one: one[1].sample)
+        # Elements from an earlier sample had left the scene by then.
+        present = [(one.channel.topic, state) for one, state in every if state.sample == newest.sample]
         return RecordedState(
             time=message.log_time / _NS,
             sim_time=float(newest.sim_time),
             wall_ns=message.publish_time,
             step=newest.step,
             episode=newest.episode,
-            # Elements from an earlier sample had left the scene by then.
-            articulations={key: _articulation(one) for key, (_, one) in states.items() if one.sample == newest.sample},
+            articulations={
+                topic.removeprefix(_ARTICULATION): _articulation(state)
+                for topic, state in present
+                if isinstance(state, _State)
+            },
             entities={
-                name: RecordedEntity(_floats(one.position), _floats(one.orientation), _floats(one.qvel))
-                for name, (_, one) in entities.items()
-                if one.sample == newest.sample
+                topic.removeprefix(_ENTITY): RecordedEntity(
+                    _floats(state.position), _floats(state.orientation), _floats(state.qvel)
+                )
+                for topic, state in present
+                if isinstance(state, _Entity)
             },
         )
 
@@ -338,7 +341,7 @@ class Run:
         now = status.st_size, status.st_mtime_ns
         with self._lock:
             if self._indexed is None or self._indexed[0] != now:
-                self._indexed = now, RecordingIndex.of(self.path, progress)
+                self._indexed = now, RecordingIndex(self.path, progress)
             index = self._indexed[1]
         self.damage = index.damage
         return index
@@ -473,7 +476,7 @@ def _picture(index: RecordingIndex, message: RecordedMessage) -> RecordedPicture
     )
 
 
-def _times(message: RecordedMessage, state: _State | _Entity) -> SampleTimes:
+def _times(message: RecordedMessage, state: _Sample) -> SampleTimes:
     return SampleTimes(message.log_time, float(state.sim_time), message.publish_time, state.step, state.episode)
 
 

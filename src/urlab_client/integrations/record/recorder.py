@@ -6,7 +6,7 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Literal, Self, get_args, overload
@@ -15,13 +15,13 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import ArrayLike
 
+from urlab_client.aio.arguments import finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.model.numbers import finite_array
 from urlab_client.errors import URLabError
-from urlab_client.integrations._episode_variation import varied_by_ops
 from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
+from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
@@ -46,16 +46,17 @@ class AsyncRecorder:
         cameras: Sequence[str] | Literal["all"],
         camera_hz: float,
         pose_hz: float,
-        options: Callable[[], WriterOptions],
+        options: WriterOptions,
     ) -> None:
         needs = ", or pass pose_hz=0" if pose_hz > 0 else None
         self._follower = Follower(
             client, name=f"record {path}", cameras=cameras, camera_hz=camera_hz, needs_model=needs, buffer=_LIVE_ITEMS
         )
+        self._client = client
         self._options = options
         self._path = path
         self._writer: WriterThread | None = None
-        self._ended = False
+        self._used = self._ended = False
 
     @property
     def path(self) -> Path:
@@ -104,12 +105,13 @@ class AsyncRecorder:
         self._writer.mark(EpisodeMark(outcome, given, time.time_ns()))
 
     async def __aenter__(self) -> Self:
-        if self._writer is not None:
+        if self._used:
             raise URLabError("A recorder records once.", hint="Call record() again.")
         self._follower.check()
-        self._writer = WriterThread(self._path, self._options())
-        await anyio.to_thread.run_sync(self._writer.open)
-        writer = self._writer
+        self._used = True
+        about = _about(self._client)
+        writer = await anyio.to_thread.run_sync(WriterThread, self._path, self._options, about)
+        self._writer = writer
         self._follower.start(writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up)
         return self
 
@@ -257,38 +259,36 @@ def record(
         raise ValueError("contacts come with the poses: pose_hz must be above 0")
     core = aio_of(client) if isinstance(client, URLabClient) else client
 
-    def options() -> WriterOptions:
-        return WriterOptions(
-            image_format=image_format,
-            jpeg_quality=jpeg_quality,
-            pose_ns=round(_NS / pose_hz) if pose_hz else 0,
-            contacts=contacts,
-            buffer_bytes=round(buffer_mib * _MIB),
-            flush_s=_FLUSH_S,
-            overwrite=overwrite,
-            lossless=lossless,
-            about={
-                "address": core.address,
-                "step_mode": str(core.step_mode),
-                "urlab_version": core.urlab_version,
-                "mujoco_version": core.mujoco_version,
-                **_varied(core),
-                "timestep": "" if core.model is None else repr(float(core.model.opt.timestep)),
-            },
-        )
-
+    options = WriterOptions(
+        image_format=image_format,
+        jpeg_quality=jpeg_quality,
+        pose_ns=round(_NS / pose_hz) if pose_hz else 0,
+        contacts=contacts,
+        buffer_bytes=round(buffer_mib * _MIB),
+        flush_s=_FLUSH_S,
+        overwrite=overwrite,
+        lossless=lossless,
+    )
     recorder = AsyncRecorder(core, Path(path), cameras=cameras, camera_hz=camera_hz, pose_hz=pose_hz, options=options)
     if isinstance(client, URLabClient):
         return Recorder(recorder, portal_of(client))
     return recorder
 
 
-def _varied(client: AsyncClient) -> dict[str, str]:
-    """Return the randomisation of the server or of an environment as an entry of a recording's metadata."""
-    declared = None if client.model is None else declared_in(client.model)
-    if declared is None and (varied := varied_by_ops(client)) is not None:
+def _about(client: AsyncClient) -> dict[str, str]:
+    """Return the metadata of a recording, with the randomisation of the server or of an environment."""
+    model = client.model
+    about = {
+        "address": client.address,
+        "step_mode": str(client.step_mode),
+        "urlab_version": client.urlab_version,
+        "mujoco_version": client.mujoco_version,
+        "timestep": "" if model is None else repr(float(model.opt.timestep)),
+    }
+    declared = None if model is None else declared_in(model)
+    if declared is None and (varied := wire_variation(client)) is not None:
         declared = varied.declaration
-    return {} if declared is None else {"randomise": declared.to_json()}
+    return about if declared is None else {**about, "randomise": declared.to_json()}
 
 
 def _check(*, camera_hz: float, pose_hz: float, jpeg_quality: int, buffer_mib: float) -> None:

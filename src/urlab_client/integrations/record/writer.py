@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -68,29 +68,16 @@ class RecordingError(URLabError):
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """Options for writing.
+    """Options for writing."""
 
-    Attributes:
-        image_format: `jpeg` or `png`, for colour pictures.
-        jpeg_quality: 1 to 95.
-        pose_ns: Shortest time between two sets of poses, nanoseconds; 0 for none.
-        contacts: Whether to add contacts to each set of poses.
-        buffer_bytes: Size of the queue.
-        flush_s: Seconds after which a chunk is written even if it is not full.
-        overwrite: Whether the file may exist.
-        lossless: Whether senders that can wait for space do so.
-        about: Metadata.
-    """
-
-    image_format: str
+    image_format: str  # of colour pictures: jpeg or png
     jpeg_quality: int
-    pose_ns: int
+    pose_ns: int  # shortest time between two sets of poses; 0 for none
     contacts: bool
     buffer_bytes: int
-    flush_s: float
+    flush_s: float  # after which a chunk is written even if it is not full
     overwrite: bool
-    lossless: bool
-    about: Mapping[str, str]
+    lossless: bool  # whether senders that can wait for space do so
 
 
 class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
@@ -114,14 +101,15 @@ class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
 
 
 class WriterThread:
-    """Writes one file. `put` may be called from one thread, `close` from any.
+    """Creates and writes one file. `put` may be called from one thread, `close` from any.
 
     Args:
         path: The file.
         options: Options for writing.
+        about: Metadata of the file.
     """
 
-    def __init__(self, path: Path, options: WriterOptions) -> None:
+    def __init__(self, path: Path, options: WriterOptions, about: Mapping[str, str]) -> None:
         self.path = path
         self.error: OSError | RecordingError | None = None
         self._options = options
@@ -130,44 +118,34 @@ class WriterThread:
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
         self._stalled = False
-        self._file: _McapFile | None = None
-        self._sink: _Sink | None = None
         self._stop = threading.Event()
-        self._thread = background_thread(
-            "urlab-record", self._run, failed=lambda error: self._fail(self._broken_off(error))
-        )
-
-    def open(self) -> None:
-        """Create the file and start the thread.
-
-        Raises:
-            OSError: The file cannot be created, or already exists.
-        """
-        self._file = _McapFile(self.path, "wb" if self._options.overwrite else "xb")
+        self._file = _McapFile(path, "wb" if options.overwrite else "xb")
         try:
-            self._sink = _Sink(self._file, self._options)
+            self._sink = _Sink(self._file, options, about)
         except BaseException:
             self._file.close()
             raise
+        self._thread = background_thread(
+            "urlab-record", self._run, failed=lambda error: self._fail(self._broken_off(error))
+        )
         self._thread.start()
 
     @property
     def stats(self) -> RecorderStats:
         """Current counters."""
-        sink, file = self._sink, self._file
         return RecorderStats(
-            states=sink.states if sink else 0,
-            frames=sink.frames if sink else 0,
+            states=self._sink.states,
+            frames=self._sink.frames,
             dropped_states=self._dropped_states,
             dropped_frames=self._dropped_frames,
             waiting_bytes=self._put_bytes - self._taken_bytes,
-            file_bytes=file.written if file else 0,
+            file_bytes=self._file.written,
         )
 
     @property
     def cameras(self) -> frozenset[str]:
         """Names of the cameras with a picture in the file."""
-        return frozenset(self._sink.cameras) if self._sink else frozenset()
+        return frozenset(self._sink.cameras)
 
     def put(self, item: State | CameraPicture) -> None:
         """Queue an item, or drop it. Pictures are dropped from half of the queue's size, to leave space for states.
@@ -220,11 +198,7 @@ class WriterThread:
         self._stop.set()
 
     def close(self) -> None:
-        """Write the queue, finish the file, and wait until that is done. Idempotent.
-
-        Raises:
-            RecordingError: Writing failed.
-        """
+        """Write the queue, finish the file, and wait until that is done; raise if writing failed. Idempotent."""
         self.end()
         self._thread.join()
         if self.error is not None:
@@ -237,30 +211,28 @@ class WriterThread:
             ) from self.error
 
     def _run(self) -> None:
-        sink, file = self._sink, self._file
-        if sink is None or file is None:
-            return
+        sink = self._sink
         try:
             while not self._stop.wait(_WAKE_S):
-                self._drain(sink)
+                self._drain()
                 sink.flush_if_due(self._dropped_states, self._dropped_frames)
-            self._drain(sink)
+            self._drain()
             sink.finish(self._dropped_states, self._dropped_frames)
         except OSError as error:
             self._fail(error)
         finally:
             with contextlib.suppress(OSError):  # already reported if writing failed
-                file.close()
+                self._file.close()
 
     def _broken_off(self, error: URLabError) -> RecordingError:
         broken = RecordingError(f"{self.path}: the recording broke off: {error.__cause__!r}")
         broken.__cause__ = error.__cause__
         return broken
 
-    def _drain(self, sink: _Sink) -> None:
+    def _drain(self) -> None:
         while self._queue:
             item, size = self._queue.popleft()
-            sink.write(item)
+            self._sink.write(item)
             self._taken_bytes += size
 
     def _fail(self, error: OSError | RecordingError) -> None:
@@ -309,30 +281,26 @@ class _Topic:
     sequence: int = 0
 
 
-@dataclass
 class _Sink:
     """Encodes and writes items. Used only in the writing thread, except for the constructor."""
 
-    file: _McapFile
-    options: WriterOptions
-    states: int = 0
-    frames: int = 0
-    cameras: dict[str, PictureMemory] = field(default_factory=dict[str, PictureMemory])
-    _clock: SampleClock = field(default_factory=SampleClock)
-    _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
-    _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
-    _scene: FollowedScene | None = None
-    _simulation: Simulation | None = None
-    _reported: tuple[int, int] = (0, 0)
-    _dirty_since: float | None = None
-    _varied: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        self._poses = Schedule(self.options.pose_ns)
-        self._writer = Writer(cast("IO[bytes]", self.file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+    def __init__(self, file: _McapFile, options: WriterOptions, about: Mapping[str, str]) -> None:
+        self.options = options
+        self.states = self.frames = 0
+        self.cameras: dict[str, PictureMemory] = {}
+        self._clock = SampleClock()
+        self._poses = Schedule(options.pose_ns)
+        self._schemas: dict[type[Struct], int] = {}
+        self._topics: dict[tuple[str, str], _Topic] = {}
+        self._scene: FollowedScene | None = None
+        self._simulation: Simulation | None = None
+        self._reported = 0, 0
+        self._dirty_since: float | None = None
+        self._varied: tuple[int, int] | None = None
+        self._writer = Writer(cast("IO[bytes]", file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"urlab-client {version('urlab-client')}")
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
-        self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **self.options.about})
+        self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **about})
 
     def write(self, item: State | CameraPicture | EpisodeMark) -> None:
         """Write one item."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
+import mujoco
 import numpy as np
 
+from urlab_client.aio.arguments import finite
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator
-from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.errors import URLabError
-from urlab_client.integrations.ik import IkSolution, InverseKinematics
-from urlab_client.integrations.ik.solver import Vector, own_sites
+from urlab_client.integrations.ik import IkSolution, InverseKinematics, Vector, only_robot, own_sites, positive, vector
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.client import URLabClient
 
@@ -65,14 +65,11 @@ class HandControl:
                 hand.
             URLabError: The client has no local model, or the robot or the site must be named.
         """
-        robots = client.articulations
-        if articulation is None and len(robots) != 1:
-            raise URLabError(f"Name the articulation: the scene has {', '.join(robots) or 'none'}.")
-        self.key: str = next(iter(robots)) if articulation is None else robots[articulation].prefix
-        self._robot = robots[self.key]
+        self._robot = only_robot(client, articulation)
+        self.key: str = self._robot.prefix
         self.ik: InverseKinematics = InverseKinematics(client, self.key, site=site or _only_site(client, self.key))
-        self.speed: float = _above_zero("speed", speed)
-        self.turn_speed: float = _above_zero("turn_speed", turn_speed)
+        self.speed: float = positive("speed", speed)
+        self.turn_speed: float = positive("turn_speed", turn_speed)
         self.blocked: bool = False
         self.set_points: dict[str, float] = {}
         solution = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
@@ -115,7 +112,7 @@ class HandControl:
                 changed.
         """
         moving, turning = _within_one("linear", linear), _within_one("angular", angular)
-        dt, opening = _above_zero("dt", dt), float(np.clip(finite("gripper", gripper), -1.0, 1.0))
+        dt, opening = positive("dt", dt), float(np.clip(finite("gripper", gripper), -1.0, 1.0))
         low, high = self._range
         self._opening = float(np.clip(self._opening + opening * dt * (high - low) / _GRIPPER_S, low, high))
         hand, _ = self.ik.pose()
@@ -158,17 +155,8 @@ def _only_site(client: URLabClient | AsyncClient, key: str) -> str:
 
 
 def _within_one(what: str, values: Vector) -> Floats:
-    given = finite_array(what, values)
-    if given.shape != (3,):
-        raise ValueError(f"{what} takes 3 numbers, got an array of shape {given.shape}")
+    given = vector(what, values, 3)
     return given / max(1.0, float(np.linalg.norm(given)))
-
-
-def _above_zero(what: str, value: float) -> float:
-    number = finite(what, value)
-    if number <= 0:
-        raise ValueError(f"{what} must be above 0, not {number:g}")
-    return number
 
 
 def _turned(quaternion: Floats, turn: Floats) -> Floats:
@@ -176,14 +164,7 @@ def _turned(quaternion: Floats, turn: Floats) -> Floats:
     angle = float(np.linalg.norm(turn))
     if not angle:
         return quaternion
-    w, (x, y, z) = np.cos(angle / 2), np.sin(angle / 2) / angle * turn
-    a, b, c, d = quaternion
-    turned = np.array(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ]
-    )
+    turned, rotation = np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(rotation, turn / angle, angle)
+    mujoco.mju_mulQuat(turned, rotation, quaternion)
     return turned / np.linalg.norm(turned)

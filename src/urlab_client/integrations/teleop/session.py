@@ -22,6 +22,7 @@ from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
+    from urlab_client.integrations.gym.episode import EnvEpisode
     from urlab_client.integrations.record import AsyncRecorder, Recorder
 
 Verdict = EpisodeOutcome | Literal["quit"]
@@ -200,9 +201,17 @@ class _Session:
         self._recorder = recorder
         self._paced = paced
         self._rng = np.random.default_rng(seed)
-        self._start = _Start(client) if task is None else _TaskStart(client, task)
+        self._task = task
+        self._n_steps = max(1, round(1.0 / (hz * timestep)))
+        self._starts: EnvEpisode | None = None
+        if task is not None:
+            from urlab_client.integrations.gym.episode import EnvEpisode
+            from urlab_client.integrations.gym.settings import EpisodeSettings
+
+            settings = EpisodeSettings.of(task, cameras=())
+            self._n_steps = settings.n_substeps
+            self._starts = EnvEpisode(client, settings=settings)
         self._hand = HandControl(client) if hand is None else hand
-        self._n_steps = self._start.n_steps or max(1, round(1.0 / (hz * timestep)))
         self._period = self._n_steps * timestep
         self._tally = TeleopTally()
         self._episode = 0
@@ -210,7 +219,7 @@ class _Session:
     async def run(self, episodes: int | None, seconds: float | None) -> TeleopTally:
         """Run episodes until the operator quits or enough are complete."""
         while episodes is None or self._tally.success + self._tally.failure < episodes:
-            await self._start.reset(self._rng)
+            await self._reset()
             self._hand.hold()
             verdict, moved = await self._drive(seconds)
             if moved:
@@ -241,7 +250,7 @@ class _Session:
 
     def _view(self, time: float) -> TeleopView:
         position, quaternion = self._hand.ik.pose()
-        goal, success = self._start.goal_and_success()
+        goal, success = self._goal_and_success()
         return TeleopView(
             episode=self._episode,
             time=time,
@@ -257,55 +266,21 @@ class _Session:
         self._episode += 1
         self._tally = self._tally.replace(**{verdict: getattr(self._tally, verdict) + 1})
         if self._recorder is not None:
-            await self._recorder.mark(verdict, goal=self._start.goal_and_success()[0])
+            await self._recorder.mark(verdict, goal=self._goal_and_success()[0])
 
+    async def _reset(self) -> None:
+        if self._starts is None:
+            for articulation in self._client.articulations.values():
+                articulation.ctrl_array[:] = 0.0
+            await self._client.reset()
+        else:
+            seed = None if self._starts.randomise is None else int(self._rng.integers(2**31))
+            await self._starts.reset(self._rng, seed=seed)
 
-class _Start:
-    """Episodes of a scene without a task, which start in the reset state."""
-
-    n_steps: int | None = None
-
-    def __init__(self, client: AsyncClient) -> None:
-        self._client = client
-
-    async def reset(self, rng: np.random.Generator) -> None:
-        del rng
-        for articulation in self._client.articulations.values():
-            articulation.ctrl_array[:] = 0.0
-        await self._client.reset()
-
-    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
+    def _goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         """Return the goal of the episode, and whether the current state is a success."""
-        return {}, None
-
-
-class _TaskStart(_Start):
-    """Episodes of a task."""
-
-    def __init__(self, client: AsyncClient, task: Task) -> None:
-        from urlab_client.integrations.gym.episode import EnvEpisode
-        from urlab_client.integrations.gym.task import EpisodeSettings
-
-        super().__init__(client)
-        settings = EpisodeSettings.of(
-            task,
-            observations=None,
-            n_substeps=None,
-            max_episode_steps=None,
-            keyframe=None,
-            reset_noise=None,
-            space_mode=None,
-            cameras=(),
-        )
-        self.n_steps = settings.n_substeps
-        self._task = task
-        self._episode = EnvEpisode(client, settings=settings, rendered=(), task=task)
-
-    async def reset(self, rng: np.random.Generator) -> None:
-        seed = None if self._episode.randomise is None else int(rng.integers(2**31))
-        await self._episode.reset(rng, seed=seed)
-
-    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
-        states = self._episode.states()
+        if self._starts is None or self._task is None:
+            return {}, None
+        states = self._starts.states()
         found = self._task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])

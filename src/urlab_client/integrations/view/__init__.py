@@ -6,7 +6,6 @@ MuJoCo world frame: metres, right-handed, z up.
 
 from urlab_client.integrations.view.foxglove_view import foxglove_view
 from urlab_client.integrations.view.rerun_view import rerun_view
-from urlab_client.integrations.view.view import AsyncView, View, ViewStats
-from urlab_client.integrations.view.window import window_view
+from urlab_client.integrations.view.view import AsyncView, View, ViewStats, window_view
 
 __all__ = ["AsyncView", "View", "ViewStats", "foxglove_view", "rerun_view", "window_view"]

@@ -26,7 +26,7 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _BACKLOG = 64  # queue length per browser; older messages are dropped
 _JOINING_S = 1.0  # how long after a subscription the newest state is sent again
 
 
-class _Foxglove:
+class _Foxglove(ViewBackend):
     """Shows states to all connected clients."""
 
     def __init__(self, *, host: str, port: int, sensors: bool) -> None:
@@ -58,14 +58,12 @@ class _Foxglove:
 
     @property
     def address(self) -> str:
-        """Address of the server."""
         if self._server is None:
             return ""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"ws://{host}:{self._server.port}"
 
     def open(self) -> None:
-        """See `ViewBackend`."""
         import foxglove
         from foxglove.channels import SceneUpdateChannel
         from foxglove.websocket import ServerListener
@@ -96,9 +94,7 @@ class _Foxglove:
             ) from None
 
     def use(self, simulation: Simulation, scene: FollowedScene) -> None:
-        """See `ViewBackend`."""
         self._shapes = shapes_of(simulation.model, simulation.bodies)
-        del scene
         if self._server is not None and self._last is not None:
             self._server.clear_session()
         for key in [key for key in self._channels if key[1]]:
@@ -106,7 +102,6 @@ class _Foxglove:
         self._joined = time.monotonic()
 
     def show(self, moment: Moment) -> None:
-        """See `ViewBackend`."""
         self._last = moment
         stamp, simulation = Time.of(moment.ns), moment.simulation
         self._send("/tf", lambda: FrameTransforms(simulation.transforms(stamp)), moment.ns)
@@ -119,13 +114,11 @@ class _Foxglove:
             self._send_contacts(moment)
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        """See `ViewBackend`."""
         stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
         self._send(topic, lambda: picture_message(picture, stamp, _JPEG_QUALITY), ns)
         self._send(f"{topic}/calibration", lambda: calibration(picture.camera, stamp), ns)
 
     def idle(self) -> bool:
-        """See `ViewBackend`."""
         # So that clients that join while time stands still see something. Repeated, because a subscription may be
         # reported before it takes effect.
         now = time.monotonic()
@@ -136,7 +129,6 @@ class _Foxglove:
         return True
 
     def close(self) -> None:
-        """See `ViewBackend`."""
         for channel in self._channels.values():
             channel.close()
         if self._server is not None:
@@ -196,9 +188,8 @@ class _Foxglove:
         points: list[fox.SpherePrimitive] = []
         arrows: list[fox.ArrowPrimitive] = []
         for contact in contacts:
-            at = fox.Vector3(x=contact.position.x, y=contact.position.y, z=contact.position.z)
-            size = fox.Vector3(x=0.016, y=0.016, z=0.016)
-            points.append(fox.SpherePrimitive(pose=fox.Pose(position=at), size=size, color=red))
+            at = _vector(contact.position.x, contact.position.y, contact.position.z)
+            points.append(fox.SpherePrimitive(pose=fox.Pose(position=at), size=_vector(0.016, 0.016, 0.016), color=red))
             force = np.array([contact.force.x, contact.force.y, contact.force.z])
             newtons = float(np.linalg.norm(force))
             if newtons > 0:
@@ -214,6 +205,12 @@ class _Foxglove:
                 )
         entity = fox.SceneEntity(id="contacts", frame_id="world", spheres=points, arrows=arrows)
         channel.log(fox.SceneUpdate(entities=[entity]), log_time=moment.ns)
+
+
+def _vector(x: float, y: float, z: float) -> fox.Vector3:
+    from foxglove import messages as fox
+
+    return fox.Vector3(x=x, y=y, z=z)
 
 
 def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quaternion:
@@ -240,24 +237,23 @@ def _entity(body: str, shapes: Sequence[Shape]) -> fox.SceneEntity:
         colour = fox.Color(r=red, g=green, b=blue, a=alpha)
         match shape.kind:
             case Kind.BOX:
-                cubes.append(fox.CubePrimitive(pose=pose, size=fox.Vector3(x=2 * x, y=2 * y, z=2 * z), color=colour))
+                cubes.append(fox.CubePrimitive(pose=pose, size=_vector(2 * x, 2 * y, 2 * z), color=colour))
             case Kind.ELLIPSOID:
-                size = fox.Vector3(x=2 * x, y=2 * y, z=2 * z)
-                spheres.append(fox.SpherePrimitive(pose=pose, size=size, color=colour))
+                spheres.append(fox.SpherePrimitive(pose=pose, size=_vector(2 * x, 2 * y, 2 * z), color=colour))
             case Kind.CYLINDER | Kind.CAPSULE:
-                size = fox.Vector3(x=2 * x, y=2 * x, z=2 * y)
+                size = _vector(2 * x, 2 * x, 2 * y)
                 cylinders.append(
                     fox.CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
                 )
                 if shape.kind is Kind.CAPSULE:
-                    ball = fox.Vector3(x=2 * x, y=2 * x, z=2 * x)
+                    ball = _vector(2 * x, 2 * x, 2 * x)
                     ends = [_pose(shape, end) for end in (-y, y)]
                     spheres += [fox.SpherePrimitive(pose=end, size=ball, color=colour) for end in ends]
             case Kind.MESH:
                 models.append(
                     fox.ModelPrimitive(
                         pose=pose,
-                        scale=fox.Vector3(x=1.0, y=1.0, z=1.0),
+                        scale=_vector(1.0, 1.0, 1.0),
                         color=colour,
                         override_color=True,
                         media_type="model/stl",

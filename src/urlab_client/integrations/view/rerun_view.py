@@ -17,7 +17,7 @@ from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 
 
-class _Rerun:
+class _Rerun(ViewBackend):
     """Shows states in Rerun."""
 
     def __init__(
@@ -43,7 +43,6 @@ class _Rerun:
 
     @property
     def address(self) -> str:
-        """See `ViewBackend`."""
         return f"http://127.0.0.1:{self._web_port}" if self._web else ""
 
     @property
@@ -53,7 +52,6 @@ class _Rerun:
         return self._stream
 
     def open(self) -> None:
-        """See `ViewBackend`."""
         import rerun as rr
 
         recording = rr.RecordingStream("urlab")
@@ -70,7 +68,6 @@ class _Rerun:
         self._stream = recording
 
     def use(self, simulation: Simulation, scene: FollowedScene) -> None:
-        """See `ViewBackend`."""
         import rerun as rr
 
         recording = self._recording
@@ -88,7 +85,6 @@ class _Rerun:
             recording.log(where, before[where].cleared(), static=True)  # type: ignore[attr-defined]  # of each archetype
 
     def show(self, moment: Moment) -> None:
-        """See `ViewBackend`."""
         import rerun as rr
 
         recording = self._recording
@@ -108,7 +104,6 @@ class _Rerun:
             recording.log("world/contacts/forces", rr.Arrows3D(vectors=_NEWTON_M * forces, origins=origins))
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        """See `ViewBackend`."""
         import rerun as rr
 
         recording, camera = self._recording, picture.camera
@@ -131,12 +126,7 @@ class _Rerun:
             media = "image/jpeg" if real else "image/png"
             recording.log(f"{where}/image", rr.EncodedImage(contents=data, media_type=media))
 
-    def idle(self) -> bool:
-        """See `ViewBackend`."""
-        return True
-
     def close(self) -> None:
-        """See `ViewBackend`."""
         recording, self._stream = self._recording, None
         recording.flush(timeout_sec=5.0)
         recording.disconnect()

@@ -1,15 +1,19 @@
-"""A view of a client's simulation: a thread that shows the newest state and skips the others."""
+"""A view of a client's simulation: a thread that shows the newest state and skips the others; MuJoCo's window."""
 
 from __future__ import annotations
 
 import logging
+import os
+import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from types import TracebackType
-from typing import Literal, Protocol, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 import anyio.to_thread
 import numpy as np
@@ -27,6 +31,9 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.plain import Serializable
+
+if TYPE_CHECKING:
+    import mujoco
 
 log: logging.Logger = logging.getLogger("urlab_client.view")
 
@@ -84,42 +91,36 @@ class Moment:
     state: State | None
 
 
-class ViewBackend(Protocol):
+class ViewBackend(ABC):
     """Display of a view. Used only by the view's thread, except `open` and `address`."""
 
     @property
     def address(self) -> str:
         """Address of the served view; empty if nothing is served."""
-        ...
+        return ""
 
+    @abstractmethod
     def open(self) -> None:
-        """Open the display.
+        """Open the display, or raise `OSError` or `URLabError`."""
 
-        Raises:
-            OSError: A file or port cannot be used.
-            URLabError: Something else is missing, for example a display.
-        """
-        ...
-
+    @abstractmethod
     def use(self, simulation: Simulation, scene: FollowedScene) -> None:
         """Show this scene from now on."""
-        ...
 
+    @abstractmethod
     def show(self, moment: Moment) -> None:
         """Show a state."""
-        ...
 
-    def show_picture(self, picture: CameraPicture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:  # noqa: B027  # a window shows none
         """Show a picture taken at `ns` on the view's clock."""
-        ...
 
     def idle(self) -> bool:
         """Process events without a new state; return whether the display is still open."""
-        ...
+        return True
 
+    @abstractmethod
     def close(self) -> None:
         """Close the display."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,14 +317,6 @@ class View(BlockingFlavour[AsyncView]):
         return self._aio.error
 
 
-@overload
-def make_view(client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> AsyncView: ...
-@overload
-def make_view(client: URLabClient, backend: ViewBackend, options: ViewOptions, name: str) -> View: ...
-@overload
-def make_view(
-    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
-) -> AsyncView | View: ...
 def make_view(
     client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
 ) -> AsyncView | View:
@@ -340,3 +333,75 @@ def make_view(
     if isinstance(client, URLabClient):
         return View(view, portal_of(client))
     return view
+
+
+def missing_for_window() -> str:
+    """Return why no window can be opened here; empty if it can."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return "there is no display: neither DISPLAY nor WAYLAND_DISPLAY is set"
+    if sys.platform == "darwin" and not os.environ.get("MJPYTHON_BIN"):
+        return "on macOS windows belong to the main thread: run with mjpython, which comes with MuJoCo"
+    return ""
+
+
+class _Window(ViewBackend):
+    """Shows states in `mujoco.viewer`'s window, which is reopened for another scene."""
+
+    def __init__(self) -> None:
+        self._viewer: Any = None
+        self._data: mujoco.MjData | None = None
+
+    def open(self) -> None:
+        missing = missing_for_window()
+        if missing:
+            raise URLabError(
+                f"window_view: {missing}.", hint="Use rerun_view, foxglove_view or `urlab console`, or set a display."
+            )
+
+    def use(self, simulation: Simulation, scene: FollowedScene) -> None:
+        import mujoco
+
+        viewer: Any = import_module("mujoco.viewer")
+        self.close()
+        self._data = mujoco.MjData(simulation.model)
+        self._viewer = viewer.launch_passive(simulation.model, self._data, show_left_ui=False, show_right_ui=False)
+
+    def show(self, moment: Moment) -> None:
+        import mujoco
+
+        if self._data is None or not self._viewer.is_running():
+            return
+        with self._viewer.lock():
+            mujoco.mj_copyData(self._data, moment.simulation.model, moment.simulation.data)
+            self._data.time = moment.ns / 1e9
+        self._viewer.sync()
+
+    def idle(self) -> bool:
+        return self._viewer is None or bool(self._viewer.is_running())
+
+    def close(self) -> None:
+        viewer, self._viewer = self._viewer, None
+        if viewer is not None:
+            viewer.close()
+
+
+@overload
+def window_view(client: AsyncClient, *, max_hz: float = ...) -> AsyncView: ...
+@overload
+def window_view(client: URLabClient, *, max_hz: float = ...) -> View: ...
+def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> AsyncView | View:
+    """Show a client's simulation in MuJoCo's own window; a context manager of the client's flavour.
+
+    The window does not control the simulation. When it is closed, `closed` is true and the client continues.
+
+    Args:
+        client: A client after `discover()`, during play, with its local model.
+        max_hz: Maximum number of states shown per second of wall time.
+
+    Raises:
+        ValueError: `max_hz` is out of range.
+
+    Entering the block raises `URLabError` if no window can be opened; the message says what is missing.
+    """
+    options = ViewOptions(cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True)
+    return make_view(client, _Window(), options, "window_view")

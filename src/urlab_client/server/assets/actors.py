@@ -87,16 +87,12 @@ class Actor:
 
     Attributes:
         name: Object name, unique in the level; an articulation's key.
-        label: Display name.
-        kind: What it is.
         actor_id: Stable id given by the client; may be empty.
         location: Position, metres.
         rotation: Unit quaternion (x, y, z, w).
         scale: Factors; 1 for articulations.
         own_tags: Tags besides the one that carries the id.
         blueprint: What an articulation is an instance of.
-        light: Settings of a light.
-        mesh: Shape of a static mesh.
         quick_convert: Settings that make a static mesh a body, or None.
         parent: Name of the actor this one is attached to; may be empty.
         controller: An articulation's controller as text, `pd,kp=80`; empty for that of its MJCF.

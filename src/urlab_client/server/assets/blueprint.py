@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import msgspec
 import mujoco
 
-from urlab_client.server.assets.importer import mujoco_messages, named_kinds
+from urlab_client.server.assets.importer import ModelFacts, mujoco_messages, named_kinds
 
 IMPORTS: Final = "MuJoCoImports"
 PARENT_CLASS: Final = "MjArticulation"
@@ -25,8 +22,16 @@ def sanitized(name: str) -> str:
     return re.sub(r"\W", "_", name)
 
 
-class BlueprintRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """`blueprint.json`."""
+class BlueprintRecord(ModelFacts, frozen=True, kw_only=True):
+    """`blueprint.json`.
+
+    Attributes:
+        stem: Sanitised file stem; identity of the blueprint.
+        source: Absolute path of the imported file, or `bundled:<name>`.
+        source_digest: SHA-256 of the imported file itself, without what it includes.
+        imported_at: UTC.
+        digest: Hash of the snapshot's content.
+    """
 
     format: Literal["urlab-blueprint"] = "urlab-blueprint"
     version: Literal[1] = 1
@@ -35,61 +40,26 @@ class BlueprintRecord(msgspec.Struct, frozen=True, kw_only=True):
     source_digest: str
     imported_at: datetime
     digest: str
-    model_name: str
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
-    actuator_types: dict[str, str]
-    sensors: tuple[str, ...]
-    cameras: tuple[str, ...]
-    n_bytes: int = 0
-    n_asset_bytes: int = 0
-    n_data_bytes: int = 0
-    n_sensor_values: int = 0
 
 
 _RECORD: Final = msgspec.json.Decoder(BlueprintRecord)
 _DIGEST: Final = re.compile(r"[0-9a-f]{16}")
 
 
-@dataclass(frozen=True, eq=False)
-class Blueprint:
-    """An imported MJCF.
+class Blueprint(BlueprintRecord, frozen=True, kw_only=True, eq=False, dict=True):
+    """An imported MJCF: its record, and the folder of its snapshot, which holds `model.xml`."""
 
-    Attributes:
-        stem: Sanitised file stem; identity of the blueprint.
-        folder: Folder of the snapshot; holds `model.xml`.
-        source: Absolute path of the imported file, or `bundled:<name>`.
-        source_digest: SHA-256 of the imported file itself, without what it includes.
-        imported_at: UTC.
-        digest: Hash of the snapshot's content.
-        model_name: The MJCF's `model` attribute; empty if it gives none.
-        joints: Joint names in compiled order, without prefix. Every element has a name: see `importer`.
-        actuators: Actuator names in compiled order.
-        actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
-        sensors: Sensor names in compiled order.
-        cameras: Camera names in compiled order.
-        n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
-        n_asset_bytes: How much of its compiled size all robots of its kind share.
-        n_data_bytes: Memory of its simulation, without the arena if MuJoCo chooses its size.
-        n_sensor_values: Total size of its sensor readings, in numbers.
-    """
-
-    stem: str
     folder: Path
-    source: str
-    source_digest: str
-    imported_at: datetime
-    digest: str
-    model_name: str
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
-    actuator_types: Mapping[str, str]
-    sensors: tuple[str, ...]
-    cameras: tuple[str, ...]
-    n_bytes: int = 0
-    n_asset_bytes: int = 0
-    n_data_bytes: int = 0
-    n_sensor_values: int = 0
+
+    @classmethod
+    def of(cls, folder: Path, record: BlueprintRecord) -> Self:
+        """Return the blueprint of a record."""
+        return cls(folder=folder, **msgspec.structs.asdict(record))
+
+    @property
+    def record(self) -> BlueprintRecord:
+        """What `blueprint.json` holds."""
+        return BlueprintRecord(**{name: getattr(self, name) for name in BlueprintRecord.__struct_fields__})
 
     @property
     def short_name(self) -> str:
@@ -150,47 +120,4 @@ def load_blueprint(file: Path) -> Blueprint:
     folder = file.parent / decoded.digest
     if not (folder / "model.xml").is_file():
         raise ValueError(f"its snapshot {folder} is gone")
-    return from_record(folder, decoded)
-
-
-def from_record(folder: Path, record: BlueprintRecord) -> Blueprint:
-    """Return the blueprint of a record, whose snapshot is `folder`."""
-    return Blueprint(
-        stem=record.stem,
-        folder=folder,
-        source=record.source,
-        source_digest=record.source_digest,
-        imported_at=record.imported_at,
-        digest=record.digest,
-        model_name=record.model_name,
-        joints=record.joints,
-        actuators=record.actuators,
-        actuator_types=MappingProxyType(record.actuator_types),
-        sensors=record.sensors,
-        cameras=record.cameras,
-        n_bytes=record.n_bytes,
-        n_asset_bytes=record.n_asset_bytes,
-        n_data_bytes=record.n_data_bytes,
-        n_sensor_values=record.n_sensor_values,
-    )
-
-
-def to_record(blueprint: Blueprint) -> BlueprintRecord:
-    """Return the record of a blueprint."""
-    return BlueprintRecord(
-        stem=blueprint.stem,
-        source=blueprint.source,
-        source_digest=blueprint.source_digest,
-        imported_at=blueprint.imported_at,
-        digest=blueprint.digest,
-        model_name=blueprint.model_name,
-        joints=blueprint.joints,
-        actuators=blueprint.actuators,
-        actuator_types=dict(blueprint.actuator_types),
-        sensors=blueprint.sensors,
-        cameras=blueprint.cameras,
-        n_bytes=blueprint.n_bytes,
-        n_asset_bytes=blueprint.n_asset_bytes,
-        n_data_bytes=blueprint.n_data_bytes,
-        n_sensor_values=blueprint.n_sensor_values,
-    )
+    return Blueprint.of(folder, decoded)

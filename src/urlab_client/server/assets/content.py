@@ -34,10 +34,8 @@ from urlab_client.server.assets.blueprint import (
     IMPORTS,
     Blueprint,
     BlueprintRecord,
-    from_record,
     load_blueprint,
     sanitized,
-    to_record,
 )
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
 from urlab_client.server.assets.importer import Compiled, build_confined, compile_snapshot, one_line, write_snapshot
@@ -156,9 +154,6 @@ class ContentRoot:
     def adopt(self, record: Path, digest: str) -> Blueprint | None:
         """Register the blueprint of another content root, copying its snapshot.
 
-        Args:
-            record: Its `blueprint.json`.
-
         Returns:
             The blueprint; None if the other content root has another snapshot by now.
 
@@ -179,7 +174,7 @@ class ContentRoot:
                 copy = Path(temporary_folder) / "snapshot"
                 shutil.copytree(other.folder, copy)
                 _replace(copy, folder)
-        return self._register(home, folder, to_record(other))
+        return self._register(home, folder, other.record)
 
     def remove_blueprint(self, stem: str) -> None:
         """Forget a blueprint and delete its folder.
@@ -267,16 +262,7 @@ class ContentRoot:
             source_digest=source_digest,
             imported_at=datetime.now(UTC),
             digest=folder.name,
-            model_name=compiled.model_name,
-            joints=compiled.joints,
-            actuators=compiled.actuators,
-            actuator_types=compiled.actuator_types,
-            sensors=compiled.sensors,
-            cameras=compiled.cameras,
-            n_bytes=compiled.n_bytes,
-            n_asset_bytes=compiled.n_asset_bytes,
-            n_data_bytes=compiled.n_data_bytes,
-            n_sensor_values=compiled.n_sensor_values,
+            **compiled.facts(),
         )
         try:
             return self._register(home, folder, record)
@@ -302,7 +288,7 @@ class ContentRoot:
     def _register(self, home: Path, folder: Path, record: BlueprintRecord) -> Blueprint:
         known = self._blueprints.get(record.stem)
         write_whole(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
-        blueprint = from_record(folder, record)
+        blueprint = Blueprint.of(folder, record)
         self._blueprints[record.stem] = blueprint
         # A play session under way may still read the model before this one; older ones are unused.
         keep = {folder, known.folder if known is not None else folder}

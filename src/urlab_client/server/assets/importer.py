@@ -9,7 +9,7 @@ import contextlib
 import logging
 import re
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -42,34 +42,52 @@ def one_line(error: object) -> str:
     return " ".join(str(error).split())
 
 
-class Compiled(msgspec.Struct, frozen=True, kw_only=True):
-    """Properties of a compiled model; see `Blueprint` for the fields it shares.
+class ModelFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """What is remembered of a compiled model.
 
     Attributes:
-        messages: MuJoCo's warnings.
-        n_bytes: Size of the compiled model.
+        model_name: The MJCF's `model` attribute; empty if it gives none.
+        joints: Joint names in compiled order, without prefix. Every element has a name: see `named_kinds`.
+        actuators: Actuator names in compiled order.
+        actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
+        sensors: Sensor names in compiled order.
+        cameras: Camera names in compiled order.
+        n_bytes: Size of the compiled model; this and what follows is 0 where an older import did not note it.
         n_asset_bytes: The part of that for meshes and textures, which all robots of a kind share.
         n_data_bytes: Memory of its simulation, without the arena if MuJoCo chooses its size.
-        n_arena_bytes: Memory of its arena.
         n_sensor_values: Total size of its sensor readings, in numbers.
-        options_problem: What is wrong with its `<option>`, if anything.
-        largest_image: Largest width or height of its cameras, pixels.
     """
 
     model_name: str
     joints: tuple[str, ...]
     actuators: tuple[str, ...]
-    actuator_types: dict[str, str]
+    actuator_types: Mapping[str, str]
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
+    n_bytes: int = 0
+    n_asset_bytes: int = 0
+    n_data_bytes: int = 0
+    n_sensor_values: int = 0
+
+
+class Compiled(ModelFacts, frozen=True, kw_only=True):
+    """Properties of a compiled model.
+
+    Attributes:
+        messages: MuJoCo's warnings.
+        n_arena_bytes: Memory of its arena.
+        options_problem: What is wrong with its `<option>`, if anything.
+        largest_image: Largest width or height of its cameras, pixels.
+    """
+
     messages: tuple[str, ...]
-    n_bytes: int
-    n_asset_bytes: int
-    n_data_bytes: int
     n_arena_bytes: int
-    n_sensor_values: int
     options_problem: str
     largest_image: int
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields of `ModelFacts`."""
+        return {name: getattr(self, name) for name in ModelFacts.__struct_fields__}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,10 +82,6 @@ _LEVEL: Final = msgspec.json.Decoder(_Level)
 def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> None:
     """Write a level atomically.
 
-    Args:
-        path: The level file; missing folders are made.
-        actors: The actors in spawn order.
-
     Raises:
         OSError: It cannot be written.
     """
@@ -104,20 +100,11 @@ def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> No
             mesh = msgspec.structs.replace(mesh, file=_relative(mesh.file, folder))
         entries.append(
             _Actor(
-                name=actor.name,
-                kind=actor.kind,
-                label=actor.label,
-                actor_id=actor.actor_id,
-                location=actor.location,
+                **_shared(actor),
                 rotation_quat=actor.rotation,
-                scale=actor.scale,
                 tags=actor.own_tags,
                 blueprint=blueprint.stem if blueprint is not None else "",
-                light=actor.light,
                 mesh=mesh,
-                quick_convert=actor.quick_convert,
-                parent=actor.parent,
-                controller=actor.controller,
             )
         )
     level = _Level(format=FORMAT, version=VERSION, blueprints=blueprints, actors=entries)
@@ -165,6 +152,12 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     for actor in actors.values():
         _check_parents(path, actor, actors)
     return actors
+
+
+def _shared(source: Actor | _Actor) -> dict[str, Any]:
+    """Return what an entry and its actor share."""
+    names = ("name", "kind", "label", "actor_id", "location", "scale", "light", "quick_convert", "parent", "controller")
+    return {name: getattr(source, name) for name in names}
 
 
 def _relative(target: str, folder: Path) -> str:
@@ -223,11 +216,7 @@ def _from_source(source: str, folder: Path, content: ContentRoot, *, trusted: bo
 
 
 def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], confined_to: ContentRoot | None) -> Actor:
-    """Check an entry and return its actor.
-
-    Args:
-        confined_to: Determines the allowed folders; None for any.
-    """
+    """Check an entry and return its actor."""
     if not entry.name or entry.name != sanitized(entry.name):
         raise ValueError("a name has letters, digits and underscores only")
     if not all(math.isfinite(value) for value in (*entry.location, *entry.scale)):
@@ -241,21 +230,14 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
             if confined_to is not None and not confined_to.open_to_clients(file):
                 raise ValueError(f"mesh {file} lies outside the folders that clients may read")
             mesh = msgspec.structs.replace(mesh, file=str(file))
+    shared = _shared(entry)
+    shared["label"] = entry.label or entry.name
     return Actor(
-        name=entry.name,
-        label=entry.label or entry.name,
-        kind=entry.kind,
-        actor_id=entry.actor_id,
-        location=entry.location,
+        **shared,
         rotation=normalized(entry.rotation_quat),
-        scale=entry.scale,
         own_tags=entry.tags,
         blueprint=blueprints[entry.blueprint] if entry.blueprint else None,
-        light=entry.light,
         mesh=mesh,
-        quick_convert=entry.quick_convert,
-        parent=entry.parent,
-        controller=entry.controller,
     )
 
 

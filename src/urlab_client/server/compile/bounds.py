@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from urlab_client._mujoco import MODEL_FILE, compiled_file
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.compile.static_meshes import add_mesh
+from urlab_client.server.compile.composition import add_mesh
 from urlab_client.server.refusal import CompileFailed
 from urlab_client.values.rotation import Vec3, rotate
 
@@ -25,10 +25,6 @@ Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3] | None:
     """Return the lower and upper corner of the box around an actor at its authored pose, world frame, metres.
-
-    Args:
-        actor: The actor.
-        every_geom: Count geoms that collide with nothing, too.
 
     Returns:
         The corners; None for an actor without geoms. Planes are endless and do not count.
@@ -91,8 +87,6 @@ def box_around(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.boo
     """Return the box around the chosen geoms, of which there must be one at least; none may be a plane.
 
     Args:
-        model: The model.
-        data: Its data with positions computed.
         geoms: Mask, shape (ngeom,).
     """
     rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)

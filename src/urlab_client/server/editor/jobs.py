@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 
 _MOST: Final = 4096
 """Maximum number of jobs that wait, and of results that nobody has fetched; beyond it the oldest results go."""
@@ -27,10 +27,6 @@ class EditorJobs:
 
     Results outlive the session that asked for them, so that it may be renewed meanwhile, but not for ever, as the
     plugin's do: a client that never fetches its results must not use up the server's memory.
-
-    Args:
-        health: Hears of the unexpected end of the thread.
-        clock: Returns the time, seconds.
     """
 
     def __init__(self, health: Health, clock: Callable[[], float] = time.monotonic) -> None:

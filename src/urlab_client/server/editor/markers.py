@@ -2,7 +2,7 @@
 
 For the `debug` handlers, which add to a `Drawings`, and for `snapshot`, which reads from it. Robot cameras do not show
 it, so that it does not get into training data. Positions are metres and rotations quaternions (x, y, z, w), both in
-MuJoCo's frame.
+MuJoCo's frame; colours are red, green and blue in 0..1, in steps of 1/255.
 """
 
 from __future__ import annotations
@@ -27,12 +27,7 @@ OVERLAY_S: Final = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sphere:
-    """A sphere of `MARKER_RADIUS_M`.
-
-    Attributes:
-        center: Centre.
-        color: Red, green, blue in 0..1, in steps of 1/255.
-    """
+    """A sphere of `MARKER_RADIUS_M`."""
 
     center: Vec3
     color: Vec3
@@ -40,13 +35,7 @@ class Sphere:
 
 @dataclass(frozen=True, kw_only=True)
 class Text:
-    """A label in the world.
-
-    Attributes:
-        at: Position.
-        text: The text.
-        color: Red, green, blue in 0..1.
-    """
+    """A label in the world."""
 
     at: Vec3
     text: str
@@ -55,14 +44,7 @@ class Text:
 
 @dataclass(frozen=True, kw_only=True)
 class DebugLine:
-    """A line segment.
-
-    Attributes:
-        start: One end.
-        end: The other.
-        color: Red, green, blue in 0..1.
-        thickness: Width; 1 is the usual.
-    """
+    """A line segment; its usual thickness is 1."""
 
     start: Vec3
     end: Vec3
@@ -72,14 +54,7 @@ class DebugLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box of lines.
-
-    Attributes:
-        center: Centre.
-        half_extents: Half sizes.
-        rotation: Unit quaternion.
-        color: Red, green, blue in 0..1.
-    """
+    """A box of lines."""
 
     center: Vec3
     half_extents: Vec3
@@ -89,15 +64,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """An arrow.
-
-    Attributes:
-        start: Tail.
-        end: Tip.
-        color: Red, green, blue in 0..1.
-        head: Size of the head, metres.
-        thickness: Width of its lines; 1 is the usual.
-    """
+    """An arrow from start to end, with a head of this length, metres, and lines of this thickness; 1 is the usual."""
 
     start: Vec3
     end: Vec3

@@ -90,7 +90,6 @@ class Track:
     """What the camera follows.
 
     Attributes:
-        actor_name: Object name of the actor.
         offset: Camera position in the actor's frame, metres.
         smoothing: Share of the old pose kept at each tick, 0 to 0.99.
     """
@@ -108,7 +107,6 @@ class Viewport:
 
     Attributes:
         view: The camera as last placed; `follow` moves it while an actor is tracked.
-        mode: View mode.
         track: What the camera follows, or None.
     """
 

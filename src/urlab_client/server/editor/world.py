@@ -9,9 +9,11 @@ Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's wo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+
+import msgspec
 
 from urlab_client.server.assets.actors import (
     ORIGIN,
@@ -25,12 +27,20 @@ from urlab_client.server.assets.actors import (
 )
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.compile.bounds import actor_bounds
-from urlab_client.server.editor import checks
-from urlab_client.server.editor.blueprints import Blueprints
-from urlab_client.server.editor.level_actors import ActorNames, LevelActors, match_actor
-from urlab_client.server.editor.levels import Levels
-from urlab_client.server.editor.quick_convert import QuickConvert
+from urlab_client.server.editor.level_actors import (
+    ActorNames,
+    LevelActors,
+    checked_pose,
+    checked_rotation,
+    float32,
+    match_actor,
+    refuse_infinite,
+    refuse_scale,
+    require,
+)
+from urlab_client.server.editor.levels import Blueprints, Levels
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, swap_frame
 from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode
@@ -42,7 +52,6 @@ class Placed(NamedTuple):
     """An actor that was placed or moved.
 
     Attributes:
-        actor: The actor in its new state.
         rotation_quat: Rotation from the request; not normalised.
         was_existing: True if an existing actor was moved.
     """
@@ -56,12 +65,9 @@ class EditorWorld:
     """The open level and the imported assets.
 
     Attributes:
-        content: The content root.
+        actors: The actors of the open level, also during play.
         pie_running: Whether a play session runs; set by the code that starts and stops it. While it is true, the ops
             that look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
-        levels: The level files, and which one is open.
-        blueprints: The imported blueprints.
-        quick_convert: Static meshes that become bodies.
     """
 
     def __init__(self, content: ContentRoot, *, actor_names: ActorNames = "model") -> None:
@@ -73,31 +79,29 @@ class EditorWorld:
         """
         self.content = content
         self.pie_running = False
-        self._actors = LevelActors(actor_names)
-        self.levels: Levels = Levels(content, self._actors, lambda: self.pie_running)
-        self.blueprints: Blueprints = Blueprints(content, self._actors, self.levels)
-        self.quick_convert: QuickConvert = QuickConvert(self._actors)
+        self.actors: LevelActors = LevelActors(actor_names)
+        self.levels: Levels = Levels(content, self.actors, lambda: self.pie_running)
+        self.blueprints: Blueprints = Blueprints(content, self.actors, self.levels)
+        self.quick_convert: QuickConvert = QuickConvert(self.actors)
         self._frozen: tuple[Actor, ...] = ()
 
     def authored(self) -> object:
         """Return a value that compares equal until a level, actor or blueprint changes."""
-        return self.levels.package, tuple(self._actors), dict(self.levels.external), dict(self.content.blueprints)
+        return self.levels.package, tuple(self.actors), dict(self.levels.external), dict(self.content.blueprints)
 
     # Actors
 
     def ensure_manager(self) -> tuple[Actor, bool]:
         """Return the level's manager, which play needs, and whether there was one already."""
-        manager = self._actors.first(ActorKind.MANAGER)
+        manager = self.actors.first(ActorKind.MANAGER)
         if manager is not None:
             return manager, True
-        return self._actors.add(
-            Actor(name=self._actors.numbered("AMjManager"), label="", kind=ActorKind.MANAGER)
-        ), False
+        return self.actors.add(Actor(name=self.actors.numbered("AMjManager"), label="", kind=ActorKind.MANAGER)), False
 
     @property
     def has_manager(self) -> bool:
         """Whether the open level has a manager actor."""
-        return self._actors.first(ActorKind.MANAGER) is not None
+        return self.actors.first(ActorKind.MANAGER) is not None
 
     def spawn_actor(
         self,
@@ -118,15 +122,8 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees: Rz(yaw) Ry(-pitch) Rx(-roll).
             scale: Must be 1.
         """
-        checks.require(blueprint, "blueprint")
-        code = "spawn_failed"
-        found = self.blueprints.blueprint(blueprint, code)
-        checks.refuse_scale(scale, code)
-        understood = checks.rotation(rotation_quat, rotation_euler, code)
-        pose = checks.pose(location, understood if understood is not None else IDENTITY, code)
-        existing = self._actors.of_class(actor_id, found.class_name, code)
-        self._make_room(existing is None, found, code)
-        return self._place(found, actor_id, existing, understood=understood or IDENTITY, pose=pose)
+        require(blueprint, "blueprint")
+        return self._spawn(blueprint, [(actor_id, location)], rotation_quat, rotation_euler, scale)[0]
 
     def spawn_grid(
         self,
@@ -147,33 +144,21 @@ class EditorWorld:
             base_actor_id: Cell (i, j) gets the id `<base>_<i>_<j>`; cells that exist are moved.
             spacing: Distance between cells, metres; z is ignored.
             origin: Position of cell (0, 0), metres.
-            rotation_quat: Rotation of every actor; wins over `rotation_euler`.
-            rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
-            scale: Must be 1.
         """
-        checks.require(blueprint, "blueprint")
-        checks.require(base_actor_id, "base_actor_id")
+        require(blueprint, "blueprint")
+        require(base_actor_id, "base_actor_id")
         if count_x <= 0 or count_y <= 0:
             raise Refusal("invalid_count", f"count_x and count_y must be above zero, not {count_x} and {count_y}")
         most = self.content.limits.grid_cells
         if count_x * count_y > most:
             raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than the limit grid_cells, {most}")
-        code = "spawn_failed"
-        found = self.blueprints.blueprint(blueprint, code)
-        checks.refuse_scale(scale, code)
-        understood = checks.rotation(rotation_quat, rotation_euler, code) or IDENTITY
-        cells: list[tuple[str, Actor | None, tuple[Vec3, Quat]]] = []
-        for j in range(count_y):
-            for i in range(count_x):
-                actor_id = f"{base_actor_id}_{i}_{j}"
-                location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
-                existing = self._actors.of_class(actor_id, found.class_name, code)
-                cells.append((actor_id, existing, checks.pose(location, understood, code)))
-        self._make_room(sum(existing is None for _, existing, _ in cells), found, code)
-        return [
-            self._place(found, actor_id, existing, understood=understood, pose=pose)
-            for actor_id, existing, pose in cells
+        x, y, z = origin
+        cells = [
+            (f"{base_actor_id}_{i}_{j}", (x + i * spacing[0], y + j * spacing[1], z))
+            for j in range(count_y)
+            for i in range(count_x)
         ]
+        return self._spawn(blueprint, cells, rotation_quat, rotation_euler, scale)
 
     def spawn_light(
         self,
@@ -189,8 +174,6 @@ class EditorWorld:
 
         Args:
             kind: `directional`, `point` or `spot`, in any letter case.
-            actor_id: Kept as a tag.
-            location: Position, metres.
             rotation_euler: (roll, pitch, yaw), degrees, in Unreal's frame; the light shines along its +x.
             intensity: In Unreal's unit for that kind; brightness here is relative to 5000.
         """
@@ -198,19 +181,19 @@ class EditorWorld:
         name = kind.casefold()
         if name not in ("directional", "point", "spot"):
             raise Refusal(code, f"'{kind}' is not a kind of light: use directional, point or spot")
-        checks.refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
-        at, rotation = checks.pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
+        refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
+        at, rotation = checked_pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
         self._make_room(1, None, code)
-        red, green, blue = (checks.float32(channel) for channel in color)
-        light = Light(kind=name, intensity=checks.float32(intensity), color=(red, green, blue))
+        red, green, blue = (float32(channel) for channel in color)
+        light = Light(kind=name, intensity=float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
-        return self._actors.add(
-            replace(draft, name=self._actors.numbered(draft.class_name), location=at, rotation=rotation)
+        return self.actors.add(
+            replace(draft, name=self.actors.numbered(draft.class_name), location=at, rotation=rotation)
         )
 
     def destroy_actor(self, target: str) -> None:
         """Remove an actor from the level; actors attached to it stay where they are."""
-        self._actors.remove(self._actors.find(target, "destroy_failed"))
+        self.actors.remove(self.actors.find(target, "destroy_failed"))
 
     def set_actor_transform(
         self,
@@ -220,24 +203,16 @@ class EditorWorld:
         rotation_quat: Quat | None = None,
         rotation_euler: Vec3 | None = None,
     ) -> Actor:
-        """Move an actor; parts left out stay.
-
-        Args:
-            location: Position, metres.
-            rotation_quat: Rotation; wins over `rotation_euler`.
-            rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
-        """
+        """Move an actor; parts left out stay."""
         code = "set_actor_transform_failed"
-        actor = self._actors.find(target, code)
-        rotation = checks.rotation(rotation_quat, rotation_euler, code)
-        at, turned = checks.pose(
+        actor = self.actors.find(target, code)
+        rotation = checked_rotation(rotation_quat, rotation_euler, code)
+        at, turned = checked_pose(
             location if location is not None else actor.location,
             rotation if rotation is not None else actor.rotation,
             code,
         )
-        return self._actors.put(
-            replace(actor, location=at, rotation=turned if rotation is not None else actor.rotation)
-        )
+        return self.actors.put(replace(actor, location=at, rotation=turned if rotation is not None else actor.rotation))
 
     def duplicate_actor(self, target: str, new_actor_id: str, *, location: Vec3 | None = None) -> Placed:
         """Place a copy of an actor, or move the actor of the same class that carries the new id.
@@ -246,53 +221,32 @@ class EditorWorld:
             location: Position of the copy, metres; by default 1 m along x from the source.
         """
         code = "duplicate_failed"
-        source = self._actors.find(target, code)
-        checks.require(new_actor_id, "new_actor_id")
+        source = self.actors.find(target, code)
+        require(new_actor_id, "new_actor_id")
         if source.kind in (ActorKind.MANAGER, ActorKind.REPLAY_MANAGER):
             raise Refusal(code, f"'{source.name}' is a {source.class_name}, of which a level has one")
         x, y, z = source.location
-        at, rotation = checks.pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
-        existing = self._actors.of_class(new_actor_id, source.class_name, code)
+        at, rotation = checked_pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
+        existing = self.actors.of_class(new_actor_id, source.class_name, code)
         self._make_room(existing is None, source.blueprint, code)
         if existing is not None:
-            copy = self._actors.put(replace(existing, location=at, rotation=rotation, scale=source.scale))
+            copy = self.actors.put(replace(existing, location=at, rotation=rotation, scale=source.scale))
         else:
             name = (
-                self._actors.articulation_name(source.blueprint)
+                self.actors.articulation_name(source.blueprint)
                 if source.blueprint is not None
-                else self._actors.numbered(source.class_name)
+                else self.actors.numbered(source.class_name)
             )
-            copy = self._actors.add(
+            copy = self.actors.add(
                 replace(source, name=name, label="", actor_id=new_actor_id, location=at, rotation=rotation, parent="")
             )
         return Placed(copy, rotation, existing is not None)
 
     # Looking
 
-    @property
-    def selected(self) -> str:
-        """Name of the selected actor; empty without a selection."""
-        return self._actors.selected
-
-    @selected.setter
-    def selected(self, name: str) -> None:
-        self._actors.selected = name
-
-    def actor(self, key: str, *, by_name: bool = False) -> Actor | None:
-        """Return the actor of the open level with an id, or with an object name; see `LevelActors.get`."""
-        return self._actors.get(key, by_name=by_name)
-
-    def unused_id(self, stem: str) -> str:
-        """Return an unused actor id: `stem`, if no actor of the open level has it."""
-        return self._actors.unused_id(stem)
-
     def snapshot(self) -> list[Actor]:
         """Return all actors; during play, those of the play world."""
         return list(self._shown())
-
-    def list_actors(self) -> list[Actor]:
-        """Return every actor of the open level, also during play."""
-        return list(self._actors)
 
     def find_actors(
         self, *, class_filter: str = "", tag: str = "", name_prefix: str = "", in_pie: bool = False
@@ -311,7 +265,7 @@ class EditorWorld:
         classes = {wanted, wanted[1:]} if wanted[:1] in ("a", "u", "f") else {wanted}
         found = [
             actor
-            for actor in (self._frozen if in_play else self._actors)
+            for actor in (self._frozen if in_play else self.actors)
             if (not wanted or not classes.isdisjoint(name.casefold() for name in actor.class_chain))
             and (not tag or tag.casefold() in (own.casefold() for own in actor.tags))
             and actor.name.casefold().startswith(name_prefix.casefold())
@@ -326,7 +280,7 @@ class EditorWorld:
     def get_actor_bounds(self, target: str, *, components_only: bool = False) -> ActorBounds:
         """Return the box around an actor at its authored pose."""
         code = "get_actor_bounds_failed"
-        actor = self._actors.find(target, code)
+        actor = self.actors.find(target, code)
         try:
             corners = actor_bounds(actor, every_geom=components_only)
         except CompileFailed as error:
@@ -338,8 +292,8 @@ class EditorWorld:
 
     def select_actor(self, target: str) -> Actor:
         """Select one actor and return it."""
-        actor = self._actors.find(target, "select_failed")
-        self._actors.selected = actor.name
+        actor = self.actors.find(target, "select_failed")
+        self.actors.selected = actor.name
         return actor
 
     def actor_path(self, actor: Actor) -> str:
@@ -354,9 +308,9 @@ class EditorWorld:
         Returns:
             The actors in spawn order, and the replay manager that the plugin adds to every session.
         """
-        actors = tuple(self._actors)
+        actors = tuple(self.actors)
         if not any(actor.kind is ActorKind.REPLAY_MANAGER for actor in actors):
-            name = self._actors.numbered("MjReplayManager")
+            name = self.actors.numbered("MjReplayManager")
             actors = (*actors, Actor(name=name, label=name, kind=ActorKind.REPLAY_MANAGER))
         self._frozen = actors
         return actors
@@ -368,35 +322,74 @@ class EditorWorld:
         if not count:
             return
         limits = self.content.limits
-        if len(self._actors) + count > limits.actors:
+        if len(self.actors) + count > limits.actors:
             raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
         more = [Actor(name="", label="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
-        problem = scene_problem((*self._actors, *more), limits)
+        problem = scene_problem((*self.actors, *more), limits)
         if problem:
             raise Refusal(code, problem)
 
     def _shown(self) -> Iterable[Actor]:
-        return self._frozen if self.pie_running else self._actors
+        return self._frozen if self.pie_running else self.actors
 
-    def _place(
+    def _spawn(
         self,
-        blueprint: Blueprint,
-        actor_id: str,
-        existing: Actor | None,
-        *,
-        understood: Quat,
-        pose: tuple[Vec3, Quat],
-    ) -> Placed:
-        at, rotation = pose
-        if existing is not None:
-            actor = self._actors.put(replace(existing, location=at, rotation=rotation))
-        else:
-            name = self._actors.articulation_name(blueprint)
-            draft = Actor(name=name, label="", kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
-            actor = self._actors.add(replace(draft, location=at, rotation=rotation))
-        return Placed(actor, understood, existing is not None)
+        path: str,
+        cells: Sequence[tuple[str, Vec3]],
+        rotation_quat: Quat | None,
+        rotation_euler: Vec3 | None,
+        scale: Vec3,
+    ) -> list[Placed]:
+        """Place or move an instance of a blueprint for each id and location, after all of them were checked."""
+        code = "spawn_failed"
+        blueprint = self.blueprints.blueprint(path, code)
+        refuse_scale(scale, code)
+        rotation = checked_rotation(rotation_quat, rotation_euler, code) or IDENTITY
+        poses = [checked_pose(location, rotation, code) for _, location in cells]
+        existing = [self.actors.of_class(actor_id, blueprint.class_name, code) for actor_id, _ in cells]
+        self._make_room(existing.count(None), blueprint, code)
+        placed: list[Placed] = []
+        for (actor_id, _), (at, turned), before in zip(cells, poses, existing, strict=True):
+            if before is not None:
+                actor = self.actors.put(replace(before, location=at, rotation=turned))
+            else:
+                name = self.actors.articulation_name(blueprint)
+                draft = Actor(name=name, label="", kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
+                actor = self.actors.add(replace(draft, location=at, rotation=turned))
+            placed.append(Placed(actor, rotation, before is not None))
+        return placed
 
 
 def _node(actor: Actor, actors: Iterable[Actor]) -> ActorHierarchyNode:
     children = [_node(child, actors) for child in actors if child.parent == actor.name]
     return ActorHierarchyNode(name=actor.name, actor_class=actor.class_name, location=actor.location, children=children)
+
+
+class QuickConvert:
+    """The Quick Convert settings of the actors of the open level."""
+
+    def __init__(self, actors: LevelActors) -> None:
+        self._actors = actors
+
+    def add(self, target: str, settings: ConversionSettings) -> Actor:
+        """Make a static mesh actor a MuJoCo body from the next play on. Repeating it replaces all settings."""
+        code = "add_quick_convert_failed"
+        actor = self._actors.find(target, code)
+        if actor.mesh is None:
+            raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
+        if settings.complex_mesh and not is_available():
+            raise Refusal(code, advice())
+        if actor.mesh.shape == "plane" and not settings.static:
+            raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
+        threshold = settings.coacd_threshold
+        refuse_infinite((threshold, *settings.friction), "coacd_threshold and friction", code)
+        kept = msgspec.structs.replace(settings, coacd_threshold=float32(threshold))
+        return self._actors.put(replace(actor, quick_convert=kept))
+
+    def remove(self, target: str) -> Actor:
+        """Make a static mesh actor decoration again."""
+        code = "remove_quick_convert_failed"
+        actor = self._actors.find(target, code)
+        if actor.quick_convert is None:
+            raise Refusal(code, f"'{actor.name}' has no Quick Convert settings")
+        return self._actors.put(replace(actor, quick_convert=None))

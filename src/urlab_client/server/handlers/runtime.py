@@ -17,12 +17,13 @@ from urlab_client.protocol.messages import cameras, runtime
 from urlab_client.server.core import ServerCore
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.handlers.control import check_all_owners, check_owner
-from urlab_client.server.physics.controllers import ArticulationControl, ControlSource, float32
+from urlab_client.server.physics.controllers import ArticulationControl, ControlSource
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import Quat, Vec3
 from urlab_client.values.types import Contact, KeyframeInfo, SimOptions
 

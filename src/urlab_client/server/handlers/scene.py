@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from urlab_client.protocol.messages import outliner, scene, uploads
-from urlab_client.server.assets.actors import Actor, ActorKind
+from urlab_client.server.assets.actors import Actor, ActorKind, ConversionSettings
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
@@ -240,7 +240,7 @@ def list_actors(server: ServerCore, _: outliner.ListActors) -> outliner.ListActo
             if actor.quick_convert is None
             else outliner.QuickConvert(**msgspec.structs.asdict(actor.quick_convert)),
         )
-        for actor in server.world.list_actors()
+        for actor in list(server.world.actors)
     ]
     return outliner.ListActorsOk(actors=rows, in_pie=server.world.pie_running)
 
@@ -283,14 +283,8 @@ def select_actor(server: ServerCore, request: outliner.SelectActor) -> outliner.
 
 @handles(outliner.AddQuickConvert)
 def add_quick_convert(server: ServerCore, request: outliner.AddQuickConvert) -> outliner.AddQuickConvertOk:
-    actor = server.world.quick_convert.add(
-        need(request, request.target, "target"),
-        static=request.static,
-        complex_mesh=request.complex_mesh,
-        coacd_threshold=request.coacd_threshold,
-        driven_by_unreal=request.driven_by_unreal,
-        friction=request.friction,
-    )
+    settings = ConversionSettings(**{name: getattr(request, name) for name in ConversionSettings.__struct_fields__})
+    actor = server.world.quick_convert.add(need(request, request.target, "target"), settings)
     return outliner.AddQuickConvertOk(
         actor_name=actor.name,
         static=request.static,

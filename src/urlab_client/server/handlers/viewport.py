@@ -20,6 +20,18 @@ from urlab_client.server.rpc.requests import need, usable
 from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, rotate, swap_frame, xyzw
 
+YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
+"""Replaces an invalid colour."""
+
+_RED: Final[Vec3] = (1.0, 0.0, 0.0)
+
+_GREEN: Final[Vec3] = (0.0, 1.0, 0.0)
+
+_BLUE: Final[Vec3] = (0.0, 0.0, 1.0)
+
+_HEAD: Final = 0.2
+"""Length of an arrow's head as a fraction of the arrow."""
+
 
 @handles(viewport.SetCamera)
 def set_camera(server: ServerCore, request: viewport.SetCamera) -> viewport.SetCameraOk:
@@ -111,7 +123,7 @@ def look(server: ServerCore) -> ViewportCamera:
 
 def _actor(server: ServerCore, request: Request[Any], target: str, target_by: str) -> Actor:
     key = need(request, target, "target")
-    actor = server.world.actor(key, by_name=target_by.casefold() == "actor_name")
+    actor = server.world.actors.get(key, by_name=target_by.casefold() == "actor_name")
     if actor is None:
         raise Refusal("unknown_actor", key)
     return actor
@@ -122,7 +134,7 @@ def _tracked(server: ServerCore) -> Actor | None:
     track = server.viewport.track
     if track is None:
         return None
-    actor = server.world.actor(track.actor_name, by_name=True)
+    actor = server.world.actors.get(track.actor_name, by_name=True)
     if actor is None:
         server.viewport.stop_tracking()
     return actor
@@ -139,17 +151,6 @@ def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
         x, y, z = data.xpos[body].tolist()
         quat = data.xquat[body].tolist()
     return (x, y, z), xyzw((quat[0], quat[1], quat[2], quat[3]))
-
-
-YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
-"""Replaces an invalid colour."""
-
-_RED: Final[Vec3] = (1.0, 0.0, 0.0)
-_GREEN: Final[Vec3] = (0.0, 1.0, 0.0)
-_BLUE: Final[Vec3] = (0.0, 0.0, 1.0)
-
-_HEAD: Final = 0.2
-"""Length of an arrow's head as a fraction of the arrow."""
 
 
 class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True, omit_defaults=True):

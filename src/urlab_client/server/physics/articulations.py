@@ -33,7 +33,6 @@ class Articulations:
 
         Args:
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
-            dialect: Decides what articulations are called.
         """
         self._model = scene.model
         self._data = scene.data

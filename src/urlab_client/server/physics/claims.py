@@ -18,11 +18,7 @@ class _Claim:
 
 
 class ControlClaims:
-    """The owners of the robots, by key. Robots are unclaimed at first, and unclaimed robots accept no writes.
-
-    Args:
-        clock: Returns the time, seconds.
-    """
+    """The owners of the robots, by key. Robots are unclaimed at first, and unclaimed robots accept no writes."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

@@ -158,11 +158,7 @@ class ArticulationControl:
         """Bind to a compiled model.
 
         Args:
-            model: The `mujoco.MjModel`.
-            index: The articulation.
             neutral: `mjData.ctrl` of the whole model after a reset, shape (nu,).
-            config: Controller to attach; None for raw controls.
-            exact: Keep set-points as they are; else they are rounded to float32.
         """
         self.index = index
         places: dict[str, int] = {}
@@ -186,7 +182,6 @@ class ArticulationControl:
             qpos: `mjData.qpos`, shape (nq,).
             qvel: `mjData.qvel`, shape (nv,).
             ctrl: `mjData.ctrl`, written in place, not clamped to `ctrlrange`.
-            raw: Bypass the controller.
         """
         controller = self.controller
         if controller is not None and controller.active and not raw:

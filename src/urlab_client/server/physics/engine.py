@@ -19,20 +19,27 @@ import mujoco
 
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import Step
-from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
-from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks, shutting_down
-from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
-from urlab_client.server.physics.physics_thread import PhysicsThread
-from urlab_client.server.physics.queued_step import QueuedStep
+from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
+from urlab_client.server.physics.scheduling import (
+    GIVE_WAY_S,
+    IDLE_S,
+    DataLock,
+    LivePacing,
+    MujocoCall,
+    Overdue,
+    PhysicsThread,
+    QueuedStep,
+    busy,
+    shutting_down,
+)
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 from urlab_client.simulation.controller_config import ControllerConfig
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -52,11 +59,15 @@ class Engine:
     the requests alone.
 
     Attributes:
-        scene: The scene.
         lock: Guards the model, the data and this object. Re-entrant. `with engine.lock` raises a `not_ready` refusal
             when physics holds it for longer than the step timeout. Do not hold it while calling `step` or `close`,
             which may have to wait for the physics thread.
-        dialect: Wire dialect of one generation of the plugin.
+        mode: The active step mode. Call `set_mode` to change it.
+        pinned_mode: The mode that cannot be left, or None.
+        paused: Whether physics is paused. Call `set_paused` to change it.
+        step_count: Sub-steps (direct) and pushes (puppet) since the last handshake or reset; live steps do not count.
+        fault: What stopped physics, or None. Cleared by a reset, by unpausing and by a change of mode.
+        replay: What plays in place of physics in a stepped mode, or None.
         articulations: The articulations with their set-points, by their names in requests and replies.
         snapshots: Numbers the states: one for each request that steps, and for each live iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
@@ -64,7 +75,7 @@ class Engine:
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
         step_wanted: Returns, after a direct request, whether to call `on_tick` for it; always True by default.
         seed: The last `reset` seed, or None; MuJoCo does not use it.
-        variation: Variations applied at each reset, or None.
+        variation: Variations applied at each reset, or None. Set before `start`.
     """
 
     def __init__(
@@ -77,19 +88,13 @@ class Engine:
         step_timeout_s: float = 5.0,
         health: Health | None = None,
         dialect: Dialect = ALPHA,
-        randomise: Randomisation | None = None,
     ) -> None:
         """Prepare a scene for stepping; `start` starts the physics thread.
 
         Args:
-            scene: Compiled scene; the engine steps its `data` in place.
             pinned_mode: Start in this mode and refuse `set_mode`; None or `auto` starts live and leaves it free.
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
-            health: Receives a report if the physics thread dies.
-
-        Raises:
-            ValueError: A name in `randomise` matches no element.
         """
         self.scene = scene
         self.dialect = dialect
@@ -101,9 +106,7 @@ class Engine:
         self._model = scene.model
         self._data = scene.data
         self.articulations: Articulations = Articulations(scene, controllers, dialect)
-        self.variation: SceneVariation | None = (
-            None if randomise is None else SceneVariation(scene, randomise, self.articulations)
-        )
+        self.variation: SceneVariation | None = None
         self._thread = PhysicsThread(
             scene.model,
             self.lock,
@@ -112,19 +115,17 @@ class Engine:
             give_up=self._drop_queue,
             health=Health() if health is None else health,
         )
-        self._integrator = Integrator(
-            scene, self.articulations, self.variation, self._call, lambda: self._thread.stopping
-        )
+        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._thread.stopping)
         self.on_substep: list[Hook] = self._integrator.on_substep
         self._pacing = LivePacing(scene.model)
-        self._pinned = None if pinned_mode is StepMode.AUTO else pinned_mode
-        self._mode = self._pinned or StepMode.LIVE
-        self._paused = paused
-        self._step_count = 0
+        self.pinned_mode: StepMode | None = None if pinned_mode is StepMode.AUTO else pinned_mode
+        self.mode: StepMode = self.pinned_mode or StepMode.LIVE
+        self.paused: bool = paused
+        self.step_count: int = 0
         self.snapshots: Snapshots = Snapshots()
         self._live_pushed: list[int] = []
-        self._fault: str | None = None
-        self._player: Player | None = None
+        self.fault: str | None = None
+        self.replay: Player | None = None
         self._step_timeout_s = step_timeout_s
         self._inline_budget_s = INLINE_SHARE * step_timeout_s
         self._queue: deque[QueuedStep[Any]] = deque()
@@ -142,9 +143,6 @@ class Engine:
 
         A request under way ends between two sub-steps. Safe to call twice.
 
-        Args:
-            timeout: Seconds to wait.
-
         Returns:
             False when physics was still busy after `timeout`, for example inside one very long `mj_step`.
         """
@@ -159,21 +157,6 @@ class Engine:
         self.close()
 
     @property
-    def mode(self) -> StepMode:
-        """The active step mode."""
-        return self._mode
-
-    @property
-    def pinned_mode(self) -> StepMode | None:
-        """The mode the server is pinned to, or None when `set_mode` is allowed."""
-        return self._pinned
-
-    @property
-    def paused(self) -> bool:
-        """Whether physics is paused."""
-        return self._paused
-
-    @property
     def speed(self) -> float:
         """Pacing of live mode in force, percent of real time, 5 to 100, a float32."""
         return self._pacing.speed
@@ -184,41 +167,22 @@ class Engine:
         return float(self._data.time)
 
     @property
-    def step_count(self) -> int:
-        """Sub-steps (direct) and pushes (puppet) since the last handshake or reset; live steps do not count."""
-        return self._step_count
-
-    @property
-    def fault(self) -> str | None:
-        """What stopped physics, or None. Cleared by a reset, by unpausing and by a change of mode."""
-        return self._fault
-
-    @property
     def overdue(self) -> Overdue | None:
         """The call of MuJoCo that has not come back for longer than a step may take, or None."""
         return self._call.overdue
 
-    @property
-    def replay(self) -> Player | None:
-        """What plays in place of physics in a stepped mode, or None."""
-        return self._player
-
     def begin_replay(self, make: Callable[[], Player]) -> None:
-        """Reset data and set-points, unpause, and from now on let steps play instead of integrating.
-
-        Args:
-            make: Makes the player once the data are reset.
-        """
+        """Reset data and set-points, unpause, and from now on let steps play instead of integrating."""
         with self.lock:
             self.reset()
             self.articulations.zero_set_points()
-            self._player = make()
+            self.replay = make()
             self._set_paused(False)
 
     def end_replay(self) -> None:
         """Let steps integrate again; the state stays where the replay left it."""
         with self.lock:
-            self._player = None
+            self.replay = None
 
     def step(self, request: Step, observe: Callable[[StepMode], T]) -> T:
         """Execute a `step` in the active mode and return the result of `observe` for the state after it.
@@ -236,11 +200,11 @@ class Engine:
         """
         deadline = time.monotonic() + self._step_timeout_s
         if not self.lock.acquire():
-            if self._mode is not StepMode.DIRECT:
+            if self.mode is not StepMode.DIRECT:
                 raise busy()
             return self._await(self._queued(request, observe), 0.0)
         try:
-            mode = self._mode
+            mode = self.mode
             if self._thread.stopping:
                 raise shutting_down()
             if self._thread.death is not None:
@@ -248,8 +212,8 @@ class Engine:
             if mode is StepMode.PUPPET:
                 self._push(request)
                 return observe(mode)
-            if self._fault is not None:
-                raise Refusal("not_ready", self._fault)
+            if self.fault is not None:
+                raise Refusal("not_ready", self.fault)
             if mode is not StepMode.DIRECT:
                 commands = request.per_articulation or {}
                 if self.dialect.live_commands:
@@ -260,7 +224,7 @@ class Engine:
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
-            if not self._paused and not self._queue and n_steps * self._integrator.substep_s <= self._inline_budget_s:
+            if not self.paused and not self._queue and n_steps * self._integrator.substep_s <= self._inline_budget_s:
                 self._tick_if_due()
                 self._run_direct(request)
                 result = observe(mode)
@@ -308,15 +272,26 @@ class Engine:
                     raise Refusal("unknown_keyframe", keyframe_name)
             self._tick_if_due()
             try:
-                self._integrator.reset(key, seed)
+                self._reset_data(key, seed)
                 self.articulations.override_joints(per_articulation_qpos or {})
                 self._integrator.forward()
             except Exception as error:
                 raise self._fail(error) from error
-            self._step_count = 0
+            self.step_count = 0
             self.snapshots.restart()
-            self._fault = None
+            self.fault = None
             self._kick()
+
+    def _reset_data(self, key: int, seed: int | None) -> None:
+        """Reset the data to a keyframe; -1 stands for the reference. The seed decides what varies."""
+        if self.variation is not None:
+            self.variation.begin(seed)
+        if key < 0:
+            mujoco.mj_resetData(self._model, self._data)
+        else:
+            mujoco.mj_resetDataKeyframe(self._model, self._data, key)
+        if self.variation is not None:
+            self.variation.start()
 
     def forward(self) -> None:
         """Run `mj_forward`; time and step counter stay."""
@@ -334,14 +309,14 @@ class Engine:
         unpauses unless the new mode is live. `auto` behaves as live.
         """
         with self.lock:
-            if self._pinned is not None:
-                raise Refusal("mode_locked_by_server", f"this server is pinned to step mode '{self._pinned}'")
-            previous = self._mode
+            if self.pinned_mode is not None:
+                raise Refusal("mode_locked_by_server", f"this server is pinned to step mode '{self.pinned_mode}'")
+            previous = self.mode
             if mode is not previous:
                 self._tick_if_due()
                 self._drop_queue(Refusal("step_timeout", f"the step was dropped by a switch to step mode '{mode}'"))
-                self._mode = mode
-                self._player = None
+                self.mode = mode
+                self.replay = None
                 if mode is not StepMode.LIVE:
                     self._set_paused(False)
                 self._pacing.restart()
@@ -352,7 +327,7 @@ class Engine:
         """Pause or resume physics and return the state in force. Resuming retries after a fault."""
         with self.lock:
             self._set_paused(paused)
-            return self._paused
+            return self.paused
 
     def set_sim_speed(self, percent: float) -> float:
         """Set the pacing of live mode, percent of real time, and return the value in force, clamped to 5..100."""
@@ -371,20 +346,20 @@ class Engine:
     def reset_step_count(self) -> None:
         """Set the step counter to 0, as a handshake does."""
         with self.lock.look():
-            self._step_count = 0
+            self.step_count = 0
 
     # What follows runs under the lock.
 
     def _set_paused(self, paused: bool) -> None:
-        if self._paused and not paused:
+        if self.paused and not paused:
             self._pacing.restart()
-            self._fault = None
-        self._paused = paused
+            self.fault = None
+        self.paused = paused
         self._wake.notify()
 
     def _kick(self) -> None:
         """Have a paused live loop, which may be asleep, take over changed set-points now."""
-        if self._paused:
+        if self.paused:
             self._pacing.restart()
             self._wake.notify()
 
@@ -399,8 +374,8 @@ class Engine:
         self._count(n_steps)
 
     def _run_direct(self, request: Step) -> None:
-        if self._player is not None:
-            self._play(self._player, request.n_steps)
+        if self.replay is not None:
+            self._play(self.replay, request.n_steps)
             return
         commands = request.per_articulation
         raw: Collection[ArticulationControl] = ()
@@ -421,13 +396,13 @@ class Engine:
         self._count(n_steps)
 
     def _count(self, n_steps: int) -> None:
-        self._step_count += n_steps
+        self.step_count += n_steps
         self.snapshots.take()
         self._tick_due = bool(self.on_tick) and self.step_wanted()
 
     def _push(self, request: Step) -> None:
-        if self._player is not None:
-            self._play(self._player, request.n_steps)
+        if self.replay is not None:
+            self._play(self.replay, request.n_steps)
             return
         self._tick_if_due()
         try:
@@ -435,15 +410,15 @@ class Engine:
         except Exception as error:
             raise self._fail(error) from error
         call_hooks(self.on_substep)
-        self._step_count += 1
+        self.step_count += 1
         self.snapshots.take()
 
     def _fail(self, error: Exception) -> Refusal:
         """Pause after a physics error and return the refusal that reports it."""
-        self._fault = f"physics stopped: {' '.join(str(error).split())}"  # MuJoCo's texts span lines
-        self._paused = True
+        self.fault = f"physics stopped: {' '.join(str(error).split())}"  # MuJoCo's texts span lines
+        self.paused = True
         logger.error("physics stopped and is paused: %s", error, exc_info=error)
-        return Refusal("not_ready", self._fault)
+        return Refusal("not_ready", self.fault)
 
     def _drop_queue(self, refusal: Refusal) -> None:
         while self._queue:
@@ -462,9 +437,9 @@ class Engine:
     # The physics thread.
 
     def _iterate(self) -> None:
-        if self._mode in (StepMode.LIVE, StepMode.AUTO):
+        if self.mode in (StepMode.LIVE, StepMode.AUTO):
             self._iterate_live()
-        elif self._mode is StepMode.DIRECT and self._queue and not self._paused:
+        elif self.mode is StepMode.DIRECT and self._queue and not self.paused:
             self._tick_if_due()
             self._queue.popleft().run(self._run_direct)
         elif self._tick_due or (self.on_tick and time.perf_counter() - self._last_tick >= IDLE_S):
@@ -473,12 +448,12 @@ class Engine:
             self._wake.wait(IDLE_S)
 
     def _iterate_live(self) -> None:
-        if wait_s := self._pacing.take_slot(idle=self._paused and not self.on_tick):
+        if wait_s := self._pacing.take_slot(idle=self.paused and not self.on_tick):
             self._wake.wait(wait_s)
             self._pacing.rested()
             return
         self.articulations.apply_controls()
-        if not self._paused:
+        if not self.paused:
             self._integrator.advance_live()
             self.snapshots.take()
         self.articulations.clear_wrenches(self._live_pushed)

@@ -15,9 +15,7 @@ from urlab_client.protocol.messages.session import Step
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.data_lock import MujocoCall
-from urlab_client.server.physics.variation import SceneVariation
-from urlab_client.server.refusal import Refusal
+from urlab_client.server.physics.scheduling import MujocoCall, shutting_down
 
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
@@ -78,23 +76,12 @@ class Integrator:
         self,
         scene: CompiledScene,
         articulations: Articulations,
-        variation: SceneVariation | None,
         call: MujocoCall,
         stopping: Callable[[], bool],
     ) -> None:
-        """Prepare to step a scene's data in place.
-
-        Args:
-            scene: The scene.
-            articulations: Their set-points and controllers make the controls.
-            variation: What varies from reset to reset.
-            call: Entered while MuJoCo works.
-            stopping: Whether a request under way is to be broken off.
-        """
         self._model = scene.model
         self._data = scene.data
         self._articulations = articulations
-        self._variation = variation
         self._call = call
         self._stopping = stopping
         self.substep_s: float = math.inf
@@ -104,11 +91,7 @@ class Integrator:
         """Integrate a direct step.
 
         Args:
-            n_steps: Sub-steps.
             raw: Articulations whose controller has no say.
-
-        Raises:
-            Refusal: `shutting_down`, between two slices.
         """
         mj_step, model, data = mujoco.mj_step, self._model, self._data
         apply_controls = self._articulations.apply_controls
@@ -137,18 +120,6 @@ class Integrator:
             mujoco.mj_step(self._model, self._data)
             call_hooks(self.on_substep)
 
-    def reset(self, key: int, seed: int | None) -> None:
-        """Reset the data to a keyframe; -1 stands for the reference. The seed decides what varies."""
-        variation = self._variation
-        if variation is not None:
-            variation.begin(seed)
-        if key < 0:
-            mujoco.mj_resetData(self._model, self._data)
-        else:
-            mujoco.mj_resetDataKeyframe(self._model, self._data, key)
-        if variation is not None:
-            variation.start()
-
     def push(self, state: Step) -> None:
         """Write the state of a puppet step, but for arrays of a wrong length, and compute what follows."""
         data = self._data
@@ -162,8 +133,3 @@ class Integrator:
         """Compute what follows from the state."""
         with self._call:
             mujoco.mj_forward(self._model, self._data)
-
-
-def shutting_down() -> Refusal:
-    """Return the refusal of a step that the end of the simulation breaks off."""
-    return Refusal("shutting_down", "the simulation is stopping")

@@ -155,11 +155,7 @@ class Observer:
         self._qvel = data.qvel
 
     def state(self, level: ObservationLevel, time: float, step: int) -> StateFields:
-        """Return the fields that all replies and messages with a state share.
-
-        Args:
-            time: `mjData.time`, seconds.
-        """
+        """Return the fields that all replies and messages with a state share."""
         return StateFields(
             time=time,
             step=step,

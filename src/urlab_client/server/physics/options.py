@@ -74,7 +74,6 @@ class OptionOverrides:
     """
 
     def __init__(self, model: mujoco.MjModel, limits: Limits, dialect: Dialect = ALPHA) -> None:
-        """Start with the integrator the scene was compiled with."""
         self._limits = limits
         self._dialect = dialect
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}

@@ -28,7 +28,7 @@ from urlab_client.server.physics.replay import ReplaySessions
 from urlab_client.server.physics.reply_template import StepReplies
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -204,9 +204,6 @@ class Play:
 
     def close(self, timeout: float) -> bool:
         """End play permanently and refuse waiting callers with `shutting_down`.
-
-        Args:
-            timeout: Seconds to wait for the simulation to end.
 
         Returns:
             False if it was still busy then.

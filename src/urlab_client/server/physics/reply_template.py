@@ -43,11 +43,6 @@ class StepReplies:
     def __init__(
         self, scene: CompiledScene, controls: Mapping[str, ArticulationControl], dialect: Dialect = ALPHA
     ) -> None:
-        """Prepare for a scene.
-
-        Args:
-            controls: `Articulations.controls` of the engine that steps it; holds the twists.
-        """
         self._scene = scene
         self._dialect = dialect
         self._controls = controls
@@ -57,11 +52,7 @@ class StepReplies:
         self._templates: dict[ObservationLevel, _ReplyTemplate] = {}
 
     def encode(self, level: ObservationLevel, time: float, step: int, frame_id: int = 0) -> bytes:
-        """Return the msgpack frame of a `StepOk` without cameras and replay. The caller holds the engine's lock.
-
-        Args:
-            time: `mjData.time`, seconds.
-        """
+        """Return the msgpack frame of a `StepOk` without cameras and replay. The caller holds the engine's lock."""
         scalars = [time, step, *sim_seconds(time), *wall_seconds(), frame_id]
         for twist in self._twists:
             scalars += (twist.vx, twist.vy, twist.yaw_rate, twist.actions)

@@ -28,11 +28,10 @@ from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.render.viewport_picture import ViewportPicture, ViewportStage
-from urlab_client.server.system.health import Health, ended
-from urlab_client.simulation.appearance import Appearance, RenderQuality
+from urlab_client.server.system.threads import Health, ended
+from urlab_client.simulation.appearance import Appearance, RenderQuality, Tints
 from urlab_client.simulation.cameras import Instant, Latency, Past, SceneCamera
 from urlab_client.simulation.opengl import RenderingUnavailable, need_backend, search_backend
-from urlab_client.simulation.tints import Tints
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -78,7 +77,6 @@ class Shot:
 
     Attributes:
         key: The camera as the request names it, the frame's key in the reply.
-        camera: The camera.
         sync: Draw the state after the step, rather than hand over the latest frame.
         late: The camera's latency, if it has one.
         least: Number of the oldest acceptable snapshot.
@@ -98,8 +96,6 @@ class Exposure:
     """A state to be drawn, and the cameras to draw.
 
     Attributes:
-        cameras: The cameras.
-        data: The state.
         taken_at: Time of the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not carry it.
         past: Receiver of the delayed frame, if the camera has a latency.
@@ -124,7 +120,6 @@ class Film:
         taken_at: When it was captured, monotonic seconds.
         captured: The same time as Unix seconds.
         number: Number of the state's snapshot.
-        jobs: The states to draw.
         past: What delayed cameras show; cameras without a state to show yet are missing.
     """
 
@@ -162,8 +157,6 @@ class Painting:
     """A state to be drawn as a picture of the viewport.
 
     Attributes:
-        picture: What it shows.
-        data: The state.
         look: Values of the model fields that vary.
         pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
         done: Set when it is drawn, or never will be.
@@ -193,13 +186,9 @@ class CameraRenderer:
         """Prepare for a scene. Drawing, and the search for OpenGL, begin with the first request for a frame.
 
         Args:
-            scene: The scene.
             modes: Meaning of the pixels by articulation key and camera name; `real` by default.
-            appearance: See `Appearance`.
-            health: Receives a report if the drawing thread dies.
             names: Names of articulations in requests and replies, by key; the key itself by default.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
-            dialect: Determines the names of cameras in requests and replies.
         """
         self._scene = scene
         self._health = Health() if health is None else health
@@ -238,7 +227,6 @@ class CameraRenderer:
         """Return what a request's `include_cameras` asks for; unknown names are left out.
 
         Args:
-            include_cameras: The request's field.
             fresh: Whether every picture is to show the state after the step.
         """
         if isinstance(include_cameras, bool):
@@ -283,12 +271,7 @@ class CameraRenderer:
         return any(_late(camera) is not None for camera in self._by_name.values())
 
     def see(self, frame_id: int, episode: int) -> None:
-        """Let the delayed cameras see the state; the caller holds the engine's lock.
-
-        Args:
-            frame_id: Number of its snapshot.
-            episode: Changes with each reset.
-        """
+        """Let the delayed cameras see the state; the caller holds the engine's lock."""
         now = self._now()
         if episode != self._episode:
             self._episode = episode
@@ -318,8 +301,6 @@ class CameraRenderer:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
-            shots: The requested frames.
-            frame_id: Number of the state's snapshot.
             draw: Whether frames may be drawn; otherwise existing ones are used.
 
         Returns:
@@ -352,8 +333,6 @@ class CameraRenderer:
         Without OpenGL, or if drawing fails or takes too long, cameras are left out; the log gives the reason.
 
         Args:
-            shots: The requested frames.
-            film: The result of `capture`.
             wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
                 is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
@@ -374,9 +353,6 @@ class CameraRenderer:
     def paint(self, job: Painting) -> Bytes:
         """Draw a picture of the viewport.
 
-        Args:
-            job: The result of `capture_viewport`.
-
         Returns:
             Red, green, blue and alpha from the top, shape (height, width, 4).
 
@@ -396,9 +372,6 @@ class CameraRenderer:
 
     def close(self, timeout: float = 1.0) -> bool:
         """Stop drawing and release waiting callers. Idempotent.
-
-        Args:
-            timeout: Seconds to wait for the thread.
 
         Returns:
             False if it was still drawing then.

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from urlab_client.server.compile.bounds import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
-from urlab_client.simulation.drawing import Bytes, Stage
-from urlab_client.simulation.sunlight import follow_subject
+from urlab_client.simulation.drawing import Bytes, Stage, follow_subject
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, rotate
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -48,9 +47,6 @@ class ViewportPicture:
 
     Attributes:
         size: Width and height, pixels.
-        view: The camera.
-        mode: View mode.
-        primitives: Debug drawing.
         overlay: Text over the picture.
         selected: Name of the actor that is marked as selected; may be empty.
         fit: Move the camera, without turning it, so that everything but endless planes is in the picture.
@@ -111,8 +107,6 @@ def bounds_of(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool
     """Return the box around the chosen geoms; None if none of them has bounds, as planes have not.
 
     Args:
-        model: The model.
-        data: Its data with positions computed.
         geoms: Mask, shape (ngeom,).
     """
     bounded = geoms & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))

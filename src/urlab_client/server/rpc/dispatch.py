@@ -24,7 +24,7 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
-from urlab_client.server.system.serving_thread import ServingThread
+from urlab_client.server.system.threads import Health, ServingThread, ended
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -40,6 +40,12 @@ _BESIDE_JOBS: Final = frozenset({"op_status", "pie_status"})
 
 BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up case-insensitively but recognise only their exact name."""
+
+
+RENEWED_S: Final = 0.25
+"""How often a waiting request checks whether the lock has been replaced."""
+
+INTERVAL_S: Final = 0.25
 
 
 class ServedRequest(Struct, frozen=True, kw_only=True):
@@ -108,10 +114,6 @@ HANDLERS: Final = HandlerTable()
 handles = HANDLERS.handles
 
 
-RENEWED_S: Final = 0.25
-"""How often a waiting request checks whether the lock has been replaced."""
-
-
 class Dispatcher:
     """Answers requests one at a time, from all transports.
 
@@ -124,7 +126,6 @@ class Dispatcher:
     callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
-        """Create the dispatcher of a server."""
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
@@ -139,7 +140,6 @@ class Dispatcher:
         """Return the reply to a request; errors become error replies.
 
         Args:
-            frame: Bytes of the request.
             transport: Transport of the request; editor ops are refused over shared memory.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
@@ -299,3 +299,42 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
     if incoming.op is not None and incoming.op.effect is not Effect.READ:
         executed = " It was executed: do not send it again."
     raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")
+
+
+class Watchdog:
+    """A thread that checks the physics of a server a few times a second."""
+
+    def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
+        self._core = core
+        self._dispatcher = dispatcher
+        self._stopping = threading.Event()
+        self._thread = health.thread("urlab-watchdog", self._run)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread is running."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread to end after `stop`; return False if it takes longer."""
+        return self._thread.ident is None or ended(self._thread, timeout)
+
+    def _run(self) -> None:
+        told: object = None
+        while not self._stopping.wait(INTERVAL_S):
+            running = self._core.play.current
+            overdue = None if running is None else running.engine.overdue
+            if overdue is None:
+                continue
+            if overdue.began_at != told:
+                told = overdue.began_at
+                logger.warning("physics has not returned from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds)
+            self._dispatcher.relieve(overdue.thread)

@@ -8,6 +8,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, TypeAlias
 
 import mujoco
@@ -25,9 +26,8 @@ from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.streams.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
+from urlab_client.server.streams.commands import Actuators, CameraEndpoint, Gains, StreamedCommand, StreamedSetPoints
 from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
-from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -138,8 +138,11 @@ class Broadcast:
         if self._capture in self._engine.on_tick:
             self._engine.on_tick.remove(self._capture)
 
-    def state_messages(self, tick: Tick) -> Iterator[tuple[bytes, bytes]]:
-        """Yield topic and payload of a tick's messages on the state socket, the snapshot last."""
+    def state_messages(self, tick: Tick) -> Iterator[tuple[bytes, Callable[[], bytes | None]]]:
+        """Yield topic and encoder of a tick's messages on the state socket, the snapshot last.
+
+        The next one may be taken although an encoder has failed.
+        """
         if not tick.arrays:
             return
         for target, values in zip(self._targets, tick.arrays, strict=True):
@@ -148,11 +151,9 @@ class Broadcast:
             twist.vx, twist.vy, twist.yaw_rate, twist.actions = values
         if tick.live:
             for row in self._wanted_rows:
-                payload = row.encode()
-                if payload is not None:
-                    yield row.topic, payload
+                yield row.topic, row.encode
         if tick.full:
-            yield STATE_FULL, self._state_full(tick)
+            yield STATE_FULL, partial(self._state_full, tick)
 
     def _state_full(self, tick: Tick) -> bytes:
         snapshot = StateFull(
@@ -165,14 +166,14 @@ class Broadcast:
 
     def info_messages(
         self, tick: Tick, cameras: Callable[[CompiledScene], Iterable[CameraEndpoint]]
-    ) -> Iterator[bytes]:
-        """Yield the frames due on the info socket."""
+    ) -> Iterator[Callable[[], bytes]]:
+        """Yield the encoders of the frames due on the info socket."""
         if not (self._info_wanted and tick.live >= self._info_due):
             return
         self._info_due = next_info(tick.live)
         endpoints = tuple(cameras(self.running.scene))
         for control in self._controls:
-            yield self._actuators.info(control, endpoints).encode()
+            yield partial(self._actuators.info, control, endpoints)
 
     def command_topics(self) -> Iterator[bytes]:
         """Yield the topics to which the articulations subscribe."""
@@ -199,7 +200,7 @@ class Broadcast:
                 command = commands.popleft()
                 if engine.mode not in _LIVE:
                     continue
-                if isinstance(command, ControlPayload):
+                if isinstance(command, StreamedSetPoints):
                     self._actuators.stage(command, self._owned)
                 else:
                     self._set_gains(*command)
@@ -210,10 +211,10 @@ class Broadcast:
     def _owned(self, control: ArticulationControl) -> bool:
         return self._dialect.claims and self.running.claims.owner(control.index.key) != UNCLAIMED
 
-    def _set_gains(self, key: str, gains: dict[str, JointGains]) -> None:
+    def _set_gains(self, key: str, gains: Gains) -> None:
         try:
             with self._engine.commanding() as articulations:
-                articulations.configure_controller(key, gains_by_parameter(gains))
+                articulations.configure_controller(key, gains)
         except Refusal as refusal:
             logger.debug("gains streamed to '%s' have no effect: %s", key, refusal.message)
 

@@ -24,7 +24,7 @@ from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import Film, Shot
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
@@ -102,9 +102,7 @@ class CameraStreams:
         """Bind the first port.
 
         Args:
-            health: Notified when the thread dies.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
-            curve_keys: Who may connect; None for anyone who can reach the interface.
 
         Raises:
             PortInUse: The port is in use.
@@ -295,9 +293,12 @@ class CameraStreams:
                 if frame is None:
                     continue
                 number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
-                for (keys, sent), messages in zip(places, news, strict=True):
-                    if shot.key in keys and self._is_news(running, shot.key, number, sent):
-                        messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                try:
+                    for (keys, sent), messages in zip(places, news, strict=True):
+                        if shot.key in keys and self._is_news(running, shot.key, number, sent):
+                            messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
+                    self._skip(f"an image of '{shot.key}' is not published", error)
         return news
 
     def _is_news(self, running: Running, key: str, number: int, sent: _Sent) -> bool:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import zmq
@@ -21,9 +22,8 @@ from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
-from urlab_client.server.streams.control_messages import CameraEndpoint
-from urlab_client.server.streams.streamed_commands import StreamedCommand, read_commands
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.streams.commands import CameraEndpoint, StreamedCommand, read_commands
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
@@ -79,11 +79,6 @@ class StreamServer:
         memory: SharedMemoryServer | None = None,
     ) -> None:
         """Bind the sockets; `start` begins to serve.
-
-        Args:
-            health: Notified when the thread dies.
-            state_port: TCP port; 0 selects a free port, as for the other ports.
-            curve_keys: Who may connect; None for anyone who can reach the interface.
 
         Raises:
             PortInUse: A port is in use.
@@ -154,9 +149,6 @@ class StreamServer:
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`.
 
-        Args:
-            timeout: Seconds to wait.
-
         Returns:
             False if the thread is still busy; it then closes the sockets when it ends.
         """
@@ -206,6 +198,9 @@ class StreamServer:
         """Log an error and continue without the current ticks and commands."""
         self._ticks.clear()
         self._commands.clear()
+        self._note_failure(error)
+
+    def _note_failure(self, error: Exception) -> None:
         self._failed += 1
         if self._failed & (self._failed - 1) == 0:  # ever more rarely
             logger.error("messages were not streamed (%d times so far)", self._failed, exc_info=error)
@@ -265,20 +260,38 @@ class StreamServer:
             broadcast, tick = self._ticks.popleft()
             if broadcast is not self._broadcast:
                 continue
-            for topic, payload in broadcast.state_messages(tick):
-                if topic == STATE_FULL:
-                    if self._memory is not None:
-                        self._memory.publish_state(payload)
-                    if not broadcast.full_wanted:
-                        continue
-                sent = payload if self.filter is None else self.filter(topic, payload)
-                if sent is not None:
-                    self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
-                    self._state.send(sent, zmq.NOBLOCK)
-            for frame in broadcast.info_messages(tick, self._cameras):
-                sent = frame if self.filter is None else self.filter(frame, frame)
-                if sent is not None:
-                    self._info.send(sent, zmq.NOBLOCK)
+            for topic, encode in broadcast.state_messages(tick):
+                with self._skipping():
+                    self._send_state(topic, encode(), full_wanted=broadcast.full_wanted)
+            for encode in broadcast.info_messages(tick, self._cameras):
+                with self._skipping():
+                    frame = encode()
+                    sent = frame if self.filter is None else self.filter(frame, frame)
+                    if sent is not None:
+                        self._info.send(sent, zmq.NOBLOCK)
+
+    def _send_state(self, topic: bytes, payload: bytes | None, *, full_wanted: bool) -> None:
+        if payload is None:
+            return
+        if topic == STATE_FULL:
+            if self._memory is not None:
+                self._memory.publish_state(payload)
+            if not full_wanted:
+                return
+        sent = payload if self.filter is None else self.filter(topic, payload)
+        if sent is not None:
+            self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
+            self._state.send(sent, zmq.NOBLOCK)
+
+    @contextmanager
+    def _skipping(self) -> Generator[None]:
+        """Omit the message that the block sends if that fails."""
+        try:
+            yield
+        except zmq.ZMQError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the next ones are none the worse
+            self._note_failure(error)
 
     def _read_commands(self) -> None:
         for frames in _waiting(self._control):

@@ -12,7 +12,7 @@ from pathlib import Path
 from urlab_client._platform.files import write_whole
 from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.server.system.health import Health, ended
+from urlab_client.server.system.threads import Health, ended
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -21,11 +21,6 @@ class Registration:
     """Keeps the file of one server in the registry for as long as the server is open."""
 
     def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
-        """Configure the registration; `start` writes the file.
-
-        Args:
-            health: Notified when the thread dies.
-        """
         self._directory = directory
         self._describe = describe
         self._path: Path | None = None

@@ -129,12 +129,7 @@ def working_in(folder: Path) -> Generator[None]:
 
 
 def sweep(folder: Path, *patterns: str) -> None:
-    """Remove leftovers of killed processes below a folder, unless another process is using it.
-
-    Args:
-        folder: The folder; it need not exist.
-        patterns: Glob patterns of the leftovers, relative to the folder.
-    """
+    """Remove leftovers of killed processes below a folder, unless another process is using it."""
     with contextlib.suppress(OSError), _alone_in(folder):
         for pattern in patterns:
             for left in folder.glob(pattern):

@@ -20,7 +20,7 @@ import zmq.utils.z85
 
 from urlab_client.errors import URLabError
 from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
-from urlab_client.server.system.health import Health
+from urlab_client.server.system.threads import Health
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

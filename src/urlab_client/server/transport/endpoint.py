@@ -16,8 +16,7 @@ import zmq
 
 from urlab_client._platform.signals import uninterrupted
 from urlab_client.server.limits import Limits
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.serving_thread import ServingThread
+from urlab_client.server.system.threads import Health, ServingThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")

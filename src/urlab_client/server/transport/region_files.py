@@ -50,30 +50,18 @@ class RegionFile:
         self._size = region_size(stride)
         self._fence = processor_fence()
         self._sequence = self._latest = 0
-        new = path.with_name(f".{path.name}")
-        self._fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | _RAW, 0o600)
+        # Windows neither replaces nor removes a file that a client has open, so there it is laid out in place.
+        new = path if sys.platform == "win32" else path.with_name(f".{path.name}")
+        self._fd = os.open(new, os.O_RDWR | os.O_CREAT | _RAW, 0o600)
         try:
             self._lay_out()
-            self._put_in_place(new)
+            if new != path:
+                new.replace(path)
         except BaseException:
+            os.close(self._fd)
             with contextlib.suppress(OSError):
-                os.close(self._fd)
-            new.unlink(missing_ok=True)
+                new.unlink()
             raise
-
-    def _put_in_place(self, new: Path) -> None:
-        if sys.platform != "win32":
-            new.replace(self.path)
-            return
-        os.close(self._fd)  # Windows cannot move open files
-        try:
-            new.replace(self.path)
-        except PermissionError:  # nor replace them: initialise the existing file again
-            new.unlink()
-            self._fd = os.open(self.path, os.O_RDWR | _RAW)
-            self._lay_out()
-        else:
-            self._fd = os.open(self.path, os.O_RDWR | _RAW)
 
     @property
     def max_payload(self) -> int:

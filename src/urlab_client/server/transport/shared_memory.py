@@ -35,9 +35,8 @@ from urlab_client.protocol.shm import (
     camera_stride,
     state_stride,
 )
-from urlab_client.server.system.health import Health
-from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.system.threads import Health, ServingThread
 from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
@@ -67,9 +66,6 @@ BLIND_PICTURE_PERIOD_S: Final = 0.5
 """How often pictures are published while no client has a doorbell: a region does not know its readers."""
 
 MAX_LISTENERS: Final = 32
-
-ACCEPT_RETRY_S: Final = 1.0
-"""Pause between two attempts to accept clients when descriptors have run out."""
 
 _SELECTOR_STEP_S: Final = 1e-3
 """`epoll` rounds shorter waits up to this."""
@@ -145,7 +141,6 @@ class SharedMemoryServer:
     def stop(self) -> None:
         """Ask the thread to end after the current request, without waiting."""
         self._stopping = True
-        self._doorbell.wake()
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`, and remove the regions.
@@ -265,10 +260,13 @@ class SharedMemoryServer:
             while not self._stopping:
                 if self._requests.sequence() == self._seen and not (self._spinning and self._spin(self._seen)):
                     rung = self._doorbell.wait(self._pause())
-                    self._note_wait(rung=rung)
+                    if rung:
+                        self._active_at = -ACTIVE_S
+                    elif self._unannounced:  # a ring may arrive after its request was seen
+                        self._active_at = time.monotonic()
+                    self._unannounced = not rung and self._requests.sequence() != self._seen
                     if self._requests.sequence() == self._seen:
                         continue
-                    self._unannounced = not rung
                 self._spinning = time.monotonic() - self._served_at < SPIN_S and not crowded()
                 if not self._serve():
                     return
@@ -296,14 +294,6 @@ class SharedMemoryServer:
                 return True
             time.sleep(0)  # releases the interpreter lock
         return False
-
-    def _note_wait(self, *, rung: bool) -> None:
-        """Update whether a client without a doorbell is active: a ring may arrive after its request was seen."""
-        if rung:
-            self._active_at = -ACTIVE_S
-        elif self._unannounced:
-            self._active_at = time.monotonic()
-        self._unannounced = False
 
     def _pause(self) -> float:
         if self._unannounced or self._active(time.monotonic()):
@@ -354,12 +344,8 @@ class _Doorbell:
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
         self._listener = self._listen(directory / DOORBELL_FILE)
-        self._accept_after = 0.0
-        self._wake_reader, self._wake_writer = socket.socketpair()
-        for end in (self._wake_reader, self._wake_writer):
-            end.setblocking(False)
-        self._selector.register(self._wake_reader, selectors.EVENT_READ)
-        self._start_accepting()
+        if self._listener is not None:
+            self._selector.register(self._listener, selectors.EVENT_READ)
 
     @property
     def listeners(self) -> int:
@@ -380,18 +366,10 @@ class _Doorbell:
                     with contextlib.suppress(OSError):  # its buffer is full, or it is gone
                         client.send(ring)
 
-    def wake(self) -> None:
-        """End `wait`. Thread-safe."""
-        self._request_event.set()
-        with contextlib.suppress(OSError):
-            self._wake_writer.send(b"\0")
-
     def wait(self, seconds: float) -> bool:
         """Wait until a client rings, or for some seconds; return whether one announced a request."""
         if self._request_event.exists:
             return self._request_event.wait(seconds)
-        if self._accept_after and time.monotonic() >= self._accept_after:
-            self._start_accepting()
         if seconds < _SELECTOR_STEP_S:
             time.sleep(seconds)
             seconds = 0.0
@@ -406,18 +384,16 @@ class _Doorbell:
             for client in self._subscriptions:
                 client.close()
             self._subscriptions.clear()
-        if self._listener is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(self._listener.getsockname())
-            self._listener.close()
+        self._stop_listening()
         self._selector.close()
-        self._wake_reader.close()
-        self._wake_writer.close()
 
-    def _start_accepting(self) -> None:
-        self._accept_after = 0.0
-        if self._listener is not None:
-            self._selector.register(self._listener, selectors.EVENT_READ)
+    def _stop_listening(self) -> None:
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            self._selector.unregister(listener)
+            with contextlib.suppress(OSError):
+                os.unlink(listener.getsockname())
+            listener.close()
 
     def _listen(self, path: Path) -> socket.socket | None:
         if not hasattr(socket, "AF_UNIX"):
@@ -448,8 +424,6 @@ class _Doorbell:
             return False
         except OSError:
             data = b""
-        if source is self._wake_reader:
-            return False
         if not data:
             self._selector.unregister(source)
             with self._lock:
@@ -467,10 +441,9 @@ class _Doorbell:
             client, _ = listener.accept()
         except BlockingIOError:
             return
-        except OSError as error:  # no descriptor left: retrying immediately would be a busy loop
-            logger.warning("a client could not be accepted at the doorbell: %s", error)
-            self._selector.unregister(listener)
-            self._accept_after = time.monotonic() + ACCEPT_RETRY_S
+        except OSError as error:  # no descriptor left: retrying would be a busy loop
+            logger.warning("no doorbell any more: %s; further clients poll", error)
+            self._stop_listening()
             return
         if len(self._subscriptions) >= MAX_LISTENERS:
             client.close()

@@ -1,0 +1,154 @@
+"""How a client's episodes vary: by its server, or by an environment through ops. Loads MuJoCo only where it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.aio.client_types import ClientObserver
+from urlab_client.aio.controllers import URLabPDController
+from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.enums import ControllerKind
+from urlab_client.randomise.declaration import Randomisation, UnsupportedRandomisation, Vary
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from urlab_client.aio.client import URLabClient
+    from urlab_client.randomise.variation import EpisodeDraws, Variation
+
+
+def server_variation(
+    client: URLabClient, model: mujoco.MjModel, layouts: Mapping[str, ArticulationLayout]
+) -> Variation | None:
+    """Return how the server of a client varies its scene, or None if it does not."""
+    from urlab_client.randomise.variation import Variation, declared_in
+
+    declared = declared_in(model)
+    return None if declared is None else Variation(declared, model, _controlled_actuators(client, layouts))
+
+
+def wire_variation(client: URLabClient) -> WireVariation | None:
+    """Return what an environment varies by ops on this client, or None if no environment does."""
+    return next((found for found in client.observers if isinstance(found, WireVariation)), None)
+
+
+@dataclass(frozen=True, eq=False)
+class _Controlled:
+    controller: URLabPDController
+    actuators: NDArray[np.intp]
+    gains: dict[str, dict[str, float]]
+    """Unvaried gains, by gain and actuator, in the order of `actuators`."""
+
+
+class WireVariation(ClientObserver):
+    """Variation by ops around the reset that starts an episode, for a server that varies nothing itself.
+
+    One of its client's observers, so that recordings, which see the client but not the environment, find it there.
+
+    Attributes:
+        declaration: What varies.
+        draws: The values drawn for the current episode; None before the first.
+        variation: The variation; it draws the same numbers as a server that varies its own scene.
+        controlled: Controllers whose gains vary, by articulation.
+    """
+
+    def __init__(
+        self,
+        client: URLabClient,
+        model: mujoco.MjModel,
+        layouts: Mapping[str, ArticulationLayout],
+        declared: Randomisation,
+        earlier: WireVariation | None = None,
+    ) -> None:
+        """Look up what varies.
+
+        `earlier` is the variation of an earlier session with the server, which may have left gravity and gains varied;
+        if None, the current gravity and gains count as unvaried.
+
+        Raises:
+            UnsupportedRandomisation: No op changes one of the quantities.
+            ValueError: A name matches no element.
+        """
+        from urlab_client.randomise.variation import Variation, field_of
+
+        self.declaration = declared
+        self.draws: EpisodeDraws | None = None
+        controlled = _controlled_actuators(client, layouts)
+        _check(client, model, declared, controlled)
+        self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
+        self._client = client
+        if (before := wire_variation(client)) is not None:
+            client.remove_observer(before)
+        client.add_observer(self)
+        self._model_fields: dict[str, NDArray[Any]] = {
+            name: np.array(field_of(model, name)) for name in self.variation.fields
+        }
+        self.controlled: dict[str, _Controlled] = {}
+        for key, articulation in client.articulations.items() if self.variation.varied_gains else ():
+            controller = articulation.controller
+            if isinstance(controller, URLabPDController):
+                gains = {name: dict[str, float](controller.params[name]) for name in self.variation.varied_gains}
+                if earlier is not None and key in earlier.controlled:
+                    gains = earlier.controlled[key].gains
+                actuators = [layouts[key].actuators[name] for name in controller.kp]
+                self.controlled[key] = _Controlled(controller, np.array(actuators, dtype=np.intp), gains)
+
+    async def apply(self, draws: EpisodeDraws) -> None:
+        """Set the quantities that a reset does not change: gravity, and the gains of controllers."""
+        self.draws = draws
+        if self._model_fields:
+            self.variation.write(draws, self._model_fields.__getitem__)
+            await self._set_gravity()
+        for each in self.controlled.values():
+            factors = self.variation.gain_factors(draws, each.actuators)
+            scaled = {
+                name: dict(zip(by, (np.array([*by.values()]) * factors[name]).tolist(), strict=True))
+                for name, by in each.gains.items()
+            }
+            await each.controller.set_gains(scaled.get("kp"), scaled.get("kv"))
+
+    async def undo(self) -> None:
+        """Restore gravity and gains if an episode has varied them."""
+        self._client.remove_observer(self)
+        if self.draws is None:
+            return
+        self.draws = None
+        if self._model_fields:
+            self.variation.restore(self._model_fields.__getitem__)
+            await self._set_gravity()
+        for each in self.controlled.values():
+            await each.controller.set_gains(each.gains.get("kp"), each.gains.get("kv"))
+
+    async def _set_gravity(self) -> None:
+        gravity = self._model_fields.get("opt.gravity")
+        if gravity is not None:
+            await self._client.runtime.set_sim_options(gravity=gravity)
+
+
+def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
+    from urlab_client.randomise.quantities import START, elements_of
+
+    def settable(vary: Vary) -> bool:
+        if vary.what in ("kp", "kv"):
+            return controlled.issuperset(elements_of(vary, model, controlled).ids.tolist())
+        return vary.what in START or vary.what == "gravity"
+
+    refused = [vary.what for vary in declared.vary if not settable(vary)]
+    if refused:
+        raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
+
+
+def _controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
+    """Return the model ids of the actuators that a controller with gains drives."""
+    controlled: set[int] = set()
+    for key, articulation in client.articulations.items():
+        controller = articulation.controller
+        if controller is not None and controller.kind == ControllerKind.PD:
+            actuators = layouts[key].actuators
+            controlled.update(actuators[name] for name in controller.params["kp"])
+    return frozenset(controlled)
