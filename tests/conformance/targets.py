@@ -33,7 +33,7 @@ BOT = """
 
 
 @contextmanager
-def server(folder: Path, dialect: str, *, shm: bool) -> Iterator[SimulatedServer]:
+def server(folder: Path, dialect: Any, *, shm: bool) -> Iterator[SimulatedServer]:
     """Serve an editor that may import the two models of a folder."""
     (folder / "bot.xml").write_text(BOT)
     (folder / "urlab_conformance_robot.xml").write_text(ROBOT)

@@ -326,12 +326,7 @@ PICTURES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a picture under another name": (
         ANY,
         "Session 8.4",
-        {
-            "reply": in_reply(
-                "step_ok",
-                lambda r: r.update(cameras={"x": one for one in r["cameras"].values()}) if r.get("cameras") else None,
-            )
-        },
+        {"reply": in_reply("step_ok", each("cameras", lambda v: {f"{name} 2": one for name, one in v.items()}))},
     ),
     "a camera's topic": ("beta", "Beta 56", {"message": in_topic(b"cam ", b"cam")}),
     "a camera's topic in the alpha": (ANY, "Transports 5.2", {"message": in_topic(b"cam ", b"cam2 ")}),

@@ -44,7 +44,7 @@ def report(request: pytest.FixtureRequest) -> Report:
     async def checked() -> Report:
         config = request.config
         groups = {Group.READ} | {one for one in (Group.PLAY, Group.AUTHOR) if config.getoption(f"--{one}")}
-        wire = Wire(config.getoption("--address"), 5559, None, shm=False, timeout=10)
+        wire = Wire(str(config.getoption("--address")), 5559, None, shm=False, timeout=10)
         made = Bench(wire)
         try:
             await made.open()

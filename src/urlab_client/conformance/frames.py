@@ -7,6 +7,7 @@ wants to know of each of them.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any, Final, cast
 
 import msgspec
@@ -98,9 +99,13 @@ def oddities(value: Any, declared: Any) -> list[str]:
         value: The reply as plain data.
         declared: The reply's struct, or any annotation.
     """
+    return list(dict.fromkeys(_odd(value, _info(declared), "")))
+
+
+@cache
+def _info(declared: Any) -> Type:
     with building():
-        info = type_info(declared)
-    return list(dict.fromkeys(_odd(value, info, "")))
+        return type_info(declared)
 
 
 def _odd(value: Any, info: Type, where: str) -> Iterator[str]:

@@ -7,6 +7,7 @@ Shared memory goes past it.
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final, Self, TypeAlias, cast
@@ -145,6 +146,7 @@ class Relay:
         self._stop.bind(_STOP)
         for socket in (self._front, self._back, self._stop):
             self._poller.register(socket, zmq.POLLIN)
+        self._ended = threading.Event()
         self._thread = background_thread("urlab-relay", self._run, failed=self._fail)
 
     # What a subclass does with it
@@ -186,13 +188,13 @@ class Relay:
             stop = self._ports.context.socket(zmq.PAIR)
             stop.connect(_STOP)
             stop.send(b"")
-            self._thread.join()
+            self._ended.wait()  # an interrupted `Thread.join` takes the thread for ended
             self._ports.context.destroy(linger=0)
 
     def join(self) -> None:
         """Wait until the relay fails or is closed."""
-        while self._thread.is_alive():
-            self._thread.join(0.2)  # so that Ctrl-C is seen everywhere
+        while not self._ended.wait(0.2):  # so that Ctrl-C is seen everywhere
+            pass
         if self.failure is not None:
             raise self.failure
 
@@ -220,6 +222,12 @@ class Relay:
         return below, bound
 
     def _run(self) -> None:
+        try:
+            self._relay()
+        finally:
+            self._ended.set()
+
+    def _relay(self) -> None:
         while True:
             for socket, _ in self._poller.poll():
                 if socket is self._stop:

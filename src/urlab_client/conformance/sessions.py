@@ -7,6 +7,7 @@ that runs anywhere.
 from __future__ import annotations
 
 import queue
+import threading
 import time
 from collections import defaultdict, deque
 from pathlib import Path
@@ -172,6 +173,7 @@ class Replay:
             self._of_op[row.op].append(row)
         self._stop = ports.context.socket(zmq.PAIR)
         self._stop.bind("inproc://urlab-replay-stop")
+        self._ended = threading.Event()
         self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
 
     def __enter__(self) -> Self:
@@ -182,13 +184,13 @@ class Replay:
         stop = self._ports.context.socket(zmq.PAIR)
         stop.connect("inproc://urlab-replay-stop")
         stop.send(b"")
-        self._thread.join()
+        self._ended.wait()  # an interrupted `Thread.join` takes the thread for ended
         self._ports.context.destroy(linger=0)
 
     def join(self) -> None:
         """Wait until the replay fails or is closed."""
-        while self._thread.is_alive():
-            self._thread.join(0.2)  # so that Ctrl-C is seen everywhere
+        while not self._ended.wait(0.2):  # so that Ctrl-C is seen everywhere
+            pass
         if self.failure is not None:
             raise self.failure
 
@@ -196,6 +198,12 @@ class Replay:
         self.failure = error
 
     def _run(self) -> None:
+        try:
+            self._serve()
+        finally:
+            self._ended.set()
+
+    def _serve(self) -> None:
         poller = zmq.Poller()
         poller.register(self._front, zmq.POLLIN)
         poller.register(self._stop, zmq.POLLIN)
