@@ -79,6 +79,11 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--timeout", type=seconds, default=10.0, metavar="SECONDS", help="how long to wait for each reply (default: 10)"
     )
+    parser.add_argument(
+        "--trust-server",
+        action="store_true",
+        help="load the binary model of a server on another machine that has no key; it is trusted with one",
+    )
     group = parser.add_argument_group("report")
     group.add_argument("--all", action="store_true", help="also print the statements that were not tried")
     group.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON; - for standard output")
@@ -124,7 +129,8 @@ async def _check(arguments: Namespace, choice: Choice) -> tuple[Bench, Report]:
         keys = client_keys(address, arguments.server_key, arguments.client_key)
         shm = arguments.transport == "shm"
         wire = Wire(address, arguments.step_port, keys, shm=shm, timeout=arguments.timeout)
-    bench = Bench(wire, own_server=own, import_file=arguments.import_file)
+    trusted = True if arguments.trust_server or keys is not None else None
+    bench = Bench(wire, own_server=own, trusted=trusted, import_file=arguments.import_file)
     try:
         try:
             await bench.open()

@@ -80,11 +80,14 @@ class Bench:
         model: The model of the handshake; None without play or with another MuJoCo.
         robots: The robots of the handshake.
         own_server: Whether the server was started for this run.
+        trusted: Whether its binary model is loaded; by default if it is on this machine.
         import_file: The user's MJCF for the checks that import one; None for one in a temporary folder.
         measured: Numbers that checks measured besides.
     """
 
-    def __init__(self, wire: Wire, *, own_server: bool = False, import_file: str | None = None) -> None:
+    def __init__(
+        self, wire: Wire, *, own_server: bool = False, trusted: bool | None = None, import_file: str | None = None
+    ) -> None:
         self.wire = wire
         self.plain_hello: dict[str, Any] = {}
         self.hello: HelloOk
@@ -93,6 +96,7 @@ class Bench:
         self.model: mujoco.MjModel | None = None
         self.robots: list[Robot] = []
         self.own_server = own_server
+        self.trusted: bool = is_local(wire.endpoint) if trusted is None else trusted
         self.import_file = import_file
         self.measured: dict[str, Any] = {}
         self._undo: list[tuple[str, dict[str, Any]]] = []
@@ -143,7 +147,7 @@ class Bench:
             self.hello = decode_reply(OPS["hello"], HelloOk, msgspec.msgpack.encode(reply))
         except ProtocolError as error:
             raise Differs("a handshake", str(error)) from error
-        self.model = _model_of(self.hello)
+        self.model = _model_of(self.hello) if self.trusted else None
         prefixes = {info.prefix: info.compiled_prefix for info in self.hello.articulations}
         layouts = {} if self.model is None else articulation_layouts(self.model, prefixes)
         self.robots = [
@@ -405,7 +409,10 @@ _GONE: Final = frozenset({"not_control_owner", "no_active_manager", "unknown_op"
 NEEDS: Final[Mapping[str, tuple[Callable[[Bench], object], str]]] = {
     "play": (lambda bench: bench.hello.manager_present, "needs a play session (--play begins one)"),
     "no_play": (lambda bench: not bench.hello.manager_present, "needs a server without a play session"),
-    "model": (lambda bench: bench.model is not None, "needs the MuJoCo of the server installed here, and play"),
+    "model": (
+        lambda bench: bench.model is not None,
+        "needs play, the server's MuJoCo here, and a server that is trusted with binary models (--trust-server)",
+    ),
     "robots": (lambda bench: bench.robots, "needs a robot"),
     "robot": (
         lambda bench: bench.robots and len(bench.robot.layout.ctrl_adr),

@@ -203,3 +203,27 @@ def plain(frame: bytes) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"a reply is {_said(value)} instead of a map")  # noqa: TRY004 - of the wire, not of a caller
     return cast("dict[str, Any]", value)
+
+
+_LONG: Final = 1024
+
+
+def thinned(frame: bytes) -> bytes:
+    """Return a reply with the size in the place of each long text and each long run of bytes."""
+
+    def visit(value: Any) -> Any:
+        match value:
+            case str() | bytes() if len(value) > _LONG:
+                return f"({len(value)} bytes)"
+            case dict():
+                return {name: visit(item) for name, item in cast("dict[str, Any]", value).items()}
+            case list():
+                return [visit(item) for item in cast("list[Any]", value)]
+            case _:
+                return value
+
+    codec = msgspec.json if frame[:1] == b"{" else msgspec.msgpack
+    try:
+        return codec.encode(visit(codec.decode(frame)))
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return frame

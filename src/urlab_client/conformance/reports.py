@@ -145,11 +145,11 @@ def readable(exchange: Exchange, redact: Redact) -> dict[str, Any]:
 
 
 def _readable(frame: bytes, size: int, redact: Redact) -> Any:
-    if len(frame) < size:
-        return f"({size} bytes)"
     try:
         value = msgspec.json.decode(frame) if frame[:1] == b"{" else msgspec.msgpack.decode(frame)
     except (msgspec.MsgspecError, UnicodeDecodeError):
+        if len(frame) < size:
+            return f"({size} bytes)"
         return f"(not a message: {frame[:32].hex()})"
     return _cleaned(value, redact)
 

@@ -18,7 +18,7 @@ from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.conformance.declarations import Differs
-from urlab_client.conformance.frames import oddities, other_numbers, plain
+from urlab_client.conformance.frames import oddities, other_numbers, plain, thinned
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import ControlRequest, Op
 from urlab_client.protocol.messages.jobs import OpStarted
@@ -35,7 +35,7 @@ _ANY: Final = OPS["meta"]
 
 
 class Exchange(Struct):
-    """A request and its reply, as they were on the wire; long frames are cut."""
+    """A request and its reply, as they were on the wire; long replies are without models and pixels, or cut."""
 
     number: int
     op: str
@@ -103,7 +103,7 @@ class Wire:
         )
         took = time.perf_counter() - started
         self.count += 1
-        kept = request[:_KEPT_BYTES], reply[:_KEPT_BYTES]
+        kept = request[:_KEPT_BYTES], reply if len(reply) <= _KEPT_BYTES else thinned(reply)[:_KEPT_BYTES]
         self.exchanges.append(Exchange(self.count, op.name, *kept, len(request), len(reply), took))
         self.times.setdefault(op.name, []).append(took)
         return reply
