@@ -35,14 +35,14 @@ _RUNG_FOR_REPLY = b"r"
 
 @contextlib.contextmanager
 def memory_server(
-    answers: Mapping[str, bytes], directory: Path, *, bell: bool, camera: tuple[str, int, int, float] | None = None
+    answers: Mapping[str, bytes], directory: Path, *, doorbell: bool, camera: tuple[str, int, int, float] | None = None
 ) -> Iterator[int]:
     """Run the server; yield its port.
 
     Args:
         answers: Reply by op; `hello` is made to point at `directory`.
         directory: Where the regions go.
-        bell: Whether to have a doorbell.
+        doorbell: Whether to have a doorbell.
         camera: File name, width, height and pictures per second of a camera that is written all the time.
     """
     hello = msgspec.msgpack.decode(answers["hello"]) | {"shm_session_dir": str(directory), "manager_present": True}
@@ -51,7 +51,7 @@ def memory_server(
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         stdin, stdout = process.stdin, process.stdout
         assert stdin is not None and stdout is not None  # noqa: S101, PT018
-        encoded = msgspec.msgpack.encode((material, str(directory), bell, camera))
+        encoded = msgspec.msgpack.encode((material, str(directory), doorbell, camera))
         stdin.write(len(encoded).to_bytes(8, "big") + encoded)
         stdin.flush()
         try:
@@ -117,7 +117,7 @@ def _main() -> None:
     stdin = sys.stdin.buffer
     material = stdin.read(int.from_bytes(stdin.read(8), "big"))
     kinds = tuple[dict[str, bytes], str, bool, tuple[str, int, int, float] | None]
-    by_name, folder, bell, camera = msgspec.msgpack.decode(material, type=kinds)
+    by_name, folder, doorbell, camera = msgspec.msgpack.decode(material, type=kinds)
     answers = {name.encode(): reply for name, reply in by_name.items()}
     directory = Path(folder)
 
@@ -133,11 +133,11 @@ def _main() -> None:
     if camera is not None:
         threading.Thread(target=_write_pictures, args=(directory, camera), daemon=True).start()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    if bell:
+    if doorbell:
         listener.bind(str(directory / "doorbell.sock"))
         listener.listen()
     print(port, flush=True)
-    if not bell:
+    if not doorbell:
         if sys.platform == "linux":  # or each sleep would take half as long again
             ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1)
         due = time.perf_counter()

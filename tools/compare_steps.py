@@ -77,7 +77,7 @@ def client(tree: Path, flavour: str) -> Iterator[Client]:
         answers = recorded(_JOINTS)
         if "shm" in flavour:
             directory = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            port = stack.enter_context(memory_server(answers, directory, bell=True))
+            port = stack.enter_context(memory_server(answers, directory, doorbell=True))
         else:
             port = stack.enter_context(server(answers))
         process = stack.enter_context(

@@ -46,6 +46,7 @@ PACKAGE = "src/urlab_client"
 RECORD = ".mutants"
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.toml")
 
+RECORDED = "not browser and not matrix"  # also what takes long: some of the code runs nowhere else
 TEST_S, RUN_S = 120, 900  # others use the machine, too
 MEMORY = 8 << 30  # a mutant may ask for more and more of it
 PASSED, FAILED = 0, 1  # exit codes of pytest
@@ -116,7 +117,7 @@ def record(root: Path, tests: Sequence[str]) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
     environment |= {"PYTHONPATH": f"{root}/src:{root}/tools", TIMES: f"{folder}/times"}
     environment["COVERAGE_PROCESS_START"] = f"{folder}/rc"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "sample_mutants", *tests]
+    command = [sys.executable, "-m", "pytest", "-q", "-m", RECORDED, "-p", "sample_mutants", *tests]
     if subprocess.run(command, cwd=root, env=environment, check=False).returncode not in {PASSED, FAILED}:  # noqa: S603
         raise SystemExit("the tests cannot run")
     Coverage(config_file=str(folder / "rc")).combine()
@@ -165,7 +166,7 @@ class Record:
 
 
 def covering(mutant: Mutant, known: Record) -> set[str]:
-    """Return the tests that run a mutant's line; of one that runs on import, those that run lines with its names.
+    """Return the tests that run a mutant's line; of one that runs on import, those of its class or with its names.
 
     If none does, as of a class that others only inherit from, any test of the file may notice.
     """
@@ -177,7 +178,9 @@ def covering(mutant: Mutant, known: Record) -> set[str]:
     names = {node.name for node in around if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)}
     names = names or {node.id for stmt in around for node in ast.walk(stmt) if isinstance(node, ast.Name)}
     word = re.compile(rf"\b({'|'.join(names)})\b")
-    found: set[str] = set()
+    classes = [node for node in around if isinstance(node, ast.ClassDef)]
+    inside = range(classes[-1].lineno, (classes[-1].end_lineno or 0) + 1) if classes else range(0)
+    found = known.running(mutant.file, inside)  # methods that check fields, of which other lines may know nothing
     for file in sources(known.root):
         text = (known.root / file).read_text("utf-8").splitlines()
         found |= known.running(file, [number for number, words in enumerate(text, 1) if names and word.search(words)])

@@ -73,7 +73,7 @@ def _blocking_steps() -> Iterator[Pair]:
     answers = recorded(_JOINTS)
     with (
         _directory() as directory,
-        memory_server(answers, directory, bell=True) as shared,
+        memory_server(answers, directory, doorbell=True) as shared,
         server(answers) as port,
         _stepping_blocking(shared, transport="shm") as ours,
         _stepping_blocking(port) as floor,
@@ -82,11 +82,11 @@ def _blocking_steps() -> Iterator[Pair]:
 
 
 @contextlib.contextmanager
-def _steps(*, bell: bool) -> Iterator[Pair]:
+def _steps(*, doorbell: bool) -> Iterator[Pair]:
     answers = recorded(_JOINTS)
     with (
         _directory() as directory,
-        memory_server(answers, directory, bell=bell) as shared,
+        memory_server(answers, directory, doorbell=doorbell) as shared,
         server(answers) as port,
         asyncio.Runner() as runner,
         _stepping(runner, shared, transport="shm") as ours,
@@ -118,7 +118,7 @@ def _pictures(width: int, height: int, rate: float) -> Iterator[Pair]:
     camera = camera_file(prefix, "eye"), width, height, rate
     with (
         _directory() as directory,
-        memory_server(answers, directory, bell=False, camera=camera) as port,
+        memory_server(answers, directory, doorbell=False, camera=camera) as port,
         asyncio.Runner() as runner,
     ):
         client = aio.URLabClient(f"tcp://127.0.0.1:{port}", step_mode="direct", transport="shm")
@@ -171,7 +171,7 @@ _DOORBELL = Row(
     what="await client.step() over shared memory with a doorbell",
     floor="the same over ZeroMQ",
     reach=0.5,
-    prepare=lambda: _steps(bell=True),
+    prepare=lambda: _steps(doorbell=True),
 )
 _FACADE_DOORBELL = Row(
     name="step-facade-shm-doorbell",
@@ -185,7 +185,7 @@ _POLLING = Row(
     what="await client.step() over shared memory, server looks every 100 µs",
     floor="the same over ZeroMQ",
     reach=0.8,
-    prepare=lambda: _steps(bell=False),
+    prepare=lambda: _steps(doorbell=False),
 )
 
 ROWS = (

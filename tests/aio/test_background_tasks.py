@@ -17,9 +17,8 @@ from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio import launch as launching
 from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.aio.session.control import Control
-from urlab_client.aio.state import session_keeper
-from urlab_client.aio.state.connection_monitor import ConnectionMonitor
-from urlab_client.aio.state.session_keeper import SessionKeeper
+from urlab_client.aio.state import connection_monitor
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.live_state import LiveState
 from urlab_client.aio.transport import waiting as transport_waiting
@@ -61,13 +60,13 @@ async def is_told(events: Stream[ClientEvent], caplog: pytest.LogCaptureFixture,
 
 
 async def test_the_keeper_of_the_session(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_keeper, "_LOOK_S", 0.01)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.01)
     ports = {f"{name}_port": free_port() for name in ("step", "state", "ctrl", "info", "camera")}
     async with SimulatedServer("arm", play=True, **ports) as first:
         client = URLabClient(**first.client_options(), step_mode="direct", keep_session=True)
         events = client.events()
         with monkeypatch.context() as patch:
-            patch.setattr(SessionKeeper, "_look", fail)
+            patch.setattr(SessionKeeper, "_probe", fail)
             await client.discover()
             await is_told(events, caplog, "urlab-keeper")
         assert (await client.step()).step == 1
@@ -90,7 +89,7 @@ async def test_the_watch_on_the_connection(
     async with URLabClient(**server.client_options(), step_mode="direct") as client:
         await client.discover()
         async with client.events() as events:
-            client._watch._look()
+            client._monitor._investigate()
             await is_told(events, caplog, "urlab-watch")
             assert (await client.step()).step == 1
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ports import free_port
 from samples import filled
 from scripted import meta_ok
 from waiting import DEADLINE_S, in_time, until
@@ -107,7 +108,8 @@ async def test_nothing_is_left_of_many_clients(scripted: Any) -> None:
         return threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))
 
     async def use() -> None:
-        async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:
+        address = f"tcp://127.0.0.1:{scripted.port}"
+        async with URLabClient(address, local_model=False, state_port=free_port()) as client:
             await client.discover()
             client.events()
             with pytest.raises(URLabTimeoutError):

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from urlab_client.aio.streams import stream as streams
+from urlab_client.aio.streams import handler
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import URLabTimeoutError
@@ -60,7 +60,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(streams, "time", clock)
+    monkeypatch.setattr(handler, "time", clock)
     return clock
 
 

@@ -14,7 +14,7 @@ from waiting import DEADLINE_S
 from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
-from urlab_client.aio.state import session_keeper
+from urlab_client.aio.state import connection_monitor
 from urlab_client.errors import ServerRestarted, SessionTakenOver
 from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost, SessionOpened
 from urlab_client.server import SimulatedServer
@@ -109,7 +109,7 @@ async def test_a_session_that_was_taken_over_is_not_taken_back(ports: dict[str, 
 
 
 async def test_a_takeover_is_noticed_without_a_call(server: SimulatedServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_keeper, "_LOOK_S", 0.02)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.02)
     async with keeping(server) as client, URLabClient(**server.client_options()) as other:
         await client.discover()
         events = client.events()
@@ -133,14 +133,14 @@ async def test_a_takeover_behind_a_broken_line_is_none_of_a_restart(server: Simu
         await other.discover()
         relay.refusing = False
         await until(events, SessionLost)
-        await wait_until(lambda: client._keeper._given_up == client.session_id)
+        await wait_until(lambda: client._keeper._taken_over == client.session_id)
         await other.runtime.list_keyframes()
 
 
 async def test_play_that_somebody_else_starts_is_discovered(
     server: SimulatedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_keeper, "_LOOK_S", 0.1)
+    monkeypatch.setattr(connection_monitor, "_PROBE_INTERVAL_S", 0.1)
     async with keeping(server) as client:
         await client.discover()
         arm, events = client.articulations["arm"], client.events()

@@ -218,20 +218,20 @@ async def test_a_doorbell_that_never_rings_delays_a_reply_and_no_more(
 async def test_a_doorbell_that_hangs_up_at_once_is_done_without(
     connect: Any, plugin: PluginMemory, directory: Path
 ) -> None:
-    with socket.socket(socket.AF_UNIX) as door:
-        door.bind(os.fspath(directory / "doorbell.sock"))
-        door.listen()
-        door.setblocking(False)
+    with socket.socket(socket.AF_UNIX) as doorbell:
+        doorbell.bind(os.fspath(directory / "doorbell.sock"))
+        doorbell.listen()
+        doorbell.setblocking(False)
 
         def turn_away() -> None:
-            door.accept()[0].close()
+            doorbell.accept()[0].close()
 
-        asyncio.get_running_loop().add_reader(door, turn_away)
+        asyncio.get_running_loop().add_reader(doorbell, turn_away)
         client = await shared(connect())
         for _ in range(3):
             assert (await client.step()).time == 0.5
         assert client.transport_stats.over_shm == 3
-        asyncio.get_running_loop().remove_reader(door)
+        asyncio.get_running_loop().remove_reader(doorbell)
 
 
 async def test_a_reply_region_begun_anew_during_a_step_brings_the_reply(connect: Any, plugin: PluginMemory) -> None:

@@ -89,7 +89,7 @@ class Bench:
     def shm(self) -> RawShm:
         """A bare client of the same session over shared memory."""
         assert self.server.shm_dir is not None
-        return RawShm(self.server.shm_dir, bell=True)
+        return RawShm(self.server.shm_dir, doorbell=True)
 
     def drive(self, value: float = 0.25, robot: str = "arm_a", owner: str = ME) -> dict[str, Any]:
         return {"per_articulation": {robot: {"ctrl": [value]}}, "control_owner": owner}

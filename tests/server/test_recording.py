@@ -101,6 +101,7 @@ def test_links_lead_nowhere_else_and_models_stay(bot: Wire, tmp_path: Path, mode
     for path in ("out/ep.json", "inner/ep.json", str(inside), str(models / "bot.xml"), str(models / "ep.json")):
         reply = bot.raw({"op": "recording_save", "session_id": bot.session_id, "path": path})
         assert reply["code"] == "path_not_writable", path
+        assert reply["absolute_path"] == str((replays / path).resolve())
     assert "<mujoco" in (models / "bot.xml").read_text()
     assert not inside.exists()
     named = replays / "ep.json"

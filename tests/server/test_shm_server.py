@@ -114,9 +114,9 @@ def test_play_that_ends_takes_its_regions_along(server: SimulatedServer, rpc: Rp
     assert "shm_session_dir" not in rpc(op="hello")
 
 
-@pytest.mark.parametrize("bell", [True, False])
-def test_steps_are_answered_as_over_zmq(server: SimulatedServer, rpc: Rpc, session: str, bell: bool) -> None:
-    with RawShm(directory_of(server), bell=bell) as shm:
+@pytest.mark.parametrize("doorbell", [True, False])
+def test_steps_are_answered_as_over_zmq(server: SimulatedServer, rpc: Rpc, session: str, doorbell: bool) -> None:
+    with RawShm(directory_of(server), doorbell=doorbell) as shm:
         for count in range(1, 6):
             reply = shm.call({"op": "step", "session_id": session})
             assert reply is not None
@@ -128,7 +128,7 @@ def test_steps_are_answered_as_over_zmq(server: SimulatedServer, rpc: Rpc, sessi
 
 def test_bytes_of_a_reply_are_those_of_zmq(server: SimulatedServer, rpc: Rpc) -> None:
     request = {"op": "step", "session_id": "sync-1234"}
-    with RawShm(directory_of(server), bell=True) as shm:
+    with RawShm(directory_of(server), doorbell=True) as shm:
         assert shm.call(request) == rpc(**request)
     assert rpc(**request)["code"] == "session_expired"
     assert "sync-1234" in rpc(**request)["message"]
@@ -137,7 +137,7 @@ def test_bytes_of_a_reply_are_those_of_zmq(server: SimulatedServer, rpc: Rpc) ->
 def test_what_does_not_travel_this_way_is_refused_before_it_is_executed(
     server: SimulatedServer, rpc: Rpc, session: str
 ) -> None:
-    with RawShm(directory_of(server), bell=True) as shm:
+    with RawShm(directory_of(server), doorbell=True) as shm:
         for op in ("import_xml", "stop_pie", "list_actors"):
             refused = shm.call({"op": op, "session_id": session})
             assert refused is not None
@@ -149,7 +149,7 @@ def test_a_step_whose_pictures_cannot_fit_is_not_taken(base: Path) -> None:
     with (
         SimulatedServer("arm", play=True, camera_size=(640, 480), shm_dir=base) as server,
         zmq_line(server) as rpc,
-        RawShm(directory_of(server), bell=True) as shm,
+        RawShm(directory_of(server), doorbell=True) as shm,
     ):
         session = rpc(op="hello")["session_id"]
         rpc(op="set_mode", session_id=session, mode="direct")
@@ -162,7 +162,7 @@ def test_a_step_whose_pictures_cannot_fit_is_not_taken(base: Path) -> None:
 
 
 def test_a_handshake_whose_model_cannot_fit_opens_no_session(server: SimulatedServer, rpc: Rpc, session: str) -> None:
-    with RawShm(directory_of(server), bell=True) as shm:
+    with RawShm(directory_of(server), doorbell=True) as shm:
         refused = shm.call({"op": "hello"})
         assert refused is not None
         assert refused["code"] == "wrong_transport"
@@ -177,7 +177,7 @@ def test_a_reply_that_turns_out_too_large_says_so_and_whether_it_was_executed(
     with (
         SimulatedServer("ball", play=True, shm_dir=base) as server,
         zmq_line(server) as rpc,
-        RawShm(directory_of(server), bell=True) as shm,
+        RawShm(directory_of(server), doorbell=True) as shm,
     ):
         read = shm.call({"op": "meta"})
         assert read is not None
@@ -191,9 +191,9 @@ def test_a_reply_that_turns_out_too_large_says_so_and_whether_it_was_executed(
 
 def test_snapshots_come_with_each_step_to_whom_asks_for_them(server: SimulatedServer, session: str, rpc: Rpc) -> None:
     directory = directory_of(server)
-    with RawShm(directory, bell=True) as shm:
-        assert shm.bell is not None
-        shm.bell.send(b"S")
+    with RawShm(directory, doorbell=True) as shm:
+        assert shm.doorbell is not None
+        shm.doorbell.send(b"S")
         state = RawRegion(eventually(lambda: (directory / "state.shm").is_file() and directory / "state.shm"))
         for count in range(1, 30):
             reply = shm.call({"op": "step", "session_id": session})
@@ -208,9 +208,9 @@ def test_snapshots_come_with_each_step_to_whom_asks_for_them(server: SimulatedSe
 @pytest.mark.opengl
 def test_pictures_come_to_whom_asks_for_them_in_every_mode(server: SimulatedServer, session: str) -> None:
     directory = directory_of(server)
-    with RawShm(directory, bell=True) as shm:
-        assert shm.bell is not None
-        shm.bell.send(b"C")
+    with RawShm(directory, doorbell=True) as shm:
+        assert shm.doorbell is not None
+        shm.doorbell.send(b"C")
         region = RawRegion(directory / "cam_arm_overview.shm")
         eventually(lambda: region.sequence >= 3)
         eventually(lambda: b"c" in shm.wait(1.0))  # those may have been published before there was whom to tell
@@ -235,14 +235,14 @@ HOSTILE = {
 @pytest.mark.parametrize("damage", HOSTILE)
 def test_a_damaged_request_region_harms_nobody(server: SimulatedServer, rpc: Rpc, session: str, damage: str) -> None:
     directory = directory_of(server)
-    with RawShm(directory, bell=True) as shm:
+    with RawShm(directory, doorbell=True) as shm:
         assert shm.call({"op": "step", "session_id": session}) is not None
         good = shm.requests.map[:64]
         HOSTILE[damage](shm.requests)
         sequence = int.from_bytes(shm.requests.map[16:24], "little")
         shm.requests.map[16:24] = (sequence + 5).to_bytes(8, "little")
-        assert shm.bell is not None
-        shm.bell.send(b"q")
+        assert shm.doorbell is not None
+        shm.doorbell.send(b"q")
         assert rpc(op="step", session_id=session)["op"] == "step_ok"
         shm.requests.map[:64] = good
         eventually(lambda: shm.call({"op": "meta"}, 1.0))
@@ -256,25 +256,25 @@ def test_files_that_are_cut_off_do_not_kill_the_server(
     eventually((directory / name).is_file)
     whole, header = (directory / name).stat().st_size, (directory / name).read_bytes()[:16]
     requests = RawRegion(directory / "req.shm")
-    with socket.socket(socket.AF_UNIX) as bell:
-        bell.connect(os.fspath(directory / "doorbell.sock"))
-        bell.send(b"S")
+    with socket.socket(socket.AF_UNIX) as doorbell:
+        doorbell.connect(os.fspath(directory / "doorbell.sock"))
+        doorbell.send(b"S")
         os.truncate(directory / name, 10)
         if name != "req.shm":
             requests.publish(msgspec.msgpack.encode({"op": "meta"}))
-        bell.send(b"q")
+        doorbell.send(b"q")
         for _ in range(20):
             assert rpc(op="step", session_id=session)["op"] == "step_ok"
     requests.close()
     eventually(lambda: (directory / name).stat().st_size == whole and (directory / name).read_bytes()[:16] == header)
-    with RawShm(directory, bell=True) as shm:
+    with RawShm(directory, doorbell=True) as shm:
         eventually(lambda: shm.call({"op": "meta"}, 0.5))
 
 
 def test_nonsense_at_the_doorbell_disturbs_nobody(server: SimulatedServer, session: str) -> None:
     directory = directory_of(server)
     noise = random.Random(5)
-    with ExitStack() as unmatched_names, RawShm(directory, bell=False) as shm:
+    with ExitStack() as unmatched_names, RawShm(directory, doorbell=False) as shm:
         for number in range(50):
             stranger = unmatched_names.enter_context(socket.socket(socket.AF_UNIX))
             stranger.connect(os.fspath(directory / "doorbell.sock"))
@@ -298,21 +298,32 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
     assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
 
+def test_a_client_that_never_listens_to_the_doorbell_delays_nobody(base: Path) -> None:
+    memory = SharedMemoryServer(base, Health())
+    memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
+    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, bell=True) as shm:
+        deaf.connect(os.fspath(memory.directory / "doorbell.sock"))
+        for _ in range(600):  # its buffer holds fewer rings
+            assert shm.call({"op": "ping"}) is not None
+    memory.stop()
+    assert memory.join(30)
+
+
 def test_a_request_that_is_seen_before_its_ring_does_not_count_as_one_without(base: Path) -> None:
     memory = SharedMemoryServer(base, Health())
     memory.switch_camera("bot/eye", (4, 4))
     memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
-    with RawShm(memory.directory, bell=True) as shm:
+    with RawShm(memory.directory, doorbell=True) as shm:
         assert shm.call({"op": "ping"}) is not None
         memory.publish_picture("bot/eye", bytes(64))  # whoever may have waited for the first one has it
         before = shm.replies.sequence
         shm.requests.publish(msgspec.msgpack.encode({"op": "ping"}))
         eventually(lambda: shm.replies.sequence > before)
-        assert shm.bell is not None
-        shm.bell.send(b"q")
+        assert shm.doorbell is not None
+        shm.doorbell.send(b"q")
         assert shm.call({"op": "ping"}) is not None
         assert memory.wanted_cameras() == []
-        with RawShm(memory.directory, bell=False) as silent:
+        with RawShm(memory.directory, doorbell=False) as silent:
             eventually(lambda: silent.call({"op": "ping"}) and memory.wanted_cameras() == ["bot/eye"])
     memory.stop()
     assert memory.join(30)
@@ -320,7 +331,10 @@ def test_a_request_that_is_seen_before_its_ring_does_not_count_as_one_without(ba
 
 def test_a_path_too_long_for_a_socket_leaves_polling(tmp_path: Path) -> None:
     deep = tmp_path / ("d" * 100)
-    with SimulatedServer("ball", play=True, shm_dir=deep) as server, RawShm(directory_of(server), bell=False) as shm:
+    with (
+        SimulatedServer("ball", play=True, shm_dir=deep) as server,
+        RawShm(directory_of(server), doorbell=False) as shm,
+    ):
         assert not (directory_of(server) / "doorbell.sock").exists()
         assert shm.call({"op": "meta"}) is not None
 
@@ -329,7 +343,7 @@ def test_two_servers_share_a_base_and_leave_nothing(base: Path) -> None:
     with SimulatedServer("ball", play=True, shm_dir=base) as one, SimulatedServer("ball", shm_dir=base) as two:
         assert directory_of(one) != directory_of(two)
         for server in (one, two):
-            with RawShm(directory_of(server), bell=True) as shm:
+            with RawShm(directory_of(server), doorbell=True) as shm:
                 assert shm.call({"op": "meta"}) is not None
     eventually(lambda: list(base.iterdir()) == [])
 
@@ -358,7 +372,7 @@ def test_a_terminated_server_cleans_up_and_a_killed_one_is_cleaned_up_after(base
     terminated, directory = serve(base)
     assert not left.exists()
     assert directory.is_dir()
-    with RawShm(directory, bell=True) as shm:
+    with RawShm(directory, doorbell=True) as shm:
         assert shm.call({"op": "meta"}) is not None
     end(terminated, subprocess.Popen.terminate)
     assert {path.name for path in base.iterdir()} == {"urlab-not-ours"}
@@ -396,7 +410,7 @@ def test_where_replies_cannot_be_written_zmq_goes_on_alone(
     server: SimulatedServer, rpc: Rpc, session: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = directory_of(server)
-    with RawShm(directory, bell=True) as shm:
+    with RawShm(directory, doorbell=True) as shm:
         assert shm.call({"op": "step", "session_id": session}) is not None
 
         def publish(region: RegionFile, payload: bytes) -> None:

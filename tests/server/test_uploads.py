@@ -278,7 +278,7 @@ def test_a_large_chunk_goes_over_zmq_alone(tmp_path: Path, tmp_path_factory: pyt
     with SimulatedServer(dialect="beta", saved_dir=tmp_path, shm_dir=base) as server, Wire(server) as wire:
         wire.hello()
         assert server.shm_dir is not None
-        with RawShm(server.shm_dir, bell=True) as shm:
+        with RawShm(server.shm_dir, doorbell=True) as shm:
             assert shm.requests.header[2] < len(data), "it does not fit into a slot"
         upload = wire.ask("upload_model_manifest", **manifest(zeros_bin=data))["upload_id"]
         assert wire.ask("upload_model_chunk", **chunk(upload, data, "zeros.bin"))["complete"]

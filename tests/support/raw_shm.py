@@ -105,13 +105,13 @@ class Doorbell:
 class RawShm:
     """Requests over `req.shm` and `rep.shm`, with or without being told."""
 
-    def __init__(self, directory: Path, *, bell: bool) -> None:
+    def __init__(self, directory: Path, *, doorbell: bool) -> None:
         self.directory = directory
         self.requests = RawRegion(directory / "req.shm")
         self.replies = RawRegion(directory / "rep.shm")
-        self.bell: Doorbell | NamedEvents | None = None
-        if bell:
-            self.bell = NamedEvents(directory) if sys.platform == "win32" else Doorbell(directory)
+        self.doorbell: Doorbell | NamedEvents | None = None
+        if doorbell:
+            self.doorbell = NamedEvents(directory) if sys.platform == "win32" else Doorbell(directory)
 
     def __enter__(self) -> Self:
         return self
@@ -121,27 +121,27 @@ class RawShm:
     ) -> None:
         self.requests.close()
         self.replies.close()
-        if self.bell is not None:
-            self.bell.close()
+        if self.doorbell is not None:
+            self.doorbell.close()
 
     def call(self, request: dict[str, Any] | bytes, seconds: float = 30.0) -> dict[str, Any] | None:
         """The reply, or None if there is none in time."""
         before = self.replies.sequence
         self.requests.publish(request if isinstance(request, bytes) else msgspec.msgpack.encode(request))
-        if self.bell is not None:
-            self.bell.send(b"q")
+        if self.doorbell is not None:
+            self.doorbell.send(b"q")
         deadline = time.monotonic() + seconds
         while self.replies.sequence == before:
             left = deadline - time.monotonic()
             if left <= 0:
                 return None
             with contextlib.suppress(OSError):
-                self.wait(min(left, 0.001 if self.bell is None else 0.5))
+                self.wait(min(left, 0.001 if self.doorbell is None else 0.5))
         return msgspec.msgpack.decode(self.replies.read()[1])
 
     def wait(self, seconds: float) -> bytes:
         """Rings that came."""
-        if self.bell is None:
+        if self.doorbell is None:
             time.sleep(seconds)
             return b""
-        return self.bell.wait(seconds)
+        return self.doorbell.wait(seconds)

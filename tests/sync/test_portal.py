@@ -30,6 +30,7 @@ from urlab_client.errors import ClientClosed, ForkedError, URLabError, URLabRPCE
 from urlab_client.sync import _loop
 from urlab_client.sync._facade import Facade, FacadeRoot, wrap
 from urlab_client.sync._portal import Portal
+from urlab_client.sync._signals import DeferredSignals
 from urlab_client.values.names import NameMap
 
 
@@ -596,6 +597,54 @@ class TestInterrupt:
         """)
         interrupt_when_ready(process)
         assert outcome(process) == (0, ["op cleaned up", "caller cleans up", "interrupted", "42"], "")
+
+    def test_is_deferred_until_it_is_let_in_or_the_block_ends(self) -> None:
+        class Struck(Exception):
+            pass
+
+        def strike(number: int, frame: object) -> None:
+            raise Struck
+
+        seen: list[bool] = []
+        before = signal.signal(signal.SIGTERM, strike)
+        try:
+            with DeferredSignals() as signals:
+                signals.on_arrival = lambda: seen.append(signals.arrived)
+                signal.raise_signal(signal.SIGTERM)
+                assert seen == [True]
+                assert isinstance(signals.let_in(), Struck)
+                assert (signals.arrived, signals.let_in()) == (False, None)
+
+            def deferred() -> None:
+                with DeferredSignals() as late:
+                    signal.raise_signal(signal.SIGTERM)
+                    seen.append(late.arrived)
+
+            with pytest.raises(Struck):
+                deferred()
+            assert seen == [True, True]
+            assert signal.getsignal(signal.SIGTERM) is strike
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+    def test_ends_a_call_that_runs_in_the_tests_own_process(self, portal: Portal) -> None:
+        class Struck(Exception):
+            pass
+
+        def strike(number: int, frame: object) -> None:
+            raise Struck
+
+        async def struck() -> None:
+            signal.raise_signal(signal.SIGTERM)
+            await asyncio.Event().wait()
+
+        before = signal.signal(signal.SIGTERM, strike)
+        try:
+            with pytest.raises(Struck):
+                portal.call(struck)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        assert portal.call(answer) == 42
 
     def test_unhandled_ends_the_process_with_one_portal_frame(self) -> None:
         process = child("""

@@ -29,6 +29,10 @@ def once():
 
 class Base:
     size = 2
+    most = 4
+
+    def check(self):
+        assert self.size <= self.most
 
 class Square(Base):
     def area(self):
@@ -47,6 +51,9 @@ def test_shout():
 
 def test_area():
     assert Square().area() == 4
+
+def test_check():
+    Square().check()
 
 def test_that_passes_only_once():
     assert once() == 1
@@ -104,12 +111,13 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         mutant(10, "1 + 1", "1 - 1"),
         mutant(13, "return 1\n", "return 2\n"),
         mutant(16, "size = 2", "size = None"),
+        mutant(17, "most = 4", "most = 1"),
     ]
     monkeypatch.setattr(tool, "draw", lambda *_: drawn)
     capsys.readouterr()
     assert tool.main(["--seed", "7", "--jobs", "2"], **where) == 0
     assert capsys.readouterr().out.splitlines()[:-1] == [
-        "7 mutants, seed 7",
+        "8 mutants, seed 7",
         f"caught     {FILE}:1",
         f"caught     {FILE}:4",
         f"equivalent {FILE}:6",
@@ -117,6 +125,7 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         f"no test    {FILE}:10",
         f"no test    {FILE}:13",
         f"caught     {FILE}:16",
+        f"caught     {FILE}:17",
         "",
         f"survives: {FILE}:7 (1 of the 1 tests that run it passed)",
         "@@ -5,5 +5,5 @@",
@@ -145,8 +154,8 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         " ",
         " class Base:",
         "",
-        "(top)             3 of    6   50%",
-        "all               3 of    6   50%",
+        "(top)             4 of    7   57%",
+        "all               4 of    7   57%",
     ]
     assert (tree / FILE).read_text("utf-8") == SOURCE
 

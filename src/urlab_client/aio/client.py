@@ -27,11 +27,10 @@ from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.capturing import Capturing
-from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
 from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
-from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
@@ -207,9 +206,9 @@ class URLabClient(ClientState):
             promote=auto_promote_step_mode,
             trusted=trust_server or keys is not None or is_local(address),
         )
-        self._watch = ConnectionMonitor(session, state)
+        self._monitor = ConnectionMonitor(session, state)
         self._keeper = SessionKeeper(session, state, self._discovery)
-        self._transport.on_event = self._watch.on_connection
+        self._transport.on_event = self._monitor.on_connection
         self._closed = False
         self._sim = SimNamespace(session, state, self._discovery)
         self._scene = SceneNamespace(session, self._sim)
@@ -306,7 +305,7 @@ class URLabClient(ClientState):
             if not self._config.read_only:
                 raise ValueError("discover: handshake is for a client with read_only=True, which opens no session")
             async with self._session.turn(MetaRequest, timeout=timeout) as turn:
-                await self._discovery.look_on(turn, handshake)
+                await self._discovery.open_read_only(turn, handshake)
             return
         async with self._session.turn(Hello, timeout=timeout) as turn:
             await self._discovery.open(turn, level)
@@ -636,7 +635,7 @@ class URLabClient(ClientState):
                 await self._publishers.camera_switch.aclose(connected=playing)
             await self._session.control.aclose(connected=playing)
             await self._keeper.aclose()
-            await self._watch.aclose()
+            await self._monitor.aclose()
             await asyncio.sleep(0)  # lets a blocking client notice that the server has gone in the meantime
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # best effort: play may have ended

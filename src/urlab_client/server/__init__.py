@@ -19,26 +19,19 @@ if TYPE_CHECKING:
     from urlab_client.simulation.controller_config import ControllerConfig
     from urlab_client.simulation.opengl import RenderingUnavailable
 
-_HOMES = {
-    "bundled_models": "urlab_client.server.assets.bundled_robots",
-    "ActiveFault": "urlab_client.server.faults",
-    "Corrupt": "urlab_client.server.faults",
-    "Cut": "urlab_client.server.faults",
-    "Delay": "urlab_client.server.faults",
-    "Drop": "urlab_client.server.faults",
-    "Fault": "urlab_client.server.faults",
-    "Faults": "urlab_client.server.faults",
-    "Refuse": "urlab_client.server.faults",
-    "ModelError": "urlab_client.server.open_server",
-    "Limits": "urlab_client.server.limits",
-    "ControllerConfig": "urlab_client.simulation.controller_config",
-    "RenderingUnavailable": "urlab_client.simulation.opengl",
-    "ServedRequest": "urlab_client.server.rpc.dispatch",
-    "SimulatedServer": "urlab_client.server.simulated",
-    "CurveServer": "urlab_client.server.transport.curve_authentication",
-    "UnprotectedServer": "urlab_client.server.transport.curve_authentication",
-    "PortInUse": "urlab_client.server.transport.endpoint",
+_NAMES = {
+    "server.assets.bundled_robots": ("bundled_models",),
+    "server.faults": ("ActiveFault", "Corrupt", "Cut", "Delay", "Drop", "Fault", "Faults", "Refuse"),
+    "server.limits": ("Limits",),
+    "server.open_server": ("ModelError",),
+    "server.rpc.dispatch": ("ServedRequest",),
+    "server.simulated": ("SimulatedServer",),
+    "server.transport.curve_authentication": ("CurveServer", "UnprotectedServer"),
+    "server.transport.endpoint": ("PortInUse",),
+    "simulation.controller_config": ("ControllerConfig",),
+    "simulation.opengl": ("RenderingUnavailable",),
 }
+_HOMES = {name: f"urlab_client.{module}" for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
-"""The state that the op handlers of a server share.
+"""The state that the op handlers of a server share: its world, its session and its play.
 
-Handlers get it as their first argument; `SimulatedServer` creates it.
+Handlers get it as their first argument; `open_server` creates it.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ _SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 class ServerSession:
     """State that the server keeps between requests, apart from the world.
 
+    It survives play sessions and level changes, and ends with the server or the next `hello`. It does not time out.
+
     Attributes:
         id: Active session id, a lower-case GUID; empty before the first `hello`.
         json: Whether replies are JSON instead of msgpack, for all clients.
@@ -97,7 +99,7 @@ def _level(name: str) -> ObservationLevel | None:
 
 
 class DriverLease:
-    """One lease at a time, which expires after some time without requests."""
+    """By which clients announce that the server is in use. It is advisory, and expires without requests."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

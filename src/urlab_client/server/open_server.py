@@ -1,4 +1,4 @@
-"""An open server: its sockets, threads, play session and folders; opening, restoring and closing them."""
+"""An open server: its sockets, threads, play session and folders; opening, restoring, drawing and closing it."""
 
 from __future__ import annotations
 

@@ -14,10 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextvars import Context
-from typing import Any, TypeVarTuple
-
-Ts = TypeVarTuple("Ts")
+from typing import Any
 
 # Consecutive rounds of callbacks after which sockets are polled even if more callbacks are ready.
 _ROUNDS = 4
@@ -29,8 +26,6 @@ _READABLE = getattr(select, "EPOLLIN", None)
 _NEEDED = (
     "_asyncgen_finalizer_hook",
     "_asyncgen_firstiter_hook",
-    "_closed",
-    "_debug",
     "_process_events",
     "_ready",
     "_run_once",
@@ -46,8 +41,6 @@ class CallerLoop(asyncio.SelectorEventLoop):
 
     _asyncgen_finalizer_hook: Any
     _asyncgen_firstiter_hook: Any
-    _closed: bool
-    _debug: bool
     _process_events: Any
     _ready: deque[Any]
     _run_once: Any
@@ -57,21 +50,10 @@ class CallerLoop(asyncio.SelectorEventLoop):
     _thread_id: int | None
 
     def __init__(self) -> None:
-        self._as_known = False  # during the constructor of asyncio's own loop
         super().__init__()
         self._as_known = all(hasattr(self, name) for name in _NEEDED)
         nothing: Mapping[int, Any] = {}
         self._poll, self._keys = _parts(self._selector) if self._as_known else (None, nothing)
-
-    def call_soon(
-        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
-    ) -> asyncio.Handle:
-        """See `asyncio.AbstractEventLoop.call_soon`."""
-        if not self._as_known or self._closed or self._debug:  # asyncio's own method then does more, or raises
-            return super().call_soon(callback, *args, context=context)
-        handle = asyncio.Handle(callback, args, self, context)
-        self._ready.append(handle)
-        return handle
 
     def run_until_stopped(self) -> None:
         """Do the same as `run_forever`, for a caller that stops the loop soon."""
@@ -96,12 +78,14 @@ class CallerLoop(asyncio.SelectorEventLoop):
         while not self._stopping:
             rounds += 1
             if ready and rounds < _ROUNDS:
+                # Only those that are ready now, as asyncio does: callbacks that they add wait for the next round.
                 for _ in range(len(ready)):
                     handle = ready.popleft()
                     if not handle._cancelled:  # noqa: SLF001
                         handle._run()  # noqa: SLF001
                 continue
             rounds = 0
+            # A cancelled timer counts as well: it only ends the wait early, and `_run_once` removes it.
             scheduled = self._scheduled
             left = scheduled[0]._when - time.monotonic() if scheduled else None  # noqa: SLF001  # the loop's own clock
             if ready or (left is not None and left <= 0):
@@ -116,6 +100,8 @@ class CallerLoop(asyncio.SelectorEventLoop):
             self._process_events(self._selector.select(left))
             return
         events = poll(left)
+        # A call waits for one reply, so almost always one socket is readable. Selecting, queueing its callback and
+        # running another round would take longer than the callback itself.
         if len(events) == 1:
             fd, mask = events[0]
             key = self._keys.get(fd)

@@ -127,6 +127,7 @@ class CallerDrivenLoop:
         self._pid = os.getpid()
         self._at_stop = at_stop
         self._stop_requested = asyncio.Event()
+        # A plain lock, which any thread may release: the turn passes from a caller to the thread and back.
         self._turn = threading.Lock()
         self._turn.acquire()  # The thread starts with it.
         self._thread_drives = True
@@ -176,8 +177,11 @@ class CallerDrivenLoop:
                 self._submit(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
-                job.leave = False  # before checking why it was set
+                # First, because a signal that arrives between this line and the next ones sets it again. The other way
+                # round, its handler would not run before the job is done.
+                job.leave = False
                 if signals.arrived:
+                    # Here and not in the loop: what a handler raises there would hit whatever task is running.
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
                 elif drives:
@@ -238,7 +242,7 @@ class CallerDrivenLoop:
             if job.finished:
                 return
             if job not in self._jobs:
-                job.coro.close()
+                job.coro.close()  # never handed over; Python would warn that it was never awaited
                 return
             self._loop.call_soon_threadsafe(self._cancel_job, job)
         drives = self._may_drive()
@@ -266,10 +270,11 @@ class CallerDrivenLoop:
         try:
             if self._ended:
                 return
-            if job.task is None:
+            if job.task is None:  # otherwise this caller was called away, and comes back for the rest of it
                 job.task = asyncio.Task(self._perform(job), loop=self._loop, name="urlab-call")
             timer = None if deadline is None else self._loop.call_at(deadline, self._call_away, job)
             self._driven = job
+            # In a loop, because anything may stop the loop: another caller that wants the turn, or code of a task.
             while not (job.finished or job.leave or self._ended):
                 self._run_loop()
             self._driven = None
@@ -283,6 +288,7 @@ class CallerDrivenLoop:
         while not self._turn.acquire(blocking=False):
             if job.finished or job.leave or (deadline is not None and time.monotonic() >= deadline):
                 return False
+            # Again in each slice: the thread may have taken the turn only after it was asked.
             self._poke(self._yield)
             if self._turn.acquire(timeout=_CLAIM_SLICE):
                 break
@@ -298,6 +304,7 @@ class CallerDrivenLoop:
     def _give_back(self) -> None:
         self._left = time.monotonic()
         self._turn.release()
+        # Only now: a job that was queued before the release saw the turn held and woke nobody (rule 3).
         if self._jobs or self._stopping:
             self._ensure_driver()
 
@@ -324,7 +331,7 @@ class CallerDrivenLoop:
     # In the loop
 
     def _yield(self) -> None:
-        if self._thread_drives:
+        if self._thread_drives:  # the request may be late, when the loop is already run by a caller
             self._loop.stop()
 
     def _start_job(self, job: Job[Any]) -> None:
@@ -377,7 +384,7 @@ class CallerDrivenLoop:
         while not self._ended:
             self._run_loop()
             if not self._ended and not self._stopping:
-                self._thread_drives = False
+                self._thread_drives = False  # before the release: the next holder must not be asked to yield
                 self._turn.release()
                 self._await_turn()
                 self._thread_drives = True

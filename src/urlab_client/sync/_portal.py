@@ -9,24 +9,18 @@ import threading
 import weakref
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+from urlab_client.aio.streams.stream import Stream
 from urlab_client.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
+from urlab_client.protocol.messages.streams import StreamItem
 from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed
 from urlab_client.sync._signals import DeferredSignals
 
 P = ParamSpec("P")
 T = TypeVar("T")
 A = TypeVar("A")
-A_co = TypeVar("A_co", covariant=True)
-
-
-class _Stream(Protocol[A_co]):
-    """An asynchronous stream whose buffered items can be read from any thread."""
-
-    def receive_nowait(self) -> A_co | None: ...
-
-    def __anext__(self) -> Coroutine[Any, Any, A_co]: ...
+Item = TypeVar("Item", bound=StreamItem)
 
 
 class Portal:
@@ -75,6 +69,7 @@ class Portal:
         """
         with DeferredSignals() as signals:
             io = self._ready()
+            # The coroutine is made here, where no signal handler can come between it and the job.
             job = Job(function(*args, **kwargs))
             io.run(job, signals)
         # Since Python 3.13 the traceback contains frames that refer to the job.
@@ -95,7 +90,7 @@ class Portal:
         except StopAsyncIteration:
             raise StopIteration from None
 
-    def next_of(self, stream: _Stream[A]) -> A:
+    def next_of(self, stream: Stream[Item]) -> Item:
         """`next` for a stream. Buffered items are returned without entering the loop."""
         with DeferredSignals():
             item = stream.receive_nowait()

@@ -53,7 +53,8 @@ class DeferredSignals:
                 if callable(handler := _get_handler(number)) and getattr(handler, "__module__", "") not in _OF_LOOPS
             ]
             try:
-                # After an exception the list contains exactly the handlers that were replaced.
+                # One C call replaces all of them, and after an exception the list contains exactly those that were
+                # replaced. In a Python loop, a handler still in place could raise between replacing one and noting it.
                 self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))
                 self._holding = True
             except BaseException:  # raised by a handler that was not replaced yet
@@ -87,7 +88,7 @@ class DeferredSignals:
                 number, frame = self._arrived.pop(0)
                 handler = _get_handler(number)
                 if handler == self._on_signal:  # unless another one was installed in the meantime
-                    handler = self._aside(number)
+                    handler = self._replaced(number)
                 if callable(handler):
                     handler(number, frame)
         except BaseException as error:  # noqa: BLE001  # raised by the caller
@@ -99,26 +100,28 @@ class DeferredSignals:
         """Restore the handlers, and run those of arrived signals, one by one as Python does."""
         mine = self._on_signal
         # Except those that were replaced in the meantime.
-        aside = [
+        replaced = [
             (number, _last_in_place(number, handler))
             for number, handler in zip(self._numbers, self._handlers)  # noqa: B905
             if _get_handler(number) == mine
         ]
         try:
-            _consume(starmap(_set_handler, aside))
-        except BaseException:  # raised by a handler that was already restored
-            _consume(starmap(_set_handler, aside))
+            _consume(starmap(_set_handler, replaced))
+        except BaseException:  # raised by a handler that was already restored; it ran once, so the second try succeeds
+            _consume(starmap(_set_handler, replaced))
             raise
         finally:
             self._holding = False
+            # The restored handlers are run by Python, as after any signal: what they raise has the caller's line in its
+            # traceback, and none runs inside another.
             if self._undelivered is not None:
                 _consume(self._undelivered)
 
-    def _aside(self, number: int) -> Any:
+    def _replaced(self, number: int) -> Any:
         """Return the handler that was replaced, by this block or an outer one."""
         handler = dict(zip(self._numbers, self._handlers, strict=False)).get(number)
         outer = getattr(handler, "__self__", None)
-        return outer._aside(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
+        return outer._replaced(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
 
     def left_in_place(self, number: int) -> Any:
         """Return the handler that this object still replaces after its block; None while the block is active."""
@@ -127,7 +130,7 @@ class DeferredSignals:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._holding:
             # At the edges of the block, and after it if several signals have arrived there: run the handler directly.
-            self._aside(number)(number, frame)
+            self._replaced(number)(number, frame)
             return
         if all(number != other for other, _ in self._arrived):
             self._arrived.append((number, frame))

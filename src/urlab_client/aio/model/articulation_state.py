@@ -110,7 +110,6 @@ class MirroredEntity:
         return None if self.pose is None or self.pose.qvel is None else self.pose.qvel.copy()
 
     def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
-        """Return the command of a direct step that carries only the wrenches."""
         return ArticulationCommand(xfrc_applied=wrenches)
 
     def apply_wrench(self, body: str, wrench: list[float]) -> None:
@@ -119,7 +118,6 @@ class MirroredEntity:
             self.wrenches[body] = wrench
 
     def take_wrenches(self) -> Wrenches:
-        """Return the wrenches for the step being built and clear the buffer."""
         with self.mirror.lock:
             taken, self.wrenches = self.wrenches, {}
         return taken
@@ -244,11 +242,9 @@ class MirroredArticulation(MirroredEntity):
             self.qvel_offset = int(model.jnt_dofadr[layout.free_joint])
 
     def root_qpos(self) -> Floats | None:
-        """See `MirroredEntity.root_qpos`; the free joint is the articulation's first."""
         return self.qpos[:7].copy() if self.has_free_base else None
 
     def root_qvel(self) -> Floats | None:
-        """See `MirroredEntity.root_qvel`."""
         return self.qvel[:6].copy() if self.has_free_base else None
 
     def check(self, state: ArticulationState, op: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -11,8 +11,16 @@ import numpy as np
 from urlab_client._mujoco import acting_kind, control_counts, control_starts, force_counts, servo_damping
 from urlab_client.aio.arguments import finite, finite_array, is_array
 from urlab_client.aio.model.articulation_state import MirroredArticulation
-from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
-from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
+from urlab_client.aio.model.layout import (
+    JOINT_KINDS,
+    JOINT_TRANSMISSIONS,
+    QPOS_WIDTH,
+    QVEL_WIDTH,
+    joint_unit,
+    sensor_kind,
+    sensor_unit,
+    set_point_meaning,
+)
 from urlab_client.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationInfo
@@ -31,6 +39,7 @@ if TYPE_CHECKING:
 _UNSPECIFIC = {"motor", "general"}  # what servers report for a `<general>`
 
 
+@dataclass(slots=True, eq=False, repr=False, kw_only=True)
 class Actuator:
     """One actuator of an articulation.
 
@@ -47,46 +56,17 @@ class Actuator:
         ctrl_local: Slice of the articulation's `ctrl_array` that holds its inputs; length 1 for ordinary actuators.
     """
 
-    __slots__ = (
-        "_first_out",
-        "_record",
-        "ctrl_local",
-        "ctrlrange",
-        "forcerange",
-        "id",
-        "joint",
-        "kp",
-        "kv",
-        "name",
-        "type",
-    )
-
-    def __init__(
-        self,
-        record: MirroredArticulation,
-        *,
-        name: str,
-        id: int,  # noqa: A002
-        type: ActuatorType | str | None,  # noqa: A002
-        ctrl_local: slice,
-        first_out: int,
-        joint: str | None = None,
-        ctrlrange: tuple[float, float] | None = None,
-        forcerange: tuple[float, float] | None = None,
-        kp: float | None = None,
-        kv: float | None = None,
-    ) -> None:
-        self._record = record
-        self.name: str = name
-        self.id: int = id
-        self.type: ActuatorType | str | None = type
-        self.ctrl_local: slice = ctrl_local
-        self._first_out = first_out
-        self.joint: str | None = joint
-        self.ctrlrange: tuple[float, float] | None = ctrlrange
-        self.forcerange: tuple[float, float] | None = forcerange
-        self.kp: float | None = kp
-        self.kv: float | None = kv
+    _record: MirroredArticulation = field(kw_only=False)
+    name: str
+    id: int
+    type: ActuatorType | str | None
+    ctrl_local: slice
+    _first_out: int
+    joint: str | None = None
+    ctrlrange: tuple[float, float] | None = None
+    forcerange: tuple[float, float] | None = None
+    kp: float | None = None
+    kv: float | None = None
 
     @property
     def force(self) -> float | None:
@@ -190,6 +170,7 @@ class Actuator:
         return f"<Actuator {self.name!r} id={self.id}>"
 
 
+@dataclass(slots=True, eq=False, repr=False, kw_only=True)
 class Joint:
     """One joint of an articulation.
 
@@ -204,40 +185,15 @@ class Joint:
         range: (low, high) in radians or metres, or None if unlimited.
     """
 
-    __slots__ = (
-        "_record",
-        "id",
-        "jnt_type",
-        "name",
-        "qpos_local_offset",
-        "qpos_offset",
-        "qvel_local_offset",
-        "qvel_offset",
-        "range",
-    )
-
-    def __init__(
-        self,
-        record: MirroredArticulation,
-        *,
-        name: str,
-        id: int,  # noqa: A002
-        jnt_type: int,
-        qpos_offset: int,
-        qpos_local_offset: int,
-        qvel_offset: int,
-        qvel_local_offset: int,
-        range: tuple[float, float] | None,  # noqa: A002
-    ) -> None:
-        self._record = record
-        self.name: str = name
-        self.id: int = id
-        self.jnt_type: int = jnt_type
-        self.qpos_offset: int = qpos_offset
-        self.qpos_local_offset: int = qpos_local_offset
-        self.qvel_offset: int = qvel_offset
-        self.qvel_local_offset: int = qvel_local_offset
-        self.range: tuple[float, float] | None = range
+    _record: MirroredArticulation = field(kw_only=False)
+    name: str
+    id: int
+    jnt_type: int
+    qpos_offset: int
+    qpos_local_offset: int
+    qvel_offset: int
+    qvel_local_offset: int
+    range: tuple[float, float] | None
 
     @property
     def kind(self) -> JointKind:
@@ -287,6 +243,7 @@ class Joint:
         return f"<Joint {self.name!r} id={self.id}>"
 
 
+@dataclass(slots=True, eq=False, repr=False, kw_only=True)
 class Sensor:
     """One sensor of an articulation.
 
@@ -296,13 +253,10 @@ class Sensor:
         dim: Length of the reading.
     """
 
-    __slots__ = ("_record", "dim", "id", "name")
-
-    def __init__(self, record: MirroredArticulation, *, name: str, id: int, dim: int) -> None:  # noqa: A002
-        self._record = record
-        self.name: str = name
-        self.id: int = id
-        self.dim: int = dim
+    _record: MirroredArticulation = field(kw_only=False)
+    name: str
+    id: int
+    dim: int
 
     @property
     def latest(self) -> Floats | None:
@@ -337,6 +291,7 @@ class Sensor:
         return f"<Sensor {self.name!r} id={self.id} dim={self.dim}>"
 
 
+@dataclass(slots=True, eq=False, repr=False, kw_only=True)
 class Body:
     """One body of an articulation.
 
@@ -345,12 +300,9 @@ class Body:
         id: Global MuJoCo body id.
     """
 
-    __slots__ = ("_record", "id", "name")
-
-    def __init__(self, record: MirroredArticulation, *, name: str, id: int) -> None:  # noqa: A002
-        self._record = record
-        self.name: str = name
-        self.id: int = id
+    _record: MirroredArticulation = field(kw_only=False)
+    name: str
+    id: int
 
     @property
     def xpos(self) -> Floats | None:
@@ -431,7 +383,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
     types = record.info.actuator_types
     if model is None:
         return [
-            Actuator(record, name=name, id=-1, type=known(ActuatorType, kind), ctrl_local=slice(i, i + 1), first_out=i)
+            Actuator(record, name=name, id=-1, type=known(ActuatorType, kind), ctrl_local=slice(i, i + 1), _first_out=i)
             for i, (name, kind) in enumerate(types.items())
         ]
     joint_of = {joint_id: name for name, joint_id in record.layout.joints.items()}
@@ -451,7 +403,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
                 id=i,
                 type=None if kind is None else known(ActuatorType, kind),
                 ctrl_local=slice(start, start + width),
-                first_out=first_out,
+                _first_out=first_out,
                 joint=joint_of.get(driven),
                 ctrlrange=_interval(model.actuator_ctrlrange[first]) if model.actuator_ctrllimited[first] else None,
                 forcerange=_interval(model.actuator_forcerange[i]) if model.actuator_forcelimited[i] else None,

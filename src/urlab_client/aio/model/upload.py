@@ -56,7 +56,6 @@ class FlatModel:
 
     @property
     def size(self) -> int:
-        """Total bytes."""
         return len(self.xml) + sum(map(len, self.files.values()))
 
     @cached_property

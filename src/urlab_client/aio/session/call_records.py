@@ -44,7 +44,6 @@ class CallRecords:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """Send a request over the transport, and measure it."""
         self._sent_bytes += len(frame)
         began = time.perf_counter()
         try:
@@ -67,7 +66,6 @@ class CallRecords:
         _QUEUED.set(_QUEUED.get() + time.perf_counter() - began)
 
     async def record(self, op: Op, answer: Awaitable[T]) -> T:
-        """Wait for the answer to a request, and record the outcome."""
         queued = _QUEUED.get()
         _QUEUED.set(0.0)
         started_ns = time.time_ns() - int(1e9 * queued)

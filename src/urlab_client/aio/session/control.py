@@ -136,7 +136,6 @@ class Control:
             await self._session.call(ClaimControl(articulation=key, ttl_s=ttl, force=force), timeout=timeout)
 
     async def release(self, key: str, *, timeout: Timeout) -> None:
-        """Release a robot if this client owns it."""
         held = self._held.pop(key, None) is not None or _control_of(key) in self._session.unsettled
         if not held or not self._session.features.claims:
             return
@@ -160,12 +159,10 @@ class Control:
                 break
 
     def forget(self) -> None:
-        """Drop all claims, because play has ended."""
         self._held.clear()
         self._others.clear()
 
     def _robots(self, request: ControlRequest[Reply]) -> list[str]:
-        """Return the keys of the robots that a request writes to."""
         match request:
             case Step(per_articulation=commands):
                 return [

@@ -133,7 +133,6 @@ class Session:
 
     @property
     def transport(self) -> RequestTransport:
-        """The transport of the requests."""
         return self._transport
 
     async def call(
@@ -242,7 +241,7 @@ class Session:
         before = self._transport.stats.sent
         try:
             yield
-        except BaseException as error:
+        except BaseException as error:  # a cancellation, too: the request may be under way
             if not leaves_open(error):
                 self.unsettled.pop(what, None)
             elif self._transport.stats.sent > before:
@@ -297,7 +296,6 @@ class Session:
             raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
     def deadlines(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Deadlines:
-        """Return the deadlines of a request."""
         default = self._default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout
@@ -326,9 +324,9 @@ class Session:
 
     async def _answer(self, request: Request[R], op: Op, deadlines: Deadlines, *, again: bool = False) -> R | OpStarted:
         # A single coroutine, because each further one between a step and its socket slows down every step.
-        stamped = self.session_id
+        stamped = self.session_id  # a handshake may change it before the answer comes
         frame = encode_request(request, stamped, json=self._json)
-        if not op.hot:
+        if not op.hot:  # the caller of a hot op has checked it more cheaply
             check_finite(request)
             if not self._json:
                 check_request(request, frame)
@@ -450,7 +448,7 @@ class Session:
 
     async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         if self._probe_task is not None:
-            self._probe_task.cancel()
+            self._probe_task.cancel()  # a probe can be repeated; a call of the user should not wait for it
         self._queued += 1
         try:
             async with asyncio.timeout_at(deadline):

@@ -78,7 +78,6 @@ class Turn:
             raise
 
     def end(self) -> None:
-        """End the turn, so that the next one can begin."""
         if self._ready:
             self._release_request_lock()
         self._session.state_lock.release()
@@ -190,18 +189,15 @@ class Mutex:
         self._waiting: deque[asyncio.Future[None]] = deque()
 
     def locked(self) -> bool:
-        """Return whether the lock is held."""
         return self._held
 
     def acquire_nowait(self) -> bool:
-        """Take the lock if it is free, and return whether it was."""
         if self._held:
             return False
         self._held = True
         return True
 
     async def acquire(self) -> None:
-        """Wait for the lock and take it."""
         if not self._held:
             self._held = True
             return

@@ -128,7 +128,6 @@ class _Taking:
         self._found: dict[int, CameraSample] = {}
 
     async def in_live_mode(self, *, certain: bool) -> None:
-        """Take the pictures of a server in live mode."""
         state, features = self._state, self._state.session.features
         try:
             async with asyncio.timeout_at(self._deadline):

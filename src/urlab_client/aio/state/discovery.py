@@ -13,7 +13,7 @@ from typing import Final
 import anyio.to_thread
 
 from urlab_client.aio.session.session import Turn
-from urlab_client.aio.state.handshake import examine
+from urlab_client.aio.state.scene_objects import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.enums import StepMode
@@ -59,7 +59,7 @@ class Discovery:
         await self.adopt(turn, hello)
         return hello
 
-    async def look_on(self, turn: Turn, handshake: bytes) -> None:
+    async def open_read_only(self, turn: Turn, handshake: bytes) -> None:
         """Apply the result of another client's `handshake()` without opening a session.
 
         Raises:
@@ -220,7 +220,6 @@ class _FirstSnapshot(MessageHandler):
         self.came: asyncio.Future[StateSnapshot | None] = asyncio.get_running_loop().create_future()
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        """Take the first snapshot that is well-formed."""
         with contextlib.suppress(ProtocolError):
             self._settle(StateSnapshot.decode(payload))
 
@@ -232,7 +231,6 @@ class _FirstSnapshot(MessageHandler):
         self._settle(None)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
-        """End the wait because the client was closed."""
         self._settle(None)
 
     def _settle(self, found: StateSnapshot | None) -> None:

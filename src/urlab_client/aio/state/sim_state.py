@@ -140,7 +140,6 @@ class SimState:
                 receiver.stop()
 
     def tell_of_handshake(self) -> None:
-        """Notify the observers of a new handshake."""
         for observer in self.observers:
             try:
                 observer.on_handshake()
@@ -164,7 +163,6 @@ class SimState:
 
     @property
     def live_received(self) -> int:
-        """Number of snapshots received in the background."""
         return self._live.stats.received
 
     @property

@@ -81,7 +81,6 @@ class StepPictures:
         return _RENDER_S if self._features.renders_sync else _BLOCKING_S * len(self._sync)
 
     def ask(self, request: Step) -> None:
-        """Add the pictures to a request, if any."""
         if not self:
             return
         request.include_cameras = True if self._all else dict(self._wanted)
@@ -165,5 +164,4 @@ class StepPictures:
 
     @property
     def names(self) -> list[str]:
-        """The user's names of the requested cameras."""
         return list(self._shown.values())

@@ -99,7 +99,6 @@ class StreamBuffer:
                 self._evict()
 
     def pop(self) -> BufferedMessage | None:
-        """Remove and return the next entry; None if the buffer is empty."""
         if not self._waiting:
             return None
         entry = self._waiting.popitem(last=False)[1]

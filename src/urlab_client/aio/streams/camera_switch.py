@@ -73,7 +73,6 @@ class CameraSwitch:
         self._follow()
 
     def is_on(self, info: CameraInfo) -> bool:
-        """Return whether this client has switched a camera on."""
         return self._on.get(info.zmq_topic, _OFF) != _OFF
 
     def forget(self) -> None:
@@ -120,7 +119,7 @@ class CameraSwitch:
             if self._failure is not None:
                 raise self._failure
 
-    def _die(self, error: URLabError) -> None:
+    def _note_failure(self, error: URLabError) -> None:
         self._failure = error
 
     async def aclose(self, *, connected: bool) -> None:
@@ -143,7 +142,9 @@ class CameraSwitch:
             return
         if self._task is None or self._task.done():
             self._failure = None
-            self._task = background_task("urlab-cameras", self._switch(), tell=self._session.tell, failed=self._die)
+            self._task = background_task(
+                "urlab-cameras", self._switch(), tell=self._session.tell, failed=self._note_failure
+            )
 
     def _due(self) -> dict[str, CameraTransports]:
         return {topic: wanted for topic in self._infos if (wanted := self._wanted(topic)) != self._on.get(topic, _OFF)}

@@ -96,7 +96,6 @@ class EventBus:
 
     @property
     def heard(self) -> bool:
-        """Whether there are listeners."""
         return bool(self._listeners)
 
     def remove(self, listener: StreamHandler[Any]) -> None:

@@ -136,20 +136,17 @@ class StreamHandler(MessageHandler, Generic[T]):
     # Called by the reader
 
     def open(self) -> None:
-        """Start receiving if not started yet."""
         if self.closed:
             raise StopAsyncIteration
         self._loop = running_loop(self._loop, f"{self._source.name}: this stream")
         self.attach()
 
     def attach(self) -> None:
-        """Attach to the source if not attached yet."""
         if not self._attached and self._end is None:
             self._source.attach(self)
             self._attached = True
 
     async def next(self) -> T:
-        """Return the next item within the stream's own timeout."""
         return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
 
     async def receive(self, timeout: Timeout) -> T:
@@ -164,7 +161,6 @@ class StreamHandler(MessageHandler, Generic[T]):
             self._reading = False
 
     def receive_nowait(self) -> T | None:
-        """Return the next item if one is buffered."""
         self._refuse_second_reader()
         return self._take()
 

@@ -54,7 +54,6 @@ class LiveState(MessageHandler):
 
     @property
     def running(self) -> bool:
-        """Whether snapshots are received."""
         return self._running
 
     def start(self) -> None:
@@ -76,7 +75,6 @@ class LiveState(MessageHandler):
             self._payload = payload
 
     def on_drained(self) -> None:
-        """Apply the newest snapshot."""
         try:
             if self._payload is not None:
                 payload, self._payload = self._payload, None

@@ -67,14 +67,12 @@ class LatestPicture(MessageHandler):
         self.newest()  # decode now: the camera may change before the next access
 
     def deliver(self, pixels: Pixels, sim_time: float | None, frame_id: int | None = None) -> None:
-        """Store a picture from a reply."""
         with self._lock:
             self._message = None
             self._pixels, self._sim_time, self._frame_id = pixels, sim_time, frame_id
 
     @property
     def came(self) -> bool:
-        """Whether a picture has arrived."""
         return self._pixels is not None or self._message is not None
 
     def frame_id(self) -> int | None:
@@ -221,7 +219,6 @@ class StepStreams:
         return new
 
     async def opened(self) -> None:
-        """Wait until the cameras stream and their connections are open, or until the time limit."""
         try:
             async with asyncio.timeout(_OPENING_S):
                 switch = self._publishers.camera_switch

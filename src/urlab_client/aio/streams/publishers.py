@@ -99,7 +99,6 @@ class Publishers:
         return not (self._features().publishes_steps or self._live())
 
     def rows(self, wanted: RowFilter) -> RowSource:
-        """Return the source of rows that the server publishes."""
         return RowSource(self.subscriptions, self._state_endpoint, wanted)
 
     def camera(self, camera: Camera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:

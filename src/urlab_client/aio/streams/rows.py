@@ -65,7 +65,6 @@ class RowFilter:
         return filters
 
     def has(self, found: StreamTopic) -> bool:
-        """Return whether rows of a topic are wanted."""
         if found.kind not in self._kinds:
             return False
         if found.kind in _OF_SCENE:

@@ -355,6 +355,7 @@ class ShmTransport:
             channel.abandoned_at = loop.time()
             raise
         finally:
+            channel.ignore()
             self._pending = None
             self._used_at = loop.time()
         channel.dirty = False

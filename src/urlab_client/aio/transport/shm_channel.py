@@ -119,6 +119,11 @@ class RegionChannel:
             self._watch = watch_memory(loop, self._has_news, on_news, fastest_s=_FASTEST_POLL_S, block=block, tell=tell)
         self._watch.expect()
 
+    def ignore(self) -> None:
+        """End `expect`."""
+        if self._watch is not None:
+            self._watch.ignore()
+
     def _has_news(self) -> bool:
         return not self.replies.intact() or self.replies.region.sequence != self.seen
 

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar, Final, TypeAlias, cast
-from weakref import WeakSet
+from weakref import WeakSet, ref
 
 import zmq
 
@@ -123,6 +123,12 @@ class Watch:
             self._armed = True
             self._watcher.arm(self)
 
+    def ignore(self) -> None:
+        """Stop watching until the next `expect`, so that the thread does not keep what a forgotten client leaves."""
+        if self._armed and self._watcher is not None:
+            self._armed = False
+            self._watcher.disarm(self)
+
     def close(self) -> None:
         """Stop watching. Call before the socket or region is closed. Idempotent."""
         if self._closed:
@@ -181,6 +187,11 @@ class _Watcher:
         with self._lock:
             self._armed.add(watch)
             self._wake()
+
+    def disarm(self, watch: Watch) -> None:
+        """Stop watching for now."""
+        with self._lock:
+            self._armed.discard(watch)
 
     def release(self, watch: Watch) -> None:
         """Stop watching: `has_news` is not running and is not called again. The last user ends the thread."""
@@ -262,23 +273,24 @@ class _Watcher:
 
     def _look_at_regions(self) -> tuple[float, Callable[[float], object] | None]:
         """Report news in regions. Return how long to sleep, and how."""
-        pause, block, now, news = _CHECK_S, None, time.monotonic(), list[Watch]()
-        for watch in self._armed:
-            if watch.has_news is None:
-                continue
-            if watch.has_news():
-                news.append(watch)
-            else:
-                pause = min(pause, watch.pause(now))
-                block = block or watch.block
+        now = time.monotonic()
+        watched = [watch for watch in self._armed if watch.has_news is not None]
+        news = [watch for watch in watched if watch.has_news is not None and watch.has_news()]
+        silent = [watch for watch in watched if watch not in news]
+        pause = min((watch.pause(now) for watch in silent), default=_CHECK_S)
+        block = next((watch.block for watch in silent if watch.block is not None), None)
+        watched.clear()
+        silent.clear()
         self._notify(news)
         return pause, block
 
-    def _notify(self, watches: Collection[Watch]) -> None:
-        for watch in watches:
-            self._armed.discard(watch)
+    def _notify(self, watches: list[Watch]) -> None:
+        self._armed.difference_update(watches)
+        references = [ref(watch) for watch in watches]
+        watches.clear()  # notifying lets other threads run: by then, nothing here may hold a client that was forgotten
+        for reference in references:
             try:
-                self._loop.call_soon_threadsafe(watch.notify)
+                self._loop.call_soon_threadsafe(_notify_if_there, reference)
             except RuntimeError as error:
                 raise _LoopClosed from error
 
@@ -290,6 +302,12 @@ class _Watcher:
                         _poll([watch.fd], 0.0)
                 except zmq.ZMQError:
                     self._armed.discard(watch)
+
+
+def _notify_if_there(reference: ref[Watch]) -> None:
+    watch = reference()
+    if watch is not None:
+        watch.notify()
 
 
 class _LoopClosed(Exception):

@@ -24,6 +24,7 @@ from urlab_client.aio.transport.connection import (
     UNANSWERED,
     ClientKeys,
     Connection,
+    Context,
     borrow_context,
     give_back_context,
 )
@@ -64,6 +65,7 @@ class _Open(NamedTuple):
     """The open socket, and what each request needs of it."""
 
     loop: asyncio.AbstractEventLoop
+    context: Context
     connection: Connection
     replies: Watch
     send: _Send
@@ -128,7 +130,7 @@ class ZmqTransport:
         opened = self._open
         if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
             opened = self._connect()
-        loop, _, replies, send, get = opened
+        loop, _, _, replies, send, get = opened
         while True:
             if not self.connected:
                 await self._wait_connected(loop, op, connect_by)
@@ -196,10 +198,9 @@ class ZmqTransport:
         if self._timer is not None:
             self._timer.cancel()
         if self._open is not None:
-            context = self._open.connection.socket.context
-            self._open.connection.close()
-            self._open = None
-            give_back_context(context)
+            opened, self._open = self._open, None
+            opened.connection.close()
+            give_back_context(opened.context)
 
     def _connect(self) -> _Open:
         if self._closed:
@@ -215,7 +216,7 @@ class ZmqTransport:
             raise
         replies = connection.watch(self._on_readable, on_demand=True)
         send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
-        self._open = _Open(loop, connection, replies, send, cast("_Get", socket.get))
+        self._open = _Open(loop, context, connection, replies, send, cast("_Get", socket.get))
         return self._open
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
@@ -301,7 +302,7 @@ class ZmqTransport:
         """Receive replies until no request waits for one."""
         if self._open is None:  # it has been closed
             return
-        loop, connection, _, _, get = self._open
+        loop, _, connection, _, _, get = self._open
         receive = connection.socket.recv
         while True:
             try:

@@ -1,4 +1,4 @@
-"""The actors of a level, combined into one spec."""
+"""The actors of a level, combined into one spec: articulations are attached, meshes and lights added."""
 
 from __future__ import annotations
 

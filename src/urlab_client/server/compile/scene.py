@@ -1,4 +1,4 @@
-"""From the actors of a level to one MuJoCo model, and the tables that map its elements to actors.
+"""From the actors of a level to one MuJoCo model, and to documents of it.
 
 For the code that starts play, and for the engine, which steps the result. Options, prefixes, keyframes and names
 follow the plugin: see `compile_scene`. Nothing here steps, paces or talks to clients.

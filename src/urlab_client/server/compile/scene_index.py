@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import mujoco
@@ -33,31 +33,19 @@ class ArticulationIndex:
         key: Actor name.
         prefix: `key` and an underscore, the beginning of its compiled names.
         actor_id: Stable id given by the client; may be empty.
-        model_name: The MJCF's `model` attribute, or its file stem.
         root_body: Lowest body id; 0, the world, if the MJCF has only world geoms.
-        bodies: Body ids.
-        joints: Joint ids.
-        actuators: Actuator ids.
-        sensors: Sensor ids.
-        body_names: Names of the bodies.
-        joint_names: Names of the joints.
-        actuator_names: Names of the actuators.
-        sensor_names: Names of the sensors.
         qpos_adr: Index into `mjData.qpos` of every coordinate, in joint order.
         qvel_adr: Index into `mjData.qvel` of every velocity, in joint order.
         ctrl_adr: Index into `mjData.ctrl` of every control, in actuator order; an actuator may have several.
         act_adr: For every control the index into `mjData.act` of its actuator's first activation; -1 if stateless.
         force_adr: Index into `mjData.actuator_force` of every output, in actuator order; an actuator may have several.
         actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
-        cameras: The cameras.
         controller: The controller that the level or the MJCF gives it; None for none.
-        original_names: Kind to (name in the model, name in the MJCF), where the two differ. They never do here.
     """
 
     key: str
     prefix: str
     actor_id: str
-    model_name: str = ""
     root_body: int
     bodies: Ints
     joints: Ints
@@ -75,9 +63,6 @@ class ArticulationIndex:
     actuator_types: Mapping[str, str]
     cameras: tuple[SceneCamera, ...]
     controller: ControllerConfig | None = None
-    original_names: Mapping[str, Mapping[str, str]] = field(
-        default_factory=lambda: {kind: {} for kind in ("actuators", "joints", "sensors", "bodies")}
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +109,6 @@ def index_articulation(
         key=actor.name,
         prefix=actor.prefix,
         actor_id=actor.actor_id,
-        model_name=blueprint.model_name or blueprint.stem,
         root_body=int(bodies[0]) if bodies.size else 0,
         bodies=bodies,
         joints=joints,

@@ -1,4 +1,4 @@
-"""The actors of the open level, by their names: looking them up, and names for new ones."""
+"""The actors of the open level by their names, and the checks of what requests say of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The levels of the content root: creating, loading, saving and deleting them, and which one is open."""
+"""The assets of the content root: levels, one of which is open, and blueprints."""
 
 from __future__ import annotations
 

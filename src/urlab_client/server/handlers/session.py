@@ -91,7 +91,6 @@ def _request_regions(directory: Path) -> session.ShmRpcInfo:
 
 def _articulation(server: ServerCore, name: str, control: ArticulationControl) -> session.ArticulationInfo:
     index, controller, dialect = control.index, control.controller, server.dialect
-    names = index.original_names
     return session.ArticulationInfo(
         prefix=name,
         actor_id=index.actor_id,
@@ -101,12 +100,7 @@ def _articulation(server: ServerCore, name: str, control: ArticulationControl) -
         if controller is None
         else session.ControllerInfo(kind=controller.kind, params=controller.params(), schema=controller.schema()),
         actuator_types=dict(index.actuator_types),
-        original_names=session.OriginalNames(
-            actuators=dict(names["actuators"]),
-            joints=dict(names["joints"]),
-            sensors=dict(names["sensors"]),
-            bodies=dict(names["bodies"]),
-        ),
+        original_names=session.OriginalNames(),
         camera_topics={
             dialect.camera_key(name, camera.name): session.CameraInfo(
                 mode=server.config.camera_mode(index, camera.name),

@@ -57,9 +57,6 @@ class Player:
         self._qpos_adr: list[int] = [*model.jnt_qposadr.tolist(), model.nq]
         self._qvel_adr: list[int] = [*model.jnt_dofadr.tolist(), model.nv]
         self._free: list[bool] = [kind == free for kind in model.jnt_type.tolist()]
-        self._quats: list[int | None] = [
-            {int(free): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}.get(kind) for kind in model.jnt_type.tolist()
-        ]
         self._names = [joint_name(model, joint) for joint in range(model.njnt)]
         self._shifts: dict[int, Floats] = {}
         if relative:

@@ -1,4 +1,7 @@
-"""The lock around model and data, which distinguishes a busy physics thread from one stuck inside MuJoCo."""
+"""When physics runs, and who waits for it: the lock around model and data, queued steps, the thread and its pace.
+
+The lock distinguishes a busy physics thread from one that is stuck inside MuJoCo.
+"""
 
 from __future__ import annotations
 

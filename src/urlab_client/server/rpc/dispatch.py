@@ -1,6 +1,7 @@
 """From a request frame to a reply frame: the order of checks, the handlers and their errors.
 
-For the transports, which call a `Dispatcher`, and for the handler modules, which register with `handles`.
+For the transports, which call a `Dispatcher`, and for the handler modules, which register with `handles`. A `Watchdog`
+keeps the server answering while MuJoCo does not return.
 """
 
 from __future__ import annotations
@@ -302,7 +303,12 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
 
 
 class Watchdog:
-    """A thread that checks the physics of a server a few times a second."""
+    """A thread that checks the physics of a server a few times a second.
+
+    A short step runs on the thread that serves requests. If MuJoCo holds that thread for longer than the step timeout,
+    the client gets an error, and another thread serves. Meanwhile the engine's lock refuses requests that need physics;
+    others, such as `hello`, `meta` and `stop_pie`, do not wait for it.
+    """
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
         self._core = core

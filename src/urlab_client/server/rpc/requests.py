@@ -3,6 +3,10 @@
 For the dispatcher. msgspec decodes a `step` and a chunk of an upload directly to their structs, as our client sends
 them: they come at kilohertz rates, or with megabytes. What this strict decoder refuses, and all other ops, is read
 leniently, as the plugin does it. Both ways agree where the first one succeeds.
+
+The lenient way turns a frame into plain data, and that into a struct, field by field: names in any letter case, several
+spellings of a value. A value that cannot be used counts as absent, which is `ABSENT` here. msgspec's own lax conversion
+follows other rules: it refuses the whole request for one value, reads no number as text, and accepts exponents.
 """
 
 from __future__ import annotations

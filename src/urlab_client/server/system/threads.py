@@ -1,7 +1,7 @@
-"""Health of a server's threads, callbacks for when one dies, and waiting for threads to end.
+"""The threads of a server: their health, and those that serve requests.
 
-`Health.thread` makes all threads of a server, and reports their unexpected end here. The dispatcher then refuses every
-request, and `SimulatedServer` calls the user's callbacks.
+`Health.thread` makes all of them, and reports their unexpected end here. The dispatcher then refuses every request, and
+`SimulatedServer` calls the user's callbacks.
 """
 
 from __future__ import annotations
@@ -100,7 +100,10 @@ def _tell(callback: Callable[[str], None], reason: str) -> None:
 
 
 class ServingThread:
-    """The current serving thread. It calls `begin` before a request and `finish` after it."""
+    """A thread that serves requests one by one. It calls `begin` before a request and `finish` after it.
+
+    Inside a call of MuJoCo it cannot be interrupted, only abandoned: another thread then sends the reply and serves.
+    """
 
     def __init__(self, name: str, run: Callable[[bytes | None], None], health: Health) -> None:
         """Configure the thread; `start` starts it.

@@ -97,8 +97,7 @@ class ZapAuthenticator:
 
     # Not zmq.auth.thread.ThreadAuthenticator: it logs refused peers only at a hidden level and passes no address to its
     # callback; if its thread dies, it reports nothing and new clients wait forever; and it needs an event loop, which
-    # on
-    # Windows requires tornado.
+    # on Windows requires tornado.
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], curve_keys: CurveKeys | None, health: Health) -> None:
         self._curve_keys = curve_keys

@@ -54,13 +54,7 @@ class PortInUse(OSError):
     port: int
 
     def __init__(self, host: str, port: int, option: str = "port") -> None:
-        """Build the message.
-
-        Args:
-            host: Address of the interface.
-            port: TCP port.
-            option: Name of the setting that chooses another port.
-        """
+        """Build the message; `option` is the setting that chooses another port."""
         super().__init__(
             errno.EADDRINUSE,
             f"{tcp(host)}:{port} is in use: end the program that uses it, "
@@ -102,13 +96,7 @@ def tcp(host: str) -> str:
 
 
 def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> int:
-    """Bind a ZeroMQ socket and return its port.
-
-    Args:
-        socket: The socket; options for new connections must be set already.
-        host: IP address of the interface.
-        port: TCP port; 0 picks a free one.
-        option: Name of the setting, for the error.
+    """Bind a ZeroMQ socket, whose options for new connections are set, and return its port.
 
     Raises:
         PortInUse: The port is in use.
@@ -134,13 +122,7 @@ def bound_peers(socket: zmq.Socket[bytes]) -> None:
 
 
 class RpcEndpoint:
-    """Receives requests one at a time and sends what `answer` returns.
-
-    Attributes:
-        kind: Type of the ZeroMQ socket.
-        port: TCP port that is bound.
-        serving: The thread that serves.
-    """
+    """Receives requests one at a time and sends what `answer` returns."""
 
     kind: ClassVar[int] = zmq.REP
     port: int
@@ -166,7 +148,7 @@ class RpcEndpoint:
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
             curve_keys: Who may connect; None for anyone who can reach the interface.
-            request_bytes: Largest request that is processed; larger ones are refused.
+            request_bytes: Largest request that is processed.
 
         Raises:
             PortInUse: The port is in use.
@@ -216,11 +198,7 @@ class RpcEndpoint:
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`.
 
-        Args:
-            timeout: Seconds to wait.
-
-        Returns:
-            False if the current request took longer; the thread then closes the socket when it has finished.
+        Returns False if the current request took longer; the thread then closes the socket when it has finished.
         """
         if not self.serving.started:
             self._close()

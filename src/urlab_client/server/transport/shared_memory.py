@@ -84,11 +84,7 @@ class SharedMemoryServer:
     """
 
     def __init__(self, base: Path, health: Health) -> None:
-        """Create the regions of requests and replies; `start` begins to serve.
-
-        Args:
-            base: Directory in which this server creates its own directory.
-            health: Notified when the thread dies.
+        """Create the regions of requests and replies in a directory below `base`; `start` begins to serve.
 
         Raises:
             OSError: The disk is full, or `base` cannot be used.
@@ -126,9 +122,7 @@ class SharedMemoryServer:
     def start(self, answer: Answer) -> None:
         """Start the thread that serves.
 
-        Args:
-            answer: Returns the reply to a request, at most `MAX_REPLY_BYTES`, or nothing to leave it unanswered; must
-                not raise.
+        `answer` returns at most `MAX_REPLY_BYTES`, or nothing to leave a request unanswered. It must not raise.
         """
         self._answer = answer
         self.serving.start()
@@ -143,11 +137,7 @@ class SharedMemoryServer:
         self._stopping = True
 
     def join(self, timeout: float) -> bool:
-        """Wait for the thread to end after `stop`, and remove the regions.
-
-        Returns:
-            False if the current request took longer.
-        """
+        """Wait for the thread to end after `stop`, and remove the regions. Return False if a request took longer."""
         if self.serving.started:
             ended = self.serving.join(timeout)
             with self._lock:
@@ -194,12 +184,7 @@ class SharedMemoryServer:
     # Cameras, on the thread that draws for the streams.
 
     def show_cameras(self, resolutions: dict[str, tuple[int, int]], header_bytes: int = 0) -> None:
-        """Replace all camera regions by those of these cameras.
-
-        Args:
-            resolutions: Width and height by `ARTICULATION/CAMERA`.
-            header_bytes: Size of the header in front of the pixels.
-        """
+        """Replace all camera regions by those of these cameras: width and height by `ARTICULATION/CAMERA`."""
         with self._lock:
             for region in self._cameras.values():
                 region.close()
@@ -264,8 +249,9 @@ class SharedMemoryServer:
                         self._active_at = -ACTIVE_S
                     elif self._unannounced:  # a ring may arrive after its request was seen
                         self._active_at = time.monotonic()
-                    self._unannounced = not rung and self._requests.sequence() != self._seen
-                    if self._requests.sequence() == self._seen:
+                    news = self._requests.sequence() != self._seen
+                    self._unannounced = news and not rung
+                    if not news:
                         continue
                 self._spinning = time.monotonic() - self._served_at < SPIN_S and not crowded()
                 if not self._serve():
