@@ -38,6 +38,7 @@ def test_the_files(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert all(row["detail"] for row in report["statements"])
     assert report["measurements"]["round_trip_ms"]["meta"]["count"] > 50
     assert report["server"]["generation"] == "beta"
+    assert report["server"]["address"] == address
     page = files["r.html"].read_text()
     assert page.startswith("<!doctype html>")
     assert "src=" not in page

@@ -17,6 +17,7 @@ from urlab_client.cli import main
 from urlab_client.cli.tap import departures, described
 from urlab_client.conformance.relay import Passed, Ports, Relay
 from urlab_client.conformance.sessions import Recorded, Replay, SessionWriter, read_session
+from urlab_client.errors import URLabError, URLabTimeoutError
 from urlab_client.keys import KeyPair
 from urlab_client.server import SimulatedServer
 
@@ -114,6 +115,39 @@ async def test_the_state_stream_passes(tmp_path: Path) -> None:
     assert times == sorted(times)
     kept = [message for row in read_session(tmp_path / "session.mcap") for message in row.messages]
     assert {(source, topic) for source, topic, _ in kept} == {("state", b"state/full")}
+
+
+async def asked(port: int) -> None:
+    """Send a request whose reply never comes."""
+    async with URLabClient(f"tcp://127.0.0.1:{port}", rcv_timeout_ms=300, local_model=False) as client:
+        with pytest.raises(URLabTimeoutError):
+            await client.meta()
+
+
+async def test_a_relay_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> bytes:
+        raise RuntimeError("on purpose")
+
+    monkeypatch.setattr(Relay, "on_exchange", fail)
+    monkeypatch.setattr(Replay, "_answer", fail)
+    with SimulatedServer() as server:
+        relay = Relay(f"tcp://127.0.0.1:{server.step_port}", None, server.state_port, Ports("127.0.0.1", None))
+        with relay:
+            await asked(relay.port)
+            with pytest.raises(URLabError, match="urlab-relay"):
+                relay.join()
+    session = [Recorded("meta", msgspec.msgpack.encode({"op": "meta", "session_id": ""}), b"x")]
+    with Replay(session, Ports("127.0.0.1", None)) as replay:
+        await asked(replay.port)
+        with pytest.raises(URLabError, match="urlab-replay"):
+            replay.join()
+
+
+def test_a_session_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    writer = SessionWriter(tmp_path / "session.mcap")
+    writer.exchange(Passed("meta", "not bytes", b"", 0.0, 0))  # type: ignore[arg-type]
+    with pytest.raises(URLabError, match="urlab-tap"):
+        writer.close()
 
 
 def test_a_request_that_was_not_recorded_is_refused() -> None:

@@ -660,13 +660,12 @@ async def silence(bench: Bench) -> None:
     """In direct mode the state stream is silent"""
     await bench.direct()
     await asyncio.sleep(0.3)
-    listening = asyncio.create_task(bench.state_messages(1, 1.0))
-    try:
+
+    async def steps() -> None:
         await asyncio.sleep(0.4)
         await bench.wire.ask("step", n_steps=3)
-        messages = await listening
-    finally:
-        listening.cancel()
+
+    messages, _ = await asyncio.gather(bench.state_messages(1, 1.0), steps())
     same("messages", 0, len(messages))
 
 
@@ -743,11 +742,7 @@ async def direct_snapshots(bench: Bench) -> None:
             target = float((await bench.wire.ask("step", n_steps=2))["time"])
             await asyncio.sleep(0.05)
 
-    stepping = asyncio.create_task(steps())
-    try:
-        messages = await bench.wire.listen(bench.state_endpoint, 1.5, lambda _: False)
-    finally:
-        await stepping
+    messages, _ = await asyncio.gather(bench.wire.listen(bench.state_endpoint, 1.5, lambda _: False), steps())
     same("topics", {b"state/full"}, {message.topic for message in messages})
     times = [float(decoded(message)["time"]) for message in messages]
     holds(target in times, f"a snapshot of time {target}", times[-5:])

@@ -26,7 +26,9 @@ Redact: TypeAlias = Callable[[str], str]
 WORDS: Final = {Verdict.HOLDS: "holds", Verdict.DIFFERS: "differs", Verdict.NOT_TRIED: "not tried"}
 _PRIVATE: Final = frozenset({"mjb", "mjb_base64", "mjcf_compiled", "vfs_assets", "data"})
 """Reply fields whose content stays here: models, their files, and pixels."""
-_PATH: Final = re.compile(r"(?:[A-Za-z]:[\\/]|(?<![\w/:])/(?!Game\b|Engine\b|Script\b))[^\s\"'<>|*?]*")
+_PATH: Final = re.compile(
+    r"(?:(?<![A-Za-z])[A-Za-z]:[\\/](?!/)|(?<![\w/:])/(?!Game\b|Engine\b|Script\b))[^\s\"'<>|*?]*"
+)
 _ADDRESS: Final = re.compile(r"(tcp://)(?!127\.0\.0\.1|0\.0\.0\.0|localhost|\[::1\])[^\s:/\"]+")
 
 
@@ -171,6 +173,7 @@ td,th{border-color:#353b42}.not_tried{color:#98a1ab}}"""
 
 def _page(report: Report, kept: dict[str, Exchange], redact: Redact) -> Iterator[str]:
     server = {name: value for name, value in report.server.items() if value not in (None, "", [])}
+    server["capabilities"] = ", ".join(report.server["capabilities"]) or "none told"
     yield "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
     yield f"<title>URLab conformance</title><style>{_STYLE}</style><h1>URLab conformance</h1>"
     yield f"<p><strong>{counts(report.statements)}</strong></p>"
