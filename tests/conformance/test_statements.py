@@ -30,6 +30,8 @@ async def test_our_server_passes_every_check(generation: str, way: str, tmp_path
             assert (report.left, report.stopped) == ([], "")
             assert (await made.wire.ask("current_level"))["level_path"] == "/Game/Levels/lab"
             assert (await made.wire.ask("pie_status"))["state"] == "ready"
+            blueprints = (await made.wire.ask("list_blueprints"))["blueprints"]
+            assert [row["blueprint_short_name"] for row in blueprints] == ["bot"]
             assert made.wire.over_shm > 100 if shm else made.wire.over_shm == 0
     results = [*before.checks, *report.checks]
     assert [(one.title, one.detail) for one in results if one.verdict is Verdict.DIFFERS] == []

@@ -318,14 +318,15 @@ class Bench:
         else:
             raise NotTried(f"needs a level that can be created: {made}")
         await self.edit("ensure_manager")
-        file = self.import_file or str(_robot_file())
-        known = {str(row.get("name")) for row in (await self.wire.ask("list_blueprints"))["blueprints"]}
-        imported = await self.job("import_xml", path=file)
+        with tempfile.TemporaryDirectory(prefix="urlab-") as folder:
+            own = Path(folder) / "urlab_conformance_robot.xml"
+            own.write_text(ROBOT, encoding="utf-8")
+            imported = await self.job("import_xml", path=self.import_file or str(own))
         if imported.get("op") != "import_xml_ok":
             text = f"{imported.get('code')}: {imported.get('message')}"
             raise NotTried(f"needs an MJCF that the server can read and may import (--import FILE): {text}")
         blueprint = str(imported["blueprint_class_path"])
-        if not any(str(imported["blueprint_short_name"]) in name for name in known):
+        if imported["imported_now"]:  # otherwise it is the user's
             self._undo.insert(0, ("destroy_asset", {"asset_path": re.sub(r"_C$", "", blueprint)}))
         return blueprint
 
@@ -393,14 +394,6 @@ def _model_of(hello: HelloOk) -> mujoco.MjModel | None:
         return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": hello.mjb})
     except ValueError as error:
         raise Differs("a model in `mjb`", str(error)) from error
-
-
-def _robot_file() -> Path:
-    folder = Path(tempfile.gettempdir()) / "urlab-conformance"
-    folder.mkdir(exist_ok=True)
-    file = folder / "urlab_conformance_robot.xml"
-    file.write_text(ROBOT, encoding="utf-8")
-    return file
 
 
 _GONE: Final = frozenset({"not_control_owner", "no_active_manager", "unknown_op", "not_ready"})
