@@ -166,21 +166,22 @@ class Record:
 
 
 def covering(mutant: Mutant, known: Record) -> set[str]:
-    """Return the tests that run a mutant's line; of one that runs on import, those of its class or with its names.
+    """Return the tests that run a mutant's line; of one that runs on import, those that run what it is part of.
 
-    If none does, as of a class that others only inherit from, any test of the file may notice.
+    These run its function or class, or lines with their names, or otherwise any line of its file.
     """
     line, statements = mutant.line, (node for node in ast.walk(ast.parse(mutant.old)) if isinstance(node, ast.stmt))
     around = [node for node in statements if node.lineno <= line <= (node.end_lineno or 0)]  # from the outside inwards
     functions = [node for node in around if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     if functions and line >= functions[-1].body[0].lineno:
         return known.running(mutant.file, [line]) or known.running(mutant.file, range(around[-1].lineno, line))
-    names = {node.name for node in around if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)}
+    named = [node for node in around if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)]
+    names = {node.name for node in named}
     names = names or {node.id for stmt in around for node in ast.walk(stmt) if isinstance(node, ast.Name)}
     word = re.compile(rf"\b({'|'.join(names)})\b")
-    classes = [node for node in around if isinstance(node, ast.ClassDef)]
-    inside = range(classes[-1].lineno, (classes[-1].end_lineno or 0) + 1) if classes else range(0)
-    found = known.running(mutant.file, inside)  # methods that check fields, of which other lines may know nothing
+    found: set[str] = set()
+    for node in named[-1:]:
+        found |= known.running(mutant.file, range(node.lineno, (node.end_lineno or 0) + 1))
     for file in sources(known.root):
         text = (known.root / file).read_text("utf-8").splitlines()
         found |= known.running(file, [number for number, words in enumerate(text, 1) if names and word.search(words)])

@@ -138,7 +138,7 @@ def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
         info = CameraInfo(
             mode=mode, resolution=(width, height), fovy=45.0, zmq_endpoint=endpoint, zmq_topic="robot/camera/eye"
         )
-        publishers = Publishers(lambda: endpoint, lambda: 0, default_timeout=10.0)
+        publishers = Publishers(lambda: endpoint, lambda: 0, live=lambda: True, default_timeout=10.0)
         stream = URLabCameraView("eye", info, publishers).frames("all", buffer=per_burst, buffer_bytes=1 << 30)
 
         async def read(pictures: int) -> float:

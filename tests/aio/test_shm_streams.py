@@ -67,7 +67,13 @@ async def memory(tmp_path: Path) -> AsyncIterator[ServerRegions]:
 
 @pytest.fixture
 async def publishers(publisher: Publisher, memory: ServerRegions) -> AsyncIterator[Publishers]:
-    made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=DEADLINE_S, memory=memory)
+    made = Publishers(
+        lambda: "tcp://127.0.0.1:1",
+        lambda: publisher.port,
+        default_timeout=DEADLINE_S,
+        live=lambda: True,
+        memory=memory,
+    )
     yield made
     made.close()
 

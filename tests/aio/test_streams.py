@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from publisher import Publisher
+from relay import Relay
 from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client.aio.streams.events import EventBus
@@ -467,6 +468,21 @@ class TestFaults:
             assert items[0].gap is not None
             assert items[0].gap.startswith("reconnected after ")
             assert (items[1].gap, states.stats.gaps) == (None, 1)
+
+    async def test_a_publisher_that_zeromq_has_given_up_is_found_again(
+        self, publisher: Publisher, subscriptions: Subscriptions, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("urlab_client.aio.transport.connection._RECONNECT_MS", -1)  # to ZeroMQ: never
+        async with (
+            Relay(publisher.port) as relay,
+            everything(StateSource(subscriptions, lambda: f"tcp://127.0.0.1:{relay.port}")) as states,
+        ):
+            await publisher.subscribed(STATE)
+            relay.cut()
+            await publisher.subscribed()
+            await publisher.subscribed(STATE)
+            publisher.send(STATE, snapshot(1.0))
+            assert "reconnected after" in str((await states.receive()).gap)
 
     async def test_a_camera_that_moved_is_followed(self, publisher: Publisher, subscriptions: Subscriptions) -> None:
         topic, pixels = vectors.load("msg_camera_real_2x2").frames

@@ -63,6 +63,8 @@ def test_outcomes_are_those_of_single_episodes_whatever_the_batch() -> None:
             assert {outcome.seed for outcome in seen} == {outcome.seed for outcome in found[-1].outcomes}
             assert evaluate_in(batch, network, episodes=3, seed=9).outcomes == found[-1].outcomes[:3]
         assert found[0] == found[1]
+        unused = URLabBatchEnv(address, 3, **{**options, "task": Reach()})
+        assert evaluate_in(unused, network, episodes=1, seed=9).outcomes == found[0].outcomes[:1]
         with pytest.raises(ValueError, match="the network returned 2 numbers, but an action has 7"):
             evaluate_in(batch, lambda _: np.zeros(2), episodes=1)
         endless = URLabBatchEnv(address, 1, autoreset_mode=AutoresetMode.DISABLED)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import msgspec
 import pytest
 
-from urlab_client.errors import RPC_ERRORS, URLabRPCError, rpc_error
+from urlab_client.errors import RPC_ERRORS, NoSession, URLabRPCError, rpc_error
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
 from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, dialect_ops, registry
 
@@ -129,6 +129,14 @@ def test_every_error_class_is_documented_and_pickles() -> None:
         error = pickle.loads(pickle.dumps(rpc_error(code, "why", op="step")))
         assert (type(error), error.code, error.message, error.op) == (cls, code, "why", "step")
         assert str(error) == str(rpc_error(code, "why", op="step"))
+
+
+def test_an_error_says_what_to_do_next_if_its_class_knows() -> None:
+    off = rpc_error("no_active_manager", "no manager")
+    assert off.hint == "Start a play session first: client.sim.start()."
+    assert str(off).endswith(off.hint)
+    assert NoSession("no session").hint == "Call discover() first.", "in place of what a session taken over says"
+    assert rpc_error("unknown_actor", "no such actor").hint is None
 
 
 def test_an_unlisted_code_is_a_plain_rpc_error() -> None:

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import Wire
 
+from urlab_client.server import Limits
 from urlab_client.simulation import joint_recording as recording
 from urlab_client.simulation.joint_recording import Frame, JointLayout, decode_csv, decode_json, encode_json
 
@@ -51,6 +52,22 @@ def test_100_the_window_rolls(bot: Wire) -> None:
     bot.ask("recording_start", max_duration_s=0.1)
     bot.ask("step", n_steps=500)
     assert bot.ask("recording_stop")["sim_duration_s"] <= 0.1 + 0.002
+
+
+def test_a_recording_takes_no_more_memory_than_it_may(
+    serve: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    wire = serve("bot", play=True, saved_dir=tmp_path / "saved", limits=Limits(recording_bytes=20_000))
+    wire.ask("set_mode", mode="direct")
+    for times in (1, 2):
+        wire.ask("recording_start")
+        wire.ask("step", n_steps=200)
+        stopped = wire.ask("recording_stop")
+        kept = int(stopped["frame_count"])
+        assert 1 < kept < 200
+        assert stopped["sim_duration_s"] == pytest.approx((kept - 1) * 0.002), "the newest, and no gap"
+        said = f"the recording has reached the limit recording_bytes, 20000 ({kept} frames): the oldest are dropped"
+        assert caplog.messages.count(said) == times, "once for each"
 
 
 def test_101_the_file(bot: Wire, tmp_path: Path) -> None:

@@ -248,9 +248,9 @@ def test_a_damaged_request_region_harms_nobody(server: SimulatedServer, rpc: Rpc
         eventually(lambda: shm.call({"op": "meta"}, 1.0))
 
 
-@pytest.mark.parametrize("name", ["req.shm", "rep.shm", "state.shm"])
+@pytest.mark.parametrize(("name", "left"), [("req.shm", 10), ("req.shm", -1), ("rep.shm", 10), ("state.shm", 10)])
 def test_files_that_are_cut_off_do_not_kill_the_server(
-    server: SimulatedServer, rpc: Rpc, session: str, name: str
+    server: SimulatedServer, rpc: Rpc, session: str, name: str, left: int
 ) -> None:
     directory = directory_of(server)
     eventually((directory / name).is_file)
@@ -259,7 +259,7 @@ def test_files_that_are_cut_off_do_not_kill_the_server(
     with socket.socket(socket.AF_UNIX) as doorbell:
         doorbell.connect(os.fspath(directory / "doorbell.sock"))
         doorbell.send(b"S")
-        os.truncate(directory / name, 10)
+        os.truncate(directory / name, left % whole)
         if name != "req.shm":
             requests.publish(msgspec.msgpack.encode({"op": "meta"}))
         doorbell.send(b"q")
@@ -301,7 +301,7 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
 def test_a_client_that_never_listens_to_the_doorbell_delays_nobody(base: Path) -> None:
     memory = SharedMemoryServer(base, Health())
     memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
-    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, bell=True) as shm:
+    with socket.socket(socket.AF_UNIX) as deaf, RawShm(memory.directory, doorbell=True) as shm:
         deaf.connect(os.fspath(memory.directory / "doorbell.sock"))
         for _ in range(600):  # its buffer holds fewer rings
             assert shm.call({"op": "ping"}) is not None

@@ -606,6 +606,12 @@ class TestInterrupt:
             raise Struck
 
         seen: list[bool] = []
+
+        def late() -> None:
+            with DeferredSignals() as signals:
+                signal.raise_signal(signal.SIGTERM)
+                seen.append(signals.arrived)
+
         before = signal.signal(signal.SIGTERM, strike)
         try:
             with DeferredSignals() as signals:
@@ -614,14 +620,8 @@ class TestInterrupt:
                 assert seen == [True]
                 assert isinstance(signals.let_in(), Struck)
                 assert (signals.arrived, signals.let_in()) == (False, None)
-
-            def deferred() -> None:
-                with DeferredSignals() as late:
-                    signal.raise_signal(signal.SIGTERM)
-                    seen.append(late.arrived)
-
             with pytest.raises(Struck):
-                deferred()
+                late()
             assert seen == [True, True]
             assert signal.getsignal(signal.SIGTERM) is strike
         finally:

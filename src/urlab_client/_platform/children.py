@@ -12,9 +12,11 @@ class _Options(TypedDict):
     creationflags: int
 
 
-APART: Final[_Options] = {
-    "start_new_session": True,  # without effect on Windows
-    "creationflags": subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0,
-}
+if sys.platform == "win32":
+    _FLAGS = subprocess.CREATE_NEW_PROCESS_GROUP
+else:
+    _FLAGS = 0
+
+APART: Final[_Options] = {"start_new_session": True, "creationflags": _FLAGS}  # each without effect on the other system
 """Options of `subprocess.Popen` for a child that exits when its input closes, not on signals that a terminal or a
 notebook sends to the process group of its parent. Ctrl-C is for the parent, which may continue to use the child."""

@@ -15,7 +15,8 @@ from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
 
 if TYPE_CHECKING:
-    from urlab_client.aio.session.session import Session, Turn
+    from urlab_client.aio.session.session import Session
+    from urlab_client.aio.session.turn import Turn
 
 _GAINS = ("kp", "kv", "torque_limit")
 

@@ -75,15 +75,16 @@ class ConsoleSession:
         self.client = client
         self.link: Link = Link("connecting", since=time.time())
         self.viewers: dict[str, Viewer] = {}
-        self.lease = lease = DrivingLease(lease_seconds)
-        self.view = view = SharedView(client)
-        self.mujoco_viewer = MujocoViewer(client, view)
-        self.cameras = Cameras(client, view)
-        self.recordings = Recordings(client, recordings)
-        self.replay = Replay(client, view, self.cameras)
-        self.body_pushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay)
-        self.controls = Controls(client, lease, view, self.cameras, self.body_pushing.apply)
-        self.hands = HandDriving(client, lease, self.controls, view)
+        lease, view = DrivingLease(lease_seconds), SharedView(client)
+        self.lease: DrivingLease = lease
+        self.view: SharedView = view
+        self.mujoco_viewer: MujocoViewer = MujocoViewer(client, view)
+        self.cameras: Cameras = Cameras(client, view)
+        self.recordings: Recordings = Recordings(client, recordings)
+        self.replay: Replay = Replay(client, view, self.cameras)
+        self.body_pushing: BodyPushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay)
+        self.controls: Controls = Controls(client, lease, view, self.cameras, self.body_pushing.apply)
+        self.hands: HandDriving = HandDriving(client, lease, self.controls, view)
         self._handshake = handshake
         self._adopted = b""
         self._agents = 0

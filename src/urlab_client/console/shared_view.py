@@ -42,7 +42,7 @@ class SharedView:
 
     def __init__(self, client: URLabClient) -> None:
         self.entries: deque[LogEntry] = deque(maxlen=_KEPT)
-        self.world = WorldDescription()
+        self.world: WorldDescription = WorldDescription()
         self.world_json: str = encode(World(self.world)).decode()
         self.snapshot: StateSnapshot | None = None
         self.state_seq: int = 0

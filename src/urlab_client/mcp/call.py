@@ -19,7 +19,7 @@ from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabArticulation
+    from urlab_client.aio import URLabArticulation, URLabClient
 
 T = TypeVar("T")
 Progress = Callable[[float, float], Awaitable[None]]
@@ -79,7 +79,7 @@ class Call:
         progress: Progress,
     ) -> None:
         self.console = console
-        self.client = console.client
+        self.client: URLabClient = console.client
         self.caller = caller
         self.limits = limits
         self.models = models

@@ -9,7 +9,8 @@ from pathlib import Path
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace, fill
 from urlab_client.aio.namespaces._ops import ReplayOps
-from urlab_client.aio.session.session import Session, Turn
+from urlab_client.aio.session.session import Session
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.errors import RecordingAlreadyActive, RecordingNotActive
 from urlab_client.protocol.messages.recording import (

@@ -34,7 +34,8 @@ from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session.jobs import OnProgress
-from urlab_client.aio.session.session import Session, Turn
+from urlab_client.aio.session.session import Session
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import StepMode
 from urlab_client.errors import UnknownOp

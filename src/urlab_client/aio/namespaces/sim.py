@@ -11,7 +11,8 @@ from urlab_client.aio.background import running_loop
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.namespaces.contexts import Playing
-from urlab_client.aio.session.session import STOP, Session, Turn, leaves_open
+from urlab_client.aio.session.session import STOP, Session, leaves_open
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import PIEState

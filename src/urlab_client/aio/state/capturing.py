@@ -14,7 +14,7 @@ from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.session.session import Turn
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_pictures import first_picture_s
 from urlab_client.aio.streams.pictures import PictureListener

@@ -12,7 +12,7 @@ from typing import Final
 
 import anyio.to_thread
 
-from urlab_client.aio.session.session import Turn
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.scene_objects import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler

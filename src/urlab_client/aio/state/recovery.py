@@ -7,7 +7,8 @@ from collections.abc import Iterable
 
 from urlab_client.aio.client_types import Resync
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.session.session import STOP, Turn
+from urlab_client.aio.session.session import STOP
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.discovery import Discovery, read_state
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState

@@ -8,7 +8,8 @@ from collections.abc import AsyncGenerator, Callable, Generator
 
 import anyio
 
-from urlab_client.aio.session.session import Session, Turn, leaves_open
+from urlab_client.aio.session.session import Session, leaves_open
+from urlab_client.aio.session.turn import Turn
 from urlab_client.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.errors import BadMode, ModeLocked
 from urlab_client.protocol.messages.runtime import SetMode, SetModeOk, SetPaused

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping
 from urlab_client.aio.arguments import finite, mapping, text
 from urlab_client.aio.model.articulation_state import MirroredArticulation, SentWrenches, restore_wrenches
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.aio.session.session import Turn, leaves_open
+from urlab_client.aio.session.session import leaves_open
+from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.enums import CameraTiming, StepMode

@@ -83,7 +83,7 @@ class StreamHandler(MessageHandler, Generic[T]):
         default_timeout: float | None,
         max_rate: float | None,
     ) -> None:
-        self.closed = False
+        self.closed: bool = False
         self._source = source
         self._buffer = buffer
         self._tolerant = tolerant

@@ -118,8 +118,8 @@ class PictureListener(MessageHandler):
 
     def __init__(self, source: CameraSource) -> None:
         self.source = source
-        self.changed = asyncio.Event()
-        self.numbered = True  # as far as is known
+        self.changed: asyncio.Event = asyncio.Event()
+        self.numbered: bool = True  # as far as is known
         self.ended: Callable[[], URLabError] | None = None
         self._kept: deque[Picture | ProtocolError] = deque(maxlen=_KEPT)
 

@@ -66,7 +66,7 @@ class Publishers:
         state_port: Callable[[], int],
         *,
         default_timeout: float | None,
-        live: Callable[[], bool] = lambda: True,
+        live: Callable[[], bool],
         features: Callable[[], Features] = Features,
         keys: ClientKeys | None = None,
         memory: ServerRegions | None = None,

@@ -47,7 +47,7 @@ class RowFilter:
         no_rows = self._kinds - _OF_ARTICULATION - _OF_SCENE
         if no_rows:
             raise ValueError(f"there are no rows of kind {', '.join(sorted(no_rows))}")
-        self.topics = tuple(sorted(self._narrow()))
+        self.topics: tuple[bytes, ...] = tuple(sorted(self._narrow()))
         if not self.topics:
             raise ValueError("row_stream: no articulation to receive rows from. Check that discover() found one.")
 

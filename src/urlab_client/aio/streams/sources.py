@@ -174,8 +174,8 @@ class Camera:
     __slots__ = ("info", "memory", "name")
 
     def __init__(self, name: str, info: CameraInfo) -> None:
-        self.name = name
-        self.info = info
+        self.name: str = name
+        self.info: CameraInfo = info
         self.memory: PictureMemory = PictureMemory()
 
     @property

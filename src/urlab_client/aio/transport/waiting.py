@@ -29,7 +29,8 @@ _CHECK_S: Final = 1.0
 _JOIN_S: Final = 1.0
 _AGAIN_S: Final = 1.0
 
-_SLOWEST_S: Final = 5e-3  # between two looks at a region
+_FAST_S: Final = 1e-3  # how long the pauses between two looks at a region stay the shortest
+_SLOWEST_S: Final = 5e-3  # the longest of them
 _POLL_STEP_S: Final = 1e-3  # the resolution of ZeroMQ's poll
 
 _DRAIN_BYTES: Final = 4096
@@ -65,12 +66,12 @@ def watch_memory(
 ) -> Watch:
     """Call `on_news` on the event loop once after each `expect`, as soon as a region has news.
 
-    The pauses between two looks are a quarter of the time that it has waited, at most five milliseconds. The thread
-    looks because the loop's timers round up to a millisecond.
+    The pauses between two looks grow with the time that it has waited, to five milliseconds. The thread looks because
+    the loop's timers round up to a millisecond.
 
     Args:
         has_news: Called on the thread until `close`; must not block or raise.
-        fastest_s: Shortest pause, seconds.
+        fastest_s: Pause in the first millisecond, seconds; later ones are longer in proportion.
         block: Sleeps until the server signals, for at most the given seconds; None without signals.
     """
     return Watch(loop, on_news, has_news=has_news, block=block, fastest_s=fastest_s, on_demand=True, tell=tell)
@@ -141,7 +142,7 @@ class Watch:
 
     def pause(self, now: float) -> float:
         """Return the seconds to sleep before the next look at the region."""
-        return min(max((now - self._since) / 4, self._fastest_s), _SLOWEST_S)
+        return min(self._fastest_s * max((now - self._since) / _FAST_S, 1.0), _SLOWEST_S)
 
     def notify(self) -> None:
         """Handle news. Called on the event loop."""
@@ -253,12 +254,11 @@ class _Watcher:
                     return False
                 pause, block = self._look_at_regions()
                 fds = [self._wake_reader.fileno(), *(watch.fd for watch in self._armed if watch.fd is not None)]
-            if block is not None:
-                block(pause)
+            if block is not None or pause < _POLL_STEP_S:
+                (block or time.sleep)(pause)
                 pause = 0.0
-            elif pause < _POLL_STEP_S:
-                time.sleep(pause)
-                pause = 0.0
+                if len(fds) == 1:  # the wake-up can wait: the regions are looked at again in any case
+                    return not self._loop.is_closed()
             ready = _poll(fds, pause)
             with self._lock:
                 if self._wake_reader.fileno() in ready:

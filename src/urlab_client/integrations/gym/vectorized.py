@@ -66,7 +66,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.task: Task | None = settings.task
         self.reward_fn: RewardFn | None = settings.reward_fn
         self.termination_fn: TerminationFn | None = settings.termination_fn
-        self.render_mode = settings.render_mode
+        self.render_mode: str | None = settings.render_mode
         self._settings = settings
         n_task = 0 if self.task is None else self.task.n_observed
         self._disturbances: list[Disturbances] = []

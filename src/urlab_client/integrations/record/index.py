@@ -138,7 +138,7 @@ class RecordingIndex:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: {UNKNOWN}")
             try:
-                self.complete = self._read_summary(file, size)
+                self.complete: bool = self._read_summary(file, size)
             except (OSError, *_BROKEN):
                 self.complete = False
             if not self.complete:
@@ -148,7 +148,7 @@ class RecordingIndex:
         self._earliest = np.minimum.accumulate(first[::-1])[::-1]  # of a block and all after it
 
     def _forget(self) -> None:
-        self.damage = ""
+        self.damage: str = ""
         self.channels: dict[int, IndexedChannel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self._blocks: list[_Block] = []

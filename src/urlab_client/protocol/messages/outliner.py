@@ -18,10 +18,10 @@ from urlab_client.protocol.base import (
     Request,
     RequiresPieRestart,
     TargetBy,
-    Vec3,
     doc,
 )
 from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Vec3
 from urlab_client.values.scene_types import ActorBounds, BlueprintInfo
 
 

@@ -17,10 +17,10 @@ from urlab_client.protocol.base import (
     Reply,
     Request,
     TargetBy,
-    Vec3,
     doc,
 )
 from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Vec3
 from urlab_client.values.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 

@@ -20,10 +20,10 @@ from urlab_client.protocol.base import (
     Request,
     RequiresPieRestart,
     TargetBy,
-    Vec3,
     doc,
 )
 from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Vec3
 from urlab_client.values.scene_types import ActorHierarchyNode
 
 

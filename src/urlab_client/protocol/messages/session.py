@@ -8,20 +8,9 @@ from typing import Annotated, Any, Final, TypeAlias
 import msgspec
 from msgspec import Struct, field
 
-from urlab_client.protocol.base import (
-    ControlRequest,
-    Effect,
-    Floats,
-    Int32,
-    Needs,
-    Op,
-    QuatWXYZ,
-    Reply,
-    Request,
-    Vec3,
-    doc,
-)
+from urlab_client.protocol.base import ControlRequest, Effect, Floats, Int32, Needs, Op, QuatWXYZ, Reply, Request, doc
 from urlab_client.values.plain import Serializable
+from urlab_client.values.rotation import Vec3
 
 NOT_SENT: Final = msgspec.Raw()
 """Value of an undecoded field that is absent; encoding omits a field that holds this very object."""

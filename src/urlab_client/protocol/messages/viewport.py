@@ -11,14 +11,13 @@ from urlab_client.protocol.base import (
     EulerDeg,
     Location,
     Op,
-    Quat,
     QuatXYZW,
     Reply,
     Request,
     TargetBy,
-    Vec3,
     doc,
 )
+from urlab_client.values.rotation import Quat, Vec3
 from urlab_client.values.types import CameraPose
 
 

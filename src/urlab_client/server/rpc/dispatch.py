@@ -112,7 +112,10 @@ class HandlerTable:
 HANDLERS: Final = HandlerTable()
 """The handlers of this package; filled when `urlab_client.server.handlers` is imported."""
 
-handles = HANDLERS.handles
+
+def handles(request: type[Q]) -> Callable[[Callable[[ServerCore, Q], A]], Callable[[ServerCore, Q], A]]:
+    """Register the decorated function as the handler of a request, in the table of all handlers."""
+    return HANDLERS.handles(request)
 
 
 class Dispatcher:
