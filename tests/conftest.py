@@ -47,6 +47,14 @@ MISSING = {
 }
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what the checks of `tests/conformance` take to run against another server."""
+    group = parser.getgroup("conformance")
+    group.addoption("--address", help="run the checks of tests/conformance against this server, and nothing else")
+    group.addoption("--play", action="store_true", help="with --address: also drive its robots")
+    group.addoption("--author", action="store_true", help="with --address: also edit, in a level of their own")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> Generator[None, int, int]:
     """Take one worker more than xdist would, as tests also wait; none for single files, or with `-s`."""

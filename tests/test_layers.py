@@ -52,6 +52,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "console": VALUES | {"_installation", "aio", "events", "integrations", "protocol", "types"},
     "web": VALUES | {"_installation", "aio", "console", "events", "integrations", "protocol", "types"},
     "mcp": VALUES | {"_installation", "aio", "console", "protocol", "types", "web"},
+    "conformance": VALUES | {"_installation", "aio", "keys", "protocol"},
     "cli": VALUES
     | {
         "",
@@ -59,6 +60,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "_mujoco",
         "_platform",
         "aio",
+        "conformance",
         "console",
         "events",
         "integrations",

@@ -121,3 +121,11 @@ async def test_cameras_that_were_never_switched_on(connect: Any, serve: Any, dia
         assert not [f for f in diagnosis.findings if f.subject == "cameras"]
         (state,) = [f for f in diagnosis.findings if f.subject == "state stream"] or [None]
         assert state is None or state.verdict is Verdict.OK, "the server says on which port it is"
+
+
+async def test_the_generation_is_named(connect: Any, serve: Any, dialect: str) -> None:
+    with serve("arm", play=True) as server:
+        client = connect(server)
+        await client.discover()
+        (versions,) = (finding for finding in (await client.explain()).findings if finding.subject == "versions")
+        assert f"({dialect}) with MuJoCo" in versions.text

@@ -28,6 +28,8 @@ NOT_RUN = {
     r"(\.venv/bin/python|python3) tools/gen_": "writes to the repository: test_docs_adding_an_op.py does it in a copy",
     r"(ssh|scp) ": "goes to a second machine",
     r"urlab console( tcp://10\..*)?$": "goes to an editor",
+    r"urlab (conformance|tap)\b": "goes to an editor: tests/conformance and tests/cli run both",
+    r"pytest tests/conformance --address": "goes to an editor",
     r"urlab mcp ": "tests/mcp run it",
     r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
     r"(python examples/clone_behaviour.py|urlab (evaluate|run-policy) clone/)": "takes long: "

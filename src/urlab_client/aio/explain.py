@@ -79,7 +79,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState, stat
     if hello is None or not session.session_id:
         yield Finding(Verdict.PROBLEM, "session", "No session is open. Call discover() first.")
         return
-    yield _versions(state)
+    yield _versions(session, state)
     finding, playing = await _play(session, state)
     yield finding
     if not playing:
@@ -171,10 +171,12 @@ def _reason(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else str(error)
 
 
-def _versions(state: SimState) -> Finding:
+def _versions(session: Session, state: SimState) -> Finding:
     hello, mirror = state.hello, state.mirror
     assert hello is not None  # noqa: S101  # checked by the caller
-    server = f"{hello.urlab_version} with MuJoCo {hello.mujoco_version}"
+    generation = session.features.generation
+    which = f"{hello.urlab_version} ({generation})" if generation else hello.urlab_version
+    server = f"{which} with MuJoCo {hello.mujoco_version}"
     if mirror.approximate:
         text = f"The server runs {server}; the local model was compiled here and only approximates the server's."
         return Finding(Verdict.NOTE, "versions", text)

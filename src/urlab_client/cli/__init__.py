@@ -34,6 +34,8 @@ COMMANDS = {
     "console": "show a simulation in the browser, and interact with it",
     "mcp": "let an agent look at a simulation, and drive it if you allow that",
     "ping": "show which server answers at an address, and how fast",
+    "conformance": "check a server against the statements about the wire",
+    "tap": "print, record and replay what clients and a server say to each other",
     "doctor": "find out why a robot does not move",
     "demo": "drive a robot end to end; keep a plot, a picture and the configuration",
     "robots": "list the bundled robots",

@@ -1,0 +1,181 @@
+"""`urlab conformance`: find out whether a server keeps to the wire."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import Final
+
+from urlab_client.aio.launch import SCHEME
+from urlab_client.aio.transport.connection import client_keys
+from urlab_client.cli._arguments import Parser, add_address, add_client, seconds
+from urlab_client.cli._common import (
+    CommandError,
+    check_ending,
+    import_mujoco,
+    json_line,
+    output,
+    progress_bar,
+    refusing,
+    sigterm_interrupts,
+    table,
+)
+from urlab_client.conformance.bench import Bench
+from urlab_client.conformance.declarations import Differs, Group, Verdict, statement_titles
+from urlab_client.conformance.reports import (
+    WORDS,
+    counts,
+    differences_first,
+    page,
+    plain_report,
+    redaction,
+    write_bundle,
+)
+from urlab_client.conformance.runner import Choice, Report
+from urlab_client.conformance.runner import run as run_checks
+from urlab_client.conformance.wire import Wire
+from urlab_client.values.names import did_you_mean
+
+DESCRIPTION = (
+    "Check a server against the statements about the wire that this project rests on, and say of each whether it "
+    "holds, differs (with what was expected and what came), or was not tried. Without options it only reads, but it "
+    "opens a session, which takes the server over from the client that drives it. --play drives the robots of a play "
+    "session, and begins one if none runs. --author makes a level of its own, and opens yours again: save yours first. "
+    "Exits with 0 if nothing differs, with 1 if something does, and with 2 if the server cannot be checked."
+)
+EXAMPLES = (
+    ("urlab conformance", "read from the editor on this machine; changes nothing"),
+    ("urlab conformance --play --author --bundle report.zip", "everything; keep a file to attach to an issue"),
+    ("urlab conformance sim://arm --play --html report.html", "the same on a simulated server, as one page"),
+)
+_FAILED: Final = 2
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
+    add_address(parser)
+    parser.add_argument("--play", action="store_true", help="also drive the robots of a play session")
+    parser.add_argument("--author", action="store_true", help="also edit, in a level that is removed afterwards")
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="WORD", help="checks with this word in their title"
+    )
+    parser.add_argument(
+        "--statement",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="checks that prove this statement, such as 'Beta 12'; a number alone is one of the beta's",
+    )
+    parser.add_argument("--no-measurements", action="store_true", help="do not measure times and rates")
+    parser.add_argument("--transport", choices=("zmq", "shm"), default="zmq", help="way of the requests (default: zmq)")
+    parser.add_argument(
+        "--import",
+        dest="import_file",
+        metavar="FILE",
+        help="with --author: MJCF on the server's machine to import (default: a small robot in a temporary folder)",
+    )
+    parser.add_argument(
+        "--timeout", type=seconds, default=10.0, metavar="SECONDS", help="how long to wait for each reply (default: 10)"
+    )
+    parser.add_argument(
+        "--trust-server",
+        action="store_true",
+        help="load the binary model of a server on another machine that has no key; it is trusted with one",
+    )
+    group = parser.add_argument_group("report")
+    group.add_argument("--all", action="store_true", help="also print the statements that were not tried")
+    group.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON; - for standard output")
+    group.add_argument("--html", type=Path, metavar="FILE", help="write the report as one page")
+    group.add_argument("--bundle", type=Path, metavar="FILE", help="write report, versions and exchanges to a ZIP file")
+    group.add_argument(
+        "--with-names",
+        action="store_true",
+        help="keep paths, host, user and robot names in these files, and add the raw frames to the bundle",
+    )
+    add_client(parser)
+
+
+def run(arguments: Namespace) -> int:
+    """Check a server and print what was found."""
+    choice = _choice(arguments)
+    for path, ending in ((arguments.html, ".html"), (arguments.bundle, ".zip")):
+        if path is not None:
+            check_ending(path, ending)
+    import_mujoco()
+    with sigterm_interrupts():
+        bench, report = asyncio.run(_check(arguments, choice))
+    _write(arguments, bench, report)
+    return 1 if report.differing else _FAILED if report.stopped else 0
+
+
+def _choice(arguments: Namespace) -> Choice:
+    titles = statement_titles()
+    names = [f"Beta {name}" if name.isdigit() else name for name in arguments.statement]
+    for name in names:
+        if name not in titles:
+            raise CommandError(f"--statement: {name!r} is not a statement.{did_you_mean(name, titles)}")
+    groups = {Group.READ, *([Group.PLAY] if arguments.play else []), *([Group.AUTHOR] if arguments.author else [])}
+    return Choice(frozenset(groups), tuple(arguments.only), tuple(names), not arguments.no_measurements)
+
+
+async def _check(arguments: Namespace, choice: Choice) -> tuple[Bench, Report]:
+    own = arguments.address.startswith(SCHEME)
+    address = arguments.address
+    if own and arguments.mjcf_options:
+        address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
+    with refusing(ValueError):
+        keys = client_keys(address, arguments.server_key, arguments.client_key)
+        shm = arguments.transport == "shm"
+        wire = Wire(address, arguments.step_port, keys, shm=shm, timeout=arguments.timeout)
+    trusted = True if arguments.trust_server or keys is not None else None
+    bench = Bench(wire, own_server=own, trusted=trusted, import_file=arguments.import_file)
+    try:
+        try:
+            await bench.open()
+        except Differs as error:
+            raise CommandError(f"{arguments.address} cannot be checked: {error}") from error
+        if arguments.state_port is not None:
+            bench.state_port = arguments.state_port
+        elif wire.state_port is not None:
+            bench.state_port = wire.state_port
+        with progress_bar("checking", 1.0) as show:
+            return bench, await run_checks(bench, choice, lambda _, done, whole: show(done / max(whole, 1)))
+    finally:
+        await asyncio.shield(wire.aclose())
+
+
+def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
+    redact = redaction(bench.plain_hello, allowed=arguments.with_names)
+    exchanges = tuple(bench.wire.exchanges)
+    if arguments.html is not None:
+        arguments.html.write_text(page(report, exchanges, redact), encoding="utf-8")
+    if arguments.bundle is not None:
+        write_bundle(arguments.bundle, report, exchanges, redact, raw=arguments.with_names)
+    if arguments.json is not None:
+        text = json_line(plain_report(report, redact))
+        if str(arguments.json) == "-":
+            print(text)
+            return
+        arguments.json.write_text(text + "\n", encoding="utf-8")
+    _print(arguments, report)
+
+
+def _print(arguments: Namespace, report: Report) -> None:
+    console = output()
+    found = table(("statement", "verdict", "what was checked"), ())
+    for row in differences_first(report):
+        if row.verdict is not Verdict.NOT_TRIED or arguments.all:
+            found.add_row(row.id, WORDS[row.verdict], row.detail)
+    console.print(found)
+    server = report.server
+    generation = f", generation {server['generation']}" if server["generation"] else ""
+    console.print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")
+    console.print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
+    if not arguments.all:
+        console.print("--all also prints what was not tried, and what that needs.")
+    for line in report.left:
+        sys.stderr.write(f"urlab conformance: not put back: {line}\n")
+    if report.stopped:
+        sys.stderr.write(f"urlab conformance: {report.stopped}; what came after was not tried\n")

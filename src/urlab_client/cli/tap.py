@@ -1,0 +1,206 @@
+"""`urlab tap`: print and record what clients and a server say to each other, and replay it."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, cast
+
+import msgspec
+
+from urlab_client.aio.transport.connection import client_keys
+from urlab_client.cli._arguments import Parser, add_address, port
+from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
+from urlab_client.conformance.frames import oddities, plain
+from urlab_client.conformance.relay import Passed, Ports, Relay
+from urlab_client.keys import KeyPair, read_pair
+from urlab_client.protocol.messages.jobs import OpStarted
+from urlab_client.protocol.messages.session import ErrorReply
+from urlab_client.protocol.registry import OPS
+
+DESCRIPTION = (
+    "Relay between clients and a server, and print each op with its sizes and its time. Clients connect to the port "
+    "that is printed instead of the server's; requests, state and pictures pass unchanged, except for the ports that "
+    "replies name. --save keeps every frame, without pixels unless --images is given, and --replay answers requests "
+    "from such a file, without a server. Shared memory goes past the relay."
+)
+EXAMPLES = (
+    ("urlab tap tcp://localhost --listen 6559", "print what a client at port 6559 does with the editor"),
+    ("urlab tap tcp://localhost --listen 6559 --save session.mcap", "record it, to send it"),
+    ("urlab tap --replay session.mcap --listen 6559", "answer a client as the recorded server did"),
+)
+_LONGEST: Final = 100
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options."""
+    add_address(parser)
+    parser.add_argument("--listen", default="6559", metavar="[HOST:]PORT", help="where clients connect (default: 6559)")
+    parser.add_argument(
+        "--listen-state", type=port, metavar="PORT", help="port for the state stream (default: the one after --listen)"
+    )
+    parser.add_argument(
+        "--listen-key", metavar="FILE", help="secret key for clients on other machines, who must know its public half"
+    )
+    parser.add_argument("--save", type=Path, metavar="FILE", help="keep every frame in this MCAP file")
+    parser.add_argument("--images", action="store_true", help="with --save: keep pixels, too")
+    parser.add_argument("--strict", action="store_true", help="name what our declarations do not know")
+    parser.add_argument("--quiet", action="store_true", help="do not print ops")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="answer from this recorded session")
+    group = parser.add_argument_group("connection")
+    group.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
+    group.add_argument(
+        "--state-port", type=port, default=5555, metavar="PORT",
+        help="port of the state stream of a server that tells none (default: %(default)s)",
+    )  # fmt: skip
+    group.add_argument("--server-key", metavar="FILE", help="public key of the server (default: $URLAB_SERVER_KEY)")
+    group.add_argument("--client-key", metavar="FILE", help="secret key towards the server ($URLAB_CLIENT_KEY)")
+
+
+def run(arguments: Namespace) -> int:
+    """Relay, or replay, until Ctrl-C."""
+    host, _, number = arguments.listen.rpartition(":")
+    if not number.isdigit():
+        raise CommandError(f"--listen: {arguments.listen!r} is not a port, nor HOST:PORT")
+    with refusing(ValueError, option="--listen"):
+        ports = Ports((host or "127.0.0.1").strip("[]"), _key(arguments))
+    own = {"port": int(number), "state_port": arguments.listen_state or (int(number) + 1 if int(number) else 0)}
+    with sigterm_interrupts():
+        if arguments.replay is not None:
+            return _replay(arguments.replay, ports, own)
+        return _relay(arguments, ports, own)
+
+
+def _key(arguments: Namespace) -> KeyPair | None:
+    return None if arguments.listen_key is None else read_pair(arguments.listen_key)
+
+
+def _replay(path: Path, ports: Ports, own: dict[str, int]) -> int:
+    from urlab_client.conformance.sessions import Replay, read_session
+
+    with refusing(ValueError):
+        session = read_session(path)
+    with Replay(session, ports, **own) as replay:
+        print(
+            f"{path}: {len(session)} exchanges at {ports.host}:{replay.port}, state at {replay.state_port}", flush=True
+        )
+        replay.join()
+    return 0
+
+
+def _relay(arguments: Namespace, ports: Ports, own: dict[str, int]) -> int:
+    if not arguments.address.startswith("tcp://"):
+        raise CommandError(f"{arguments.address} cannot be relayed: give tcp://HOST or tcp://HOST:PORT")
+    rest = arguments.address.removeprefix("tcp://")
+    endpoint = arguments.address if rest.rpartition(":")[2].isdigit() else f"{arguments.address}:{arguments.step_port}"
+    with refusing(ValueError):
+        keys = client_keys(endpoint, arguments.server_key, arguments.client_key)
+    with (
+        _saved(arguments) as writer,
+        _Tap(arguments, writer, endpoint, keys, arguments.state_port, ports, **own) as tap,
+    ):
+        print(f"{endpoint} at {ports.host}:{tap.port}, state at {tap.state_port}", flush=True)
+        tap.join()
+    return 0
+
+
+@contextmanager
+def _saved(arguments: Namespace) -> Generator[Any]:
+    if arguments.save is None:
+        yield None
+        return
+    from urlab_client.conformance.sessions import SessionWriter
+
+    check_ending(arguments.save, ".mcap")
+    if arguments.save.exists():
+        raise CommandError(f"{arguments.save} exists; choose another name")
+    writer = SessionWriter(arguments.save, images=arguments.images)
+    try:
+        yield writer
+    finally:
+        writer.close()
+
+
+class _Tap(Relay):
+    """A relay that prints, judges and records."""
+
+    def __init__(self, arguments: Namespace, writer: Any, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._quiet, self._strict, self._writer = arguments.quiet, arguments.strict, writer
+        self._known: set[str] = set()
+
+    def on_exchange(self, passed: Passed) -> bytes:
+        if self._writer is not None:
+            self._writer.exchange(passed)
+        if not self._quiet:
+            print(described(passed), flush=True)
+        for line in departures(passed) if self._strict else ():
+            if line not in self._known:
+                self._known.add(line)
+                print(f"  {line}", flush=True)
+        return passed.reply
+
+    def on_message(self, source: str, topic: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
+        if self._writer is not None:
+            self._writer.message(source, topic, payload)
+        return topic, payload
+
+
+def described(passed: Passed) -> str:
+    """Return an exchange on one line."""
+    at = time.strftime("%H:%M:%S", time.localtime(passed.at / 1e9))
+    return (
+        f"{at} {passed.op or '?'}({_fields(passed.request, _ENVELOPE)}) {len(passed.request)} B -> "
+        f"{_fields(passed.reply, frozenset())} {len(passed.reply)} B, {1e3 * passed.seconds:.2f} ms"
+    )
+
+
+_ENVELOPE: Final = frozenset({"op", "session_id", "control_owner"})
+_LARGE: Final = 1 << 14
+
+
+def _fields(frame: bytes, hidden: frozenset[str]) -> str:
+    if len(frame) > _LARGE:
+        return "…"
+    try:
+        value = plain(frame)
+    except ValueError as error:
+        return str(error)
+    shown = (f"{name}={_value(item)}" for name, item in value.items() if name not in hidden)
+    text = ", ".join(shown)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def _value(item: Any) -> str:
+    match item:
+        case dict():
+            return "{" + ", ".join(map(str, cast("dict[str, Any]", item))) + "}"
+        case list():
+            return f"[{len(cast('list[Any]', item))}]"
+        case bytes():
+            return f"{len(item)} B"
+        case float():
+            return f"{item:g}"
+        case _:
+            return str(item)
+
+
+def departures(passed: Passed) -> list[str]:
+    """Return how a request and its reply depart from the declarations."""
+    op = OPS.get(passed.op)
+    if op is None:
+        return [f"the op {passed.op!r} is not declared"]
+    lines: list[str] = []
+    try:
+        request, reply = plain(passed.request), plain(passed.reply)
+    except ValueError as error:
+        return [f"{passed.op}: {error}"]
+    kinds: dict[str, type[msgspec.Struct]] = {op.reply_name: op.reply, "error": ErrorReply, "op_started": OpStarted}
+    kind = kinds.get(str(reply.get("op")))
+    lines += [f"{passed.op}: {line}" for line in oddities(request, op.request)]
+    if kind is None:
+        return [*lines, f"{passed.op}: the reply's op {reply.get('op')!r} is not declared"]
+    return [*lines, *(f"{reply['op']}: {line}" for line in oddities(reply, kind))]

@@ -1,0 +1,78 @@
+"""`urlab conformance` at the terminal: its output, its files, its exit codes."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from urlab_client.cli import main
+from urlab_client.conformance import statement_titles
+from urlab_client.server import SimulatedServer
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with SimulatedServer("arm", dialect="beta", play=True) as server:
+        yield f"{server.address}:{server.step_port}"
+
+
+def test_reading_changes_nothing_and_says_what_holds(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", address]) == 0
+    out = capsys.readouterr().out
+    assert "Session 5.2" in out
+    assert "generation beta" in out
+    assert " 0 differs, " in out
+
+
+def test_the_files(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {name: tmp_path / name for name in ("r.json", "r.html", "r.zip")}
+    options = ["--json", str(files["r.json"]), "--html", str(files["r.html"]), "--bundle", str(files["r.zip"])]
+    assert main(["conformance", address, *options]) == 0
+    report = json.loads(files["r.json"].read_text())
+    assert [row["id"] for row in report["statements"]] == list(statement_titles())
+    assert {row["verdict"] for row in report["statements"]} == {"holds", "not_tried"}
+    assert all(row["detail"] for row in report["statements"])
+    assert report["measurements"]["round_trip_ms"]["meta"]["count"] > 50
+    assert report["server"]["generation"] == "beta"
+    assert report["server"]["address"] == address
+    page = files["r.html"].read_text()
+    assert page.startswith("<!doctype html>")
+    assert "src=" not in page
+    assert "href=" not in page
+    with zipfile.ZipFile(files["r.zip"]) as bundle:
+        assert set(bundle.namelist()) == {"report.json", "report.html", "exchanges.jsonl"}
+        exchanges = [json.loads(line) for line in bundle.read("exchanges.jsonl").decode().splitlines()]
+    assert "hello" in {one["op"] for one in exchanges}
+    text = json.dumps([report, exchanges])
+    assert str(Path.home()) not in text
+    assert "mjb_base64" not in text or "bytes)" in text
+    capsys.readouterr()
+
+
+def test_names_stay_if_they_may(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for option, there in (([], False), (["--with-names"], True)):
+        file = tmp_path / f"{there}.zip"
+        assert main(["conformance", address, "--bundle", str(file), "--only", "robot", *option]) == 0
+        with zipfile.ZipFile(file) as bundle:
+            assert ('"arm"' in bundle.read("exchanges.jsonl").decode()) is there
+            assert any(name.startswith("frames/") for name in bundle.namelist()) is there
+    capsys.readouterr()
+
+
+def test_some_checks(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", address, "--play", "--statement", "32", "--json", "-", "--no-measurements"]) == 0
+    rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["statements"]}
+    assert rows["Beta 32"]["verdict"] == "holds"
+    assert rows["Beta 2"]["verdict"] == "not_tried"
+    assert rows["Beta 70"]["detail"].startswith("it is about clients")
+
+
+def test_what_cannot_be_tried(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", "tcp://127.0.0.1:1", "--timeout", "0.2"]) == 2
+    assert "connection refused" in capsys.readouterr().err
+    assert main(["conformance", "--statement", "Beta 320"]) == 2
+    assert "'Beta 320' is not a statement. Did you mean" in capsys.readouterr().err

@@ -1,0 +1,398 @@
+"""The checks are not blind: of everything that is falsified, one thing at a time, they name the statement."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from falsifier import (
+    Falsifier,
+    Fields,
+    Kept,
+    Previous,
+    SameJob,
+    drop,
+    each,
+    in_reply,
+    in_request,
+    in_state,
+    narrowed,
+    put,
+)
+from targets import bench, furnish, server
+
+from urlab_client.conformance import Choice, Group, Verdict, run
+from urlab_client.server import SimulatedServer
+
+
+def turned(quaternion: list[float]) -> list[float]:
+    return [*quaternion[1:], quaternion[0]]
+
+
+def bodies(state: Fields) -> None:
+    for body in state.get("bodies", {}).values():
+        body["xquat"] = turned(body["xquat"])
+
+
+def pictures(change: Any) -> Any:
+    return in_reply("step_ok", lambda reply: [change(one) for one in (reply.get("cameras") or {}).values()] and None)
+
+
+def robots(change: Any) -> Any:
+    return in_reply("hello_ok", lambda reply: [change(one) for one in reply["articulations"]] and None)
+
+
+def instance(change: Any) -> Any:
+    return in_reply("hello_ok", lambda reply: change(reply["instance"]) and None)
+
+
+def commands(change: Any) -> Any:
+    return in_request("step", lambda request: [change(one) for one in request.get("per_articulation", {}).values()])
+
+
+def unguarded(request: Fields, reply: Fields) -> object:
+    """Say that a step was taken where the server refused it."""
+    if request.get("op") != "step" or reply.get("code") != "not_control_owner":
+        return None
+    clock = {"sec": 0.0, "nsec": 0.0}
+    taken: Fields = {"op": "step_ok", "time": 0.0, "step": 0.0, "sim_time": clock, "wall_time": clock}
+    return msgspec.msgpack.encode({**taken, "frame_id": 1.0, "arts": {}, "scene": {}})
+
+
+def whole_number(reply: Fields) -> bytes:
+    return msgspec.msgpack.encode({**reply, "step": int(reply["step"])})
+
+
+def in_snapshot(change: Any) -> Any:
+    def apply(_: str, topic: bytes, payload: bytes) -> tuple[bytes, bytes]:
+        if topic != b"state/full":
+            return topic, payload
+        snapshot = msgspec.msgpack.decode(payload)
+        change(snapshot)
+        return topic, msgspec.msgpack.encode(snapshot)
+
+    return apply
+
+
+def in_topic(old: bytes, new: bytes) -> Any:
+    return lambda _, topic, payload: (topic.replace(old, new), payload)
+
+
+def in_row(kind: bytes, change: Any) -> Any:
+    return lambda _, topic, payload: (topic, change(payload) if kind in topic else payload)
+
+
+def swapped(payload: bytes) -> bytes:
+    return payload[:12] + payload[24:28] + payload[12:24] + payload[28:]
+
+
+def in_header(offset: int, layout: str, value: float) -> Any:
+    def apply(source: str, topic: bytes, payload: bytes) -> tuple[bytes, bytes]:
+        if source != "camera":
+            return topic, payload
+        data = bytearray(payload)
+        struct.pack_into(layout, data, offset, value)
+        return topic, bytes(data)
+
+    return apply
+
+
+def narrow(value: float) -> float:
+    return float(np.float32(value))
+
+
+ANY = "alpha"
+FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
+    # Steps and their replies
+    "the sign of qvel": (ANY, "Session 10.2", {"reply": in_state(each("qvel", lambda v: [-x for x in v]))}),
+    "the order of the quaternion in qpos": (
+        ANY,
+        "Session 10.2",
+        {"reply": in_state(each("qpos", lambda v: [*v[:3], *turned(v[3:7]), *v[7:]]))},
+    ),
+    "qpos in single precision": (ANY, "Session 10.2", {"reply": in_state(each("qpos", lambda v: [*map(narrow, v)]))}),
+    "one position": ("beta", "Session 10.2", {"reply": in_state(each("qpos", lambda v: [*v[:-1], v[-1] + 1e-6]))}),
+    "controls that are not applied": ("beta", "Session 10.2", {"request": commands(drop("ctrl"))}),
+    "a reply of the step before": (ANY, "Session 9.3.2", {"reply": in_reply("step_ok", Previous())}),
+    "one substep for all": (ANY, "Simulation 2.4", {"request": in_request("step", put("n_steps", 1))}),
+    "a step counter that is one ahead": (
+        "beta",
+        "Session 9.3.2",
+        {"reply": in_reply("step_ok", each("step", lambda v: v + 1))},
+    ),
+    "a time that stands still": (ANY, "Session 9.3.2", {"reply": in_reply("step_ok", put("time", 0.0))}),
+    "a wrench that is ignored": (ANY, "Session 9.3.2", {"request": commands(drop("xfrc_applied"))}),
+    "a torque in the place of a force": (
+        "beta",
+        "Beta 38",
+        {"request": commands(each("xfrc_applied", lambda v: {k: [*w[3:], *w[:3]] for k, w in v.items()}))},
+    ),
+    "sensors that read nothing": (
+        ANY,
+        "Simulation 8",
+        {"reply": in_state(each("sensors", lambda v: {name: [0.0] * len(one) for name, one in v.items()}))},
+    ),
+    "a sensor that is missing": ("beta", "Session 8.2", {"reply": in_state(each("sensors", lambda _: {}))}),
+    "the order of a body's quaternion": (ANY, "Session 8.2", {"reply": in_state(bodies)}),
+    "forces that are missing at full": ("beta", "Session 8.2", {"reply": in_state(drop("actuator_force"))}),
+    "set-points by name that are ignored": (ANY, "Session 10.1", {"request": commands(drop("ctrl_map"))}),
+    "set-points in double precision": (
+        ANY,
+        "Session 10.1",
+        {"reply": in_state(each("ctrl", lambda v: [round(x, 6) for x in v]))},
+    ),
+    "set-points in single precision": (
+        "beta",
+        "Beta 35",
+        {"reply": in_state(each("ctrl", lambda v: [*map(narrow, v)]))},
+    ),
+    "the server's UTC": (
+        ANY,
+        "Session 8.1",
+        {"reply": in_reply("step_ok", put("wall_time", {"sec": 0.0, "nsec": 0.0}))},
+    ),
+    "seconds without their nanoseconds": (
+        "beta",
+        "Session 8.1",
+        {"reply": in_reply("step_ok", lambda r: r["sim_time"].update(nsec=0.0))},
+    ),
+    "a reset that keeps the velocities": (
+        ANY,
+        "Session 9.4",
+        {"reply": in_state(each("qvel", lambda v: [x + 0.5 for x in v]), "reset_ok")},
+    ),
+    "a keyframe that is taken for another": (
+        ANY,
+        "Session 9.4",
+        {"request": in_request("reset", put("keyframe_name", ""))},
+    ),
+    "an unknown keyframe's code": (
+        ANY,
+        "Session 9.4",
+        {"reply": in_reply("error:unknown_keyframe", put("code", "bad_value"))},
+    ),
+    "joints that a reset ignores": (
+        "beta",
+        "Session 9.4",
+        {"request": in_request("reset", drop("per_articulation_qpos"))},
+    ),
+    "a forward that takes a step": (
+        ANY,
+        "Session 9.5",
+        {"reply": in_reply("forward_ok", each("time", lambda v: v + 0.002))},
+    ),
+    "a push that is ignored": (ANY, "Session 9.3.3", {"request": in_request("step", drop("qvel"))}),
+    "a push that keeps the time": (
+        "beta",
+        "Beta 40",
+        {"request": in_request("step", lambda r: r.setdefault("time", 3.0))},
+    ),
+    # Fields and numbers
+    "a number as float32": (ANY, "Session 3.1", {"reply": in_reply("step_ok", narrowed)}),
+    "a number as an integer": ("beta", "Session 3.1", {"reply": in_reply("step_ok", whole_number)}),
+    "a field that nobody declared": (ANY, "Fields 1", {"reply": in_reply("hello_ok", put("mood", 1.0))}),
+    "a field of another type": ("beta", "Fields 1", {"reply": in_reply("list_actors_ok", put("in_pie", "no"))}),
+    "a field that is missing": ("beta", "Beta 30", {"reply": in_reply("step_ok", drop("sim_time"))}),
+    "a required field that is missing": (ANY, "Fields 1", {"reply": in_reply("current_level_ok", drop("level_path"))}),
+    "the alpha's name of the states": (
+        "beta",
+        "Beta 30",
+        {"reply": in_reply("step_ok", lambda r: r.update(per_articulation=r["arts"]))},
+    ),
+    "a frame id after a reset": ("beta", "Beta 31", {"reply": in_reply("reset_ok", put("frame_id", 1.0))}),
+    "a frame id that is stuck": ("beta", "Beta 32", {"reply": in_reply("step_ok", Kept("frame_id"))}),
+    "a level that stays": ("beta", "Beta 36", {"request": in_request("step", put("observations", "full"))}),
+    "time that passes in a pause": ("beta", "Beta 33", {"request": in_request("set_paused", put("paused", False))}),
+    # Handshake and catalogue
+    "the model's size": (ANY, "Session 3.2", {"reply": in_reply("hello_ok", each("mjb_size", lambda v: v + 1))}),
+    "the model's text": ("beta", "Session 3.2", {"reply": in_reply("hello_ok", put("mjb_base64", "AAAA"))}),
+    "the letters of the session id": (
+        ANY,
+        "Session 6",
+        {"reply": in_reply("hello_ok", each("session_id", str.upper)), "request": each("session_id", str.lower)},
+    ),
+    "the version's number": ("beta", "Session 9.1", {"reply": in_reply("hello_ok", put("mujoco_version_int", 1.0))}),
+    "an op that is not listed": (ANY, "Session 9.2", {"reply": in_reply("meta_ok", lambda r: r["ops"].pop() and None)}),
+    "a required field that is not listed": (
+        "beta",
+        "Session 9.2",
+        {"reply": in_reply("meta_ok", lambda r: [op.pop("required_fields", None) for op in r["ops"]] and None)},
+    ),
+    "an instance without capabilities": ("beta", "Beta 3", {"reply": instance(drop("capabilities"))}),
+    "a prefix that is not the actor id": ("beta", "Beta 5", {"reply": robots(put("actor_id", "somebody else"))}),
+    "a slash in a camera's topic": (
+        "beta",
+        "Beta 47",
+        {"reply": robots(lambda r: [one.update(zmq_topic="a/camera/b") for one in r["camera_topics"].values()])},
+    ),
+    "actuators that the model lacks": (ANY, "Session 7", {"reply": robots(put("actuator_types", {"wing": "motor"}))}),
+    "a keyframe that is not listed": (
+        ANY,
+        "Session 9.15",
+        {"reply": in_reply("list_keyframes_ok", put("keyframes", []))},
+    ),
+    # Refusals
+    "the code of an unknown op": (
+        ANY,
+        "Session 5.2",
+        {"reply": in_reply("error:unknown_op", put("code", "bad_request"))},
+    ),
+    "a refusal without a message": (ANY, "Session 5.1", {"reply": in_reply("error:missing_op", drop("message"))}),
+    "an old session that goes on": (
+        "beta",
+        "Session 6",
+        {"reply": in_reply("error:session_expired", put("code", "busy"))},
+    ),
+    "a code that nobody knows": ("beta", "Session 9.6", {"reply": in_reply("error:bad_mode", put("code", "no_mood"))}),
+    # Modes and options
+    "the mode before": (ANY, "Session 9.6", {"reply": in_reply("set_mode_ok", put("previous_mode", "puppet"))}),
+    "a speed without limits": (ANY, "Session 9.8", {"reply": in_reply("set_sim_speed_ok", put("percent", 1000.0))}),
+    "a time step that is ignored": (
+        "beta",
+        "Simulation 1.4",
+        {"request": in_request("set_sim_options", lambda r: r["options"].pop("timestep", None))},
+    ),
+    "an integrator by another name": (
+        "beta",
+        "Beta 64",
+        {"reply": in_reply("set_sim_options_ok", lambda r: r["options"].update(integrator="rk4"))},
+    ),
+    # Claims and leases
+    "a claim that is not enforced": ("beta", "Beta 9", {"reply": unguarded}),
+    "an owner that is not told": ("beta", "Beta 9", {"reply": in_reply("error:not_control_owner", drop("owner"))}),
+    "a claim under the public name": (
+        "beta",
+        "Beta 12",
+        {"reply": in_reply("claim_control_ok", put("articulation", "arm_a"))},
+    ),
+    "a time limit that is forgotten": ("beta", "Beta 15", {"reply": in_reply("claim_control_ok", put("ttl_s", 0.0))}),
+    "a claim that never expires": ("beta", "Beta 16", {"request": in_request("claim_control", put("ttl_s", 0.0))}),
+    "a lease that shows nowhere": ("beta", "Beta 27", {"reply": instance(put("busy", False))}),
+    "a lease of another length": ("beta", "Beta 26", {"reply": in_reply("acquire_lease_ok", put("ttl_s", 30.0))}),
+    # Streams
+    "a snapshot's topic": ("beta", "Beta 43", {"message": in_topic(b"state/full", b"state/fool")}),
+    "snapshots that go back in time": (
+        "beta",
+        "Beta 43",
+        {"message": in_snapshot(each("time", lambda v: -v))},
+    ),
+    "a snapshot without sensors": (
+        ANY,
+        "Transports 3.3",
+        {"message": in_snapshot(lambda s: [one.pop("sensors") for one in s["per_articulation"].values()])},
+    ),
+    "a space behind a topic": (ANY, "Transports 3.1", {"message": in_topic(b"/joint/j", b"/joint/j ")}),
+    "a row's quaternion": (ANY, "Transports 3.2", {"message": in_row(b"base_state", swapped)}),
+    "a row's length": (ANY, "Transports 3.2", {"message": in_row(b"/joint/", lambda payload: payload[:-4])}),
+    # The editor
+    "a place in centimetres": (
+        ANY,
+        "Editor 3.1 spawn_actor",
+        {"request": in_request("spawn_actor", each("location", lambda v: [100 * x for x in v]))},
+    ),
+    "y turned over": (
+        "beta",
+        "Editor 3.1 duplicate_actor",
+        {"request": in_request("duplicate_actor", each("location", lambda v: [-v[0], *v[1:]]))},
+    ),
+    "a move that is ignored": (
+        ANY,
+        "Editor 3.1 set_actor_transform",
+        {"request": in_request("set_actor_transform", drop("location"))},
+    ),
+    "a job's number": ("beta", "Generation 2 2", {"reply": SameJob()}),
+    "a rotation that is not one": (
+        ANY,
+        "Editor 2.2",
+        {
+            "reply": in_reply(
+                "list_actors_ok", lambda r: [one.update(rotation_quat=[1.0] * 4) for one in r["actors"]] and None
+            )
+        },
+    ),
+}
+
+PICTURES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "a stale picture": ("beta", "Beta 50", {"reply": pictures(each("frame_id", lambda v: v - 1))}),
+    "a picture of another time": ("beta", "Beta 50", {"reply": pictures(each("sim_time", lambda v: v + 0.002))}),
+    "a picture's size": (ANY, "Session 8.4", {"reply": pictures(put("width", 32.0))}),
+    "a picture's end": (ANY, "Session 8.4", {"reply": pictures(each("data", lambda v: v[:-4]))}),
+    "a picture under another name": (
+        ANY,
+        "Session 8.4",
+        {"reply": in_reply("step_ok", each("cameras", lambda v: {f"{name} 2": one for name, one in v.items()}))},
+    ),
+    "a camera's topic": ("beta", "Beta 56", {"message": in_topic(b"cam ", b"cam")}),
+    "a camera's topic in the alpha": (ANY, "Transports 5.2", {"message": in_topic(b"cam ", b"cam2 ")}),
+    "the number of a streamed picture": ("beta", "Beta 56", {"message": in_header(8, "<Q", 7)}),
+    "the time of a streamed picture": ("beta", "Beta 56", {"message": in_header(16, "<d", 99.0)}),
+    "a switch that stays on": (
+        "beta",
+        "Beta 53",
+        {
+            "reply": in_reply(
+                "set_camera_streaming_ok",
+                lambda r: [one.update(streaming=True) for one in r["cameras"].values()] and None,
+            )
+        },
+    ),
+}
+
+
+WITH_REPLIES = ("Session 10.2", "Editor 3.3 list_actors", "Editor 3.1 current_level")
+"""Statements whose checks give the check of every reply something to judge."""
+
+
+@pytest.fixture(scope="module")
+def targets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tuple[SimulatedServer, Path]]]:
+    """Servers of both generations with a saved level in play."""
+    made: dict[str, tuple[SimulatedServer, Path]] = {}
+    folders = {name: tmp_path_factory.mktemp(name) for name in ("alpha", "beta")}
+
+    async def prepare(served: SimulatedServer, folder: Path) -> None:
+        async with bench(served, folder) as ready:
+            await furnish(ready, folder)
+
+    with server(folders["alpha"], "alpha", shm=False) as alpha, server(folders["beta"], "beta", shm=False) as beta:
+        for name, served in (("alpha", alpha), ("beta", beta)):
+            asyncio.run(prepare(served, folders[name]))
+            made[name] = served, folders[name]
+        yield made
+
+
+async def differing(target: tuple[SimulatedServer, Path], statement: str, **how: Any) -> set[str]:
+    """Return the statements that differ when something is falsified."""
+    served, folder = target
+    with Falsifier(served, **how) as relay:
+        async with bench(served, folder, port=relay.port, state_port=relay.state_port) as made:
+            named = (statement, *(WITH_REPLIES if statement in {"Fields 1", "Session 3.1"} else ()))
+            choice = Choice(frozenset(Group), statements=named, measure=False)
+            report = await run(made, choice)
+    return {row.id for row in report.statements if row.verdict is Verdict.DIFFERS}
+
+
+@pytest.mark.parametrize("what", FALSIFIED)
+async def test_what_is_falsified_is_named(targets: dict[str, tuple[SimulatedServer, Path]], what: str) -> None:
+    generation, statement, how = FALSIFIED[what]
+    assert statement in await differing(targets[generation], statement, **how)
+
+
+@pytest.mark.opengl
+@pytest.mark.parametrize("what", PICTURES)
+async def test_a_falsified_picture_is_named(targets: dict[str, tuple[SimulatedServer, Path]], what: str) -> None:
+    generation, statement, how = PICTURES[what]
+    assert statement in await differing(targets[generation], statement, **how)
+
+
+@pytest.mark.parametrize("generation", ["alpha", "beta"])
+async def test_the_relay_falsifies_nothing_by_itself(
+    targets: dict[str, tuple[SimulatedServer, Path]], generation: str
+) -> None:
+    for statement in ("Session 10.2", "Beta 43", "Transports 3.2", "Session 9.1"):
+        assert await differing(targets[generation], statement) == set()

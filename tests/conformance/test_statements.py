@@ -1,0 +1,112 @@
+"""The checks of `urlab conformance`, one test each: against our servers, or with `--address` against any."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from relay import Relay
+from targets import bench, furnish, server
+
+from urlab_client.conformance import CHECKS, Bench, Check, Choice, Group, Report, Verdict, Wire, run, statement_titles
+from urlab_client.conformance.bench import NEEDS
+
+EVERYTHING = Choice(groups=frozenset(Group), measure=False)
+# What our servers lack, whatever is open in them.
+MESH = "A static mesh becomes a body, and stops being one"
+
+
+@pytest.mark.opengl
+@pytest.mark.parametrize("way", ["zmq", "shm"])
+@pytest.mark.parametrize("generation", ["alpha", "beta"])
+async def test_our_server_passes_every_check(generation: str, way: str, tmp_path: Path) -> None:
+    shm = way == "shm"
+    with server(tmp_path, generation, shm=shm) as served:
+        async with bench(served, tmp_path, shm=shm) as made:
+            before = await run(made, Choice(measure=False))
+            await furnish(made, tmp_path)
+            report = await run(made, EVERYTHING)
+            assert (report.left, report.stopped) == ([], "")
+            assert (await made.wire.ask("current_level"))["level_path"] == "/Game/Levels/lab"
+            assert (await made.wire.ask("pie_status"))["state"] == "ready"
+            blueprints = (await made.wire.ask("list_blueprints"))["blueprints"]
+            assert [row["blueprint_short_name"] for row in blueprints] == ["bot"]
+            assert made.wire.over_shm > 100 if shm else made.wire.over_shm == 0
+    results = [*before.checks, *report.checks]
+    assert [(one.title, one.detail) for one in results if one.verdict is Verdict.DIFFERS] == []
+    wanted = {one.title for one in CHECKS if generation in one.dialects and (shm or "shm" not in one.needs)}
+    assert {one.title for one in results if one.verdict is Verdict.HOLDS} == wanted - {MESH}
+
+
+@pytest.fixture(scope="module")
+def report(request: pytest.FixtureRequest) -> Report:
+    """Return what the checks find at `--address`."""
+
+    async def checked() -> Report:
+        config = request.config
+        groups = {Group.READ} | {one for one in (Group.PLAY, Group.AUTHOR) if config.getoption(f"--{one}")}
+        wire = Wire(str(config.getoption("--address")), 5559, None, shm=False, timeout=10)
+        made = Bench(wire)
+        try:
+            await made.open()
+            return await run(made, Choice(groups=frozenset(groups), measure=False))
+        finally:
+            await wire.aclose()
+
+    return asyncio.run(checked())
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "check" in metafunc.fixturenames:
+        checks = CHECKS if metafunc.config.getoption("--address") else []
+        metafunc.parametrize("check", checks, ids=lambda check: check.title)
+
+
+def test_check(report: Report, check: Check) -> None:
+    for result in report.checks:
+        if result.title == check.title:
+            if result.verdict is Verdict.NOT_TRIED:
+                pytest.skip(result.detail)
+            assert result.verdict is not Verdict.DIFFERS, f"{', '.join(result.statements)}: {result.detail}"
+
+
+def test_what_a_check_names_is_there() -> None:
+    for check in CHECKS:
+        assert set(check.statements) <= set(statement_titles())
+        assert set(check.needs) <= set(NEEDS)
+        assert check.title
+        assert check.statements
+    assert len({check.title for check in CHECKS}) == len(CHECKS)
+
+
+@pytest.mark.parametrize("interruption", ["cancelled", "cut"])
+async def test_the_level_is_open_again_after_an_interruption(tmp_path: Path, interruption: str) -> None:
+    with server(tmp_path, "beta", shm=False) as served:
+        async with Relay(served.step_port) as relay, bench(served, tmp_path, port=relay.port) as made:
+            await furnish(made, tmp_path)
+            running = asyncio.ensure_future(
+                run(
+                    made,
+                    Choice(groups=frozenset({Group.AUTHOR}), measure=False),
+                    lambda result, *_: interrupt() if result.group is Group.AUTHOR else None,
+                )
+            )
+            interrupted = False
+
+            def interrupt() -> None:
+                nonlocal interrupted
+                if not interrupted:
+                    interrupted = True
+                    running.cancel() if interruption == "cancelled" else relay.cut()
+
+            await asyncio.wait((running,))
+            assert interrupted
+            assert running.cancelled() == (interruption == "cancelled")
+            assert made.undone == 0
+            assert (await made.wire.ask("current_level"))["level_path"] == "/Game/Levels/lab"
+            assert (await made.wire.ask("pie_status"))["state"] == "ready"
+            rows = (await made.wire.ask("list_actors"))["actors"]
+            assert [row["actor_id"] for row in rows if row.get("is_articulation")] == ["arm a", ""]
+            gone = await made.edit("destroy_asset", asset_path="/Game/Levels/urlab_conformance.urlab_conformance")
+            assert gone["was_found"] is False
