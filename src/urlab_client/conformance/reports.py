@@ -125,7 +125,8 @@ def _without(key: str, value: Any, redact: Redact) -> Any:
 def counts(rows: Iterable[StatementResult]) -> str:
     """Return how many statements hold, differ and were not tried."""
     found = Counter(row.verdict for row in rows)
-    return ", ".join(f"{found[verdict]} {word}" for verdict, word in WORDS.items())
+    holds, differs = found[Verdict.HOLDS], found[Verdict.DIFFERS]
+    return f"{holds} hold{'s' * (holds == 1)}, {differs} differ{'s' * (differs == 1)}, {found[Verdict.NOT_TRIED]} not tried"
 
 
 def differences_first(report: Report) -> list[StatementResult]:
