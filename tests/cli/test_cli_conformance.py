@@ -25,7 +25,7 @@ def test_reading_changes_nothing_and_says_what_holds(address: str, capsys: pytes
     out = capsys.readouterr().out
     assert "Session 5.2" in out
     assert "generation beta" in out
-    assert " 0 differs, " in out
+    assert " 0 differ, " in out
 
 
 def test_the_files(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

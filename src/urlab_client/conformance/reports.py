@@ -125,8 +125,9 @@ def _without(key: str, value: Any, redact: Redact) -> Any:
 def counts(rows: Iterable[StatementResult]) -> str:
     """Return how many statements hold, differ and were not tried."""
     found = Counter(row.verdict for row in rows)
-    holds, differs = found[Verdict.HOLDS], found[Verdict.DIFFERS]
-    return f"{holds} hold{'s' * (holds == 1)}, {differs} differ{'s' * (differs == 1)}, {found[Verdict.NOT_TRIED]} not tried"
+    said = {Verdict.HOLDS: ("holds", "hold"), Verdict.DIFFERS: ("differs", "differ")}
+    counted = [f"{found[verdict]} {words[found[verdict] != 1]}" for verdict, words in said.items()]
+    return ", ".join([*counted, f"{found[Verdict.NOT_TRIED]} not tried"])
 
 
 def differences_first(report: Report) -> list[StatementResult]:
