@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = "import sys, hatchling.build as b; b.build_wheel(sys.argv[1]); b.build_sdist(sys.argv[1])"
-SHIPPED = {".py", ".typed", ".xml", ".png", ".html", ".css", ".js", ".svg", ".json", ".webmanifest", ".ico"}
+SHIPPED = {".py", ".typed", ".xml", ".png", ".html", ".css", ".js", ".svg", ".toml", ".json", ".webmanifest", ".ico"}
 
 
 def run(command: Sequence[str | Path], cwd: Path) -> subprocess.CompletedProcess[str]:
