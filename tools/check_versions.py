@@ -39,7 +39,7 @@ CORE = (*FROM_END_TO_END, "tests/server", "tests/protocol", "tests/aio", "tests/
 QUICK = {"lowest": CORE, "mujoco-3.11": FROM_END_TO_END}
 
 # What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
-TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "pillow", "trio", "uvloop"}
+TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "mcap", "pillow", "trio", "uvloop"}
 
 
 def project() -> dict[str, Any]:

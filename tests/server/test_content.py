@@ -315,6 +315,7 @@ def test_importing_again_mends_a_damaged_snapshot(workspace: Workspace, workshop
     assert tree(again.folder) == before
 
 
+@pytest.mark.mujoco("3.16")
 def test_importing_the_same_content_makes_the_same_snapshot(workspace: Workspace, workshop: Path) -> None:
     first, _ = workspace.content.import_xml(str(workshop))
     second, _ = workspace.content.import_xml(str(workshop), force_reimport=True)
