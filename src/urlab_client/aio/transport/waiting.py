@@ -32,6 +32,7 @@ _AGAIN_S: Final = 1.0
 _FAST_S: Final = 1e-3  # how long the pauses between two looks at a region stay the shortest
 _SLOWEST_S: Final = 5e-3  # the longest of them
 _POLL_STEP_S: Final = 1e-3  # the resolution of ZeroMQ's poll
+_LINGER_S: Final = 2e-3  # how long after news the thread does without its wake-up, which takes as long as a reply
 
 _DRAIN_BYTES: Final = 4096
 _POLLIN: Final = int(zmq.POLLIN)
@@ -101,7 +102,7 @@ class Watch:
         self.tell = tell
         self._loop = loop
         self._on_news = on_news
-        self._fastest_s = fastest_s
+        self.fastest_s = fastest_s
         self._on_demand = on_demand
         self._since = 0.0
         self._armed = False
@@ -142,7 +143,7 @@ class Watch:
 
     def pause(self, now: float) -> float:
         """Return the seconds to sleep before the next look at the region."""
-        return min(self._fastest_s * max((now - self._since) / _FAST_S, 1.0), _SLOWEST_S)
+        return min(self.fastest_s * max((now - self._since) / _FAST_S, 1.0), _SLOWEST_S)
 
     def notify(self) -> None:
         """Handle news. Called on the event loop."""
@@ -171,6 +172,8 @@ class _Watcher:
         self._users = 0
         self._ended = False
         self._woken = False
+        self._lingers_until = 0.0
+        self._linger_pause = 0.0
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._start()
 
@@ -277,7 +280,11 @@ class _Watcher:
         watched = [watch for watch in self._armed if watch.has_news is not None]
         news = [watch for watch in watched if watch.has_news is not None and watch.has_news()]
         silent = [watch for watch in watched if watch not in news]
-        pause = min((watch.pause(now) for watch in silent), default=_CHECK_S)
+        if news:
+            self._lingers_until = now + _LINGER_S
+            self._linger_pause = min(watch.fastest_s for watch in news)
+        idle = self._linger_pause if now < self._lingers_until else _CHECK_S
+        pause = min((watch.pause(now) for watch in silent), default=idle)
         block = next((watch.block for watch in silent if watch.block is not None), None)
         watched.clear()
         silent.clear()
