@@ -27,7 +27,7 @@ from urlab_client.values.descriptions import (
     EntityDescription,
     Pose,
 )
-from urlab_client.values.names import NameMap
+from urlab_client.values.names import NameMap, PublicDir
 from urlab_client.values.rotation import rotate
 
 Move: TypeAlias = Callable[["URLabArticulation", Mapping[str, float], float, float], Awaitable[float]]
@@ -37,7 +37,7 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class URLabEntity:
+class URLabEntity(PublicDir):
     """A dynamic body, or the root of an articulation.
 
     The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread

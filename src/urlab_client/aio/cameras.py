@@ -13,14 +13,15 @@ from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
+from urlab_client.values.names import PublicDir
 from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
 
-class URLabCameraView:
+class URLabCameraView(PublicDir):
     """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
     delivered: bool
@@ -114,7 +115,7 @@ class URLabCameraView:
 
     def frames(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,

@@ -11,7 +11,7 @@ from copy import copy
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
-from urlab_client.aio.arguments import integer
+from urlab_client.aio.arguments import integer, require
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
@@ -40,14 +40,29 @@ from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.shm_regions import ServerRegions
-from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.enums import (
+    CameraTiming,
+    EncodingName,
+    ObservationLevel,
+    ObservationLevelName,
+    StepMode,
+    StepModeName,
+    Transport,
+    TransportName,
+)
 from urlab_client.errors import URLabError
 from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import (
+    CameraSample,
+    RowSample,
+    StateSnapshot,
+    StreamPolicy,
+    StreamPolicyName,
+)
 from urlab_client.protocol.topics import TopicKind
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
@@ -112,7 +127,7 @@ class URLabClient(ClientState):
         self,
         address: str = "tcp://localhost",
         *,
-        step_mode: str | StepMode = "auto",
+        step_mode: StepMode | StepModeName = "auto",
         step_port: int = 5559,
         state_port: int = STATE_PORT,
         ctrl_port: int = 5556,
@@ -121,9 +136,9 @@ class URLabClient(ClientState):
         local_model: bool = True,
         rcv_timeout_ms: int = 5000,
         auto_promote_step_mode: bool = True,
-        transport: str | Transport = "zmq",
+        transport: Transport | TransportName = "zmq",
         shm_dir: str | None = None,
-        encoding: str = "msgpack",
+        encoding: EncodingName = "msgpack",
         server_key: str | os.PathLike[str] | None = None,
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
@@ -271,7 +286,7 @@ class URLabClient(ClientState):
 
     async def discover(
         self,
-        observations: str | ObservationLevel = "standard",
+        observations: ObservationLevel | ObservationLevelName = "standard",
         *,
         handshake: bytes | None = None,
         timeout: Timeout = DEFAULT,
@@ -317,7 +332,7 @@ class URLabClient(ClientState):
         n_steps: int = 1,
         *,
         include_cameras: bool | Mapping[str, str | CameraTiming] = False,
-        observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
+        observations: ObservationLevel | ObservationLevelName | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
         """Advance physics according to the step mode, and update the state.
@@ -480,7 +495,7 @@ class URLabClient(ClientState):
 
     def state_stream(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -523,7 +538,7 @@ class URLabClient(ClientState):
         kinds: Collection[str | TopicKind] = (),
         components: Collection[str] = (),
         *,
-        policy: str | StreamPolicy = "latest_per_key",
+        policy: StreamPolicy | StreamPolicyName = "latest_per_key",
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -600,9 +615,11 @@ class URLabClient(ClientState):
 
         Raises:
             URLabRPCError: The server refused the request.
+            TypeError: It is not a request, but the name of an op, for example; nothing was sent.
             ValueError: A `Step` has numbers that are not finite, or 0 steps in direct mode, where the server would take
                 one; nothing was sent.
         """
+        require("call", request, Request, "a request of urlab_client.protocol.messages, such as Step()")
         request = copy(request)  # the session stamps its id on what it sends, and the owner of the robots
         if not isinstance(request, Step):
             return await self._session.call(request, timeout=timeout)

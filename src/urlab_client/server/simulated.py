@@ -17,7 +17,7 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode, StepModeName
 from urlab_client.protocol.base import DialectName
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.config import ServerConfig
@@ -63,7 +63,7 @@ class SimulatedServer:
         *models: str | os.PathLike[str],
         play: bool = False,
         unpaused: bool = False,
-        step_mode: StepMode | str = StepMode.AUTO,
+        step_mode: StepMode | StepModeName = "auto",
         host: str = "127.0.0.1",
         curve: CurveServer | None = None,
         insecure_no_auth: bool = False,

@@ -19,7 +19,7 @@ from urlab_client.aio.namespaces import runtime as aio_runtime
 from urlab_client.aio.namespaces import scene as aio_scene
 from urlab_client.aio.namespaces import sim as aio_sim
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.enums import StepMode
+from urlab_client.enums import StepMode, StepModeName
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,
     CameraDelayInForce,
@@ -66,19 +66,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
     __slots__ = ()
     _aio: aio_ops.RuntimeOps
-
-    def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
-        """Set the pacing of live mode, and return the value in force.
-
-        Args:
-            percent: Percent of real time; the engine clamps to 5..100.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return self._portal.call(self._aio.set_sim_speed, percent, timeout=timeout)
 
     def set_control_source(self, source: str, *, articulation: str | None = None, timeout: Timeout = DEFAULT) -> None:
         """Choose the source of the set-points for the actuators: this protocol or the editor's panel.
@@ -1136,7 +1123,16 @@ class RuntimeNamespace(RuntimeOps, twin=aio_runtime.RuntimeNamespace):
         """
         return self._portal.call(self._aio.set_camera_delay, cameras, timeout=timeout)
 
-    def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
+    def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
+        """Set the pacing of live mode, and return the value in force, which the log mentions if the engine clamped it.
+
+        Args:
+            percent: Percent of real time; the engine clamps to 5..100.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        return self._portal.call(self._aio.set_sim_speed, percent, timeout=timeout)
+
+    def set_mode(self, mode: StepMode | StepModeName, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the mode in force. Every mode except live resumes paused physics.
 
         Args:

@@ -266,7 +266,6 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         errors=("not_ready", "missing_field"),
-        generated=True,
         returns="percent",
         positional=1,
     ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Struct
@@ -29,6 +29,10 @@ class StreamPolicy(StrEnum):
     """The newest message of each topic."""
     ALL = "all"
     """Every message, up to a limit."""
+
+
+StreamPolicyName: TypeAlias = Literal["latest", "latest_per_key", "all"]
+"""A policy of streams, by name."""
 
 
 class StreamItem(Serializable, Struct, kw_only=True, omit_defaults=True):
