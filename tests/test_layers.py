@@ -114,7 +114,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "transport",
         "streams",
         "faults",
-        "config",
         "core",
         "rpc",
         "handlers",

@@ -23,8 +23,7 @@ from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client.aio.streams.events import EventBus
 from urlab_client.aio.streams.live_state import LiveState
-from urlab_client.aio.streams.rows import RowFilter, RowSource
-from urlab_client.aio.streams.sources import Camera, CameraSource, StateSource
+from urlab_client.aio.streams.sources import Camera, CameraSource, RowFilter, RowSource, StateSource
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.errors import (

@@ -218,8 +218,7 @@ async def test_discovering_changes_nothing_in_the_world_of_another(connect: Any,
 
 
 async def test_a_request_of_the_caller_stays_as_it_is(connect: Any, serve: Any) -> None:
-    from urlab_client.protocol.messages.control import ClaimControl
-    from urlab_client.protocol.messages.runtime import GetContacts
+    from urlab_client.protocol.messages.runtime import ClaimControl, GetContacts
     from urlab_client.protocol.messages.session import Step
 
     with serve("arm", play=True) as server:

@@ -35,7 +35,7 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
-from urlab_client.aio.streams.rows import RowFilter, RowSource
+from urlab_client.aio.streams.sources import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport

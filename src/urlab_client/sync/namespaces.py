@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces import _ops as aio_ops
-from urlab_client.aio.namespaces import contexts as aio_contexts
 from urlab_client.aio.namespaces import outliner as aio_outliner
 from urlab_client.aio.namespaces import recording as aio_recording
 from urlab_client.aio.namespaces import runtime as aio_runtime
@@ -770,36 +769,6 @@ class FarmNamespace(Facade, twin=aio_ops.FarmNamespace):
         self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)
 
 
-class Playing(Facade, twin=aio_contexts.Playing):
-    """Play for the duration of a block; see `client.sim.playing()`."""
-
-    __slots__ = ()
-    _aio: aio_contexts.Playing
-
-    def __enter__(self) -> PIEStartResult:
-        return self._portal.call(self._aio.__aenter__)
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
-
-
-class SceneEdit(Facade, twin=aio_contexts.SceneEdit):
-    """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
-
-    __slots__ = ()
-    _aio: aio_contexts.SceneEdit
-
-    def __enter__(self) -> None:
-        self._portal.call(self._aio.__aenter__)
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
-
-
 class OutlinerNamespace(OutlinerOps, twin=aio_outliner.OutlinerNamespace):
     """Inspecting the world, and preparing plain meshes for physics."""
 
@@ -1156,6 +1125,21 @@ class RuntimeNamespace(RuntimeOps, twin=aio_runtime.RuntimeNamespace):
         return self._portal.call(self._aio.forward, timeout=timeout)
 
 
+class SceneEdit(Facade, twin=aio_scene.SceneEdit):
+    """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
+
+    __slots__ = ()
+    _aio: aio_scene.SceneEdit
+
+    def __enter__(self) -> None:
+        self._portal.call(self._aio.__aenter__)
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
+
+
 class SceneNamespace(SceneOps, twin=aio_scene.SceneNamespace):
     """Editor-time authoring. Edits during play take effect at the next start of play."""
 
@@ -1429,6 +1413,21 @@ class SceneNamespace(SceneOps, twin=aio_scene.SceneNamespace):
             URLabRPCError: An op failed; actors placed before it stay.
         """
         return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)
+
+
+class Playing(Facade, twin=aio_sim.Playing):
+    """Play for the duration of a block; see `client.sim.playing()`."""
+
+    __slots__ = ()
+    _aio: aio_sim.Playing
+
+    def __enter__(self) -> PIEStartResult:
+        return self._portal.call(self._aio.__aenter__)
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
 
 
 class SimNamespace(Facade, twin=aio_sim.SimNamespace):

@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 from urlab_client.aio.background import background_task
 from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.session.turn import Deadlines
-from urlab_client.errors import ControlClaimed, NotControlOwner, URLabError
+from urlab_client.errors import UNCLAIMED, ControlClaimed, NotControlOwner, URLabError
 from urlab_client.protocol.base import ControlRequest, Reply
-from urlab_client.protocol.messages.control import (
-    UNCLAIMED,
+from urlab_client.protocol.messages.runtime import (
     ClaimControl,
     ClaimControlOk,
     ReleaseControl,
     ReleaseControlOk,
+    SetControlSource,
+    SetQpos,
+    SetTwist,
 )
-from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
 from urlab_client.protocol.messages.session import Step
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from urlab_client.server.assets.actors import (
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
-from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.composition import actor_bounds
 from urlab_client.server.editor.level_actors import (
     ActorNames,
     LevelActors,
