@@ -124,18 +124,6 @@ class Control:
         self._note_write(robots)
         return reply
 
-    async def claim(self, key: str, *, force: bool, ttl: float, timeout: Timeout) -> None:
-        """Claim a robot.
-
-        Raises:
-            ControlClaimed: Another client owns it.
-            ValueError: `ttl` is negative, NaN or infinite.
-        """
-        if not 0 <= ttl < math.inf:
-            raise ValueError(f"ttl must be at least 0 seconds and finite, got {ttl}")
-        if self._session.features.claims:
-            await self._session.call(ClaimControl(articulation=key, ttl_s=ttl, force=force), timeout=timeout)
-
     async def release(self, key: str, *, timeout: Timeout) -> None:
         held = self._held.pop(key, None) is not None or _control_of(key) in self._session.unsettled
         if not held or not self._session.features.claims:
