@@ -8,14 +8,20 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from urlab_client._mujoco import acting_kind, control_counts, control_starts, force_counts, servo_damping
+from urlab_client._mujoco import (
+    QPOS_WIDTH,
+    QVEL_WIDTH,
+    acting_kind,
+    control_counts,
+    control_starts,
+    force_counts,
+    servo_damping,
+)
 from urlab_client.aio.arguments import finite, finite_array, is_array
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import (
     JOINT_KINDS,
     JOINT_TRANSMISSIONS,
-    QPOS_WIDTH,
-    QVEL_WIDTH,
     joint_unit,
     sensor_kind,
     sensor_unit,

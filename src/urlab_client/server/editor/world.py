@@ -34,7 +34,6 @@ from urlab_client.server.editor.level_actors import (
     LevelActors,
     checked_pose,
     checked_rotation,
-    float32,
     match_actor,
     refuse_infinite,
     refuse_scale,
@@ -42,6 +41,7 @@ from urlab_client.server.editor.level_actors import (
 )
 from urlab_client.server.editor.levels import Blueprints, Levels
 from urlab_client.server.refusal import CompileFailed, Refusal
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, swap_frame
 from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode
 
