@@ -112,7 +112,7 @@ class Watch:
             with contextlib.suppress(NotImplementedError):
                 loop.add_reader(fd, on_news)
                 return
-        self._watcher = _Watcher.of(loop)
+        self._watcher = _Watcher.of(loop, self)
         if not on_demand:
             self.expect()
 
@@ -169,7 +169,7 @@ class _Watcher:
         self._lock = threading.Lock()
         # Weak: an unclosed client is collected with its loop before this thread sees that the loop is closed.
         self._armed = WeakSet[Watch]()
-        self._users = 0
+        self._users = WeakSet[Watch]()
         self._ended = False
         self._woken = False
         self._lingers_until = 0.0
@@ -178,12 +178,12 @@ class _Watcher:
         self._start()
 
     @classmethod
-    def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
-        """Return the watcher of `loop` and count the caller as a user."""
+    def of(cls, loop: asyncio.AbstractEventLoop, user: Watch) -> _Watcher:
+        """Return the watcher of `loop` for a new user."""
         watcher = cls._of_loops.get(loop)
         if watcher is None:
             watcher = cls._of_loops[loop] = cls(loop)
-        watcher._users += 1
+        watcher._users.add(user)
         return watcher
 
     def arm(self, watch: Watch) -> None:
@@ -201,7 +201,7 @@ class _Watcher:
         """Stop watching: `has_news` is not running and is not called again. The last user ends the thread."""
         with self._lock:
             self._armed.discard(watch)
-            self._users -= 1
+            self._users.discard(watch)
             last = not self._users
             self._ended = self._ended or last
             if last or watch.fd is not None:  # its socket is about to be closed
@@ -226,7 +226,7 @@ class _Watcher:
         self._thread.start()
 
     def _on_death(self, event: ClientEvent) -> None:
-        for watch in tuple(self._armed):
+        for watch in tuple(self._users):
             if watch.tell is not None:
                 watch.tell(event)
         self._loop.call_later(_AGAIN_S, self._begin_again)
