@@ -76,11 +76,12 @@ def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
     if type(value) is list:
         numbers: list[Any] = value  # pyright: ignore[reportUnknownVariableType]  # `cast` is a call, for each array
-        if len(numbers) <= _SHORT:
+        count = len(numbers)
+        if count <= _SHORT:
             # Twice as fast as the code below, but only for numbers; everything else falls through.
-            packed = np.empty(len(numbers))
+            packed = np.empty(count)
             try:
-                _packer(len(numbers))(packed, 0, *numbers)
+                _packer(count)(packed, 0, *numbers)
             except (struct.error, OverflowError):
                 pass
             else:

@@ -14,8 +14,8 @@ streams and heartbeats. The rules:
 5. Signals are deferred while the main thread is in this module. An arriving signal makes the call leave the loop; then
    its handler runs, and if the handler raises, the call is cancelled.
 
-A thread with its own running loop, as in a notebook, cannot run a second one: its calls are always queued. The loop is
-asyncio's own selector loop; nothing here relies on its private parts.
+A thread with its own running loop, as in a notebook, cannot run a second one: its calls are always queued. The loop
+relies on asyncio's public interface only.
 """
 
 from __future__ import annotations

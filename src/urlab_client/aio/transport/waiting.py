@@ -116,6 +116,11 @@ class Watch:
         if not on_demand:
             self.expect()
 
+    @property
+    def by_loop(self) -> bool:
+        """Whether the loop itself watches, always."""
+        return self._watcher is None
+
     def expect(self) -> None:
         """Watch until the next news, if that was left to this call."""
         if self._watcher is None:
