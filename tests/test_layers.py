@@ -41,6 +41,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "_mujoco",
         "_platform",
         "aio",
+        "events",
         "keys",
         "protocol",
         "randomise",

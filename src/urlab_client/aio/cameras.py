@@ -141,7 +141,9 @@ class URLabCameraView(PublicDir):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.camera(self.camera, policy),
             policy=policy,

@@ -521,7 +521,9 @@ class URLabClient(ClientState):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.state(policy),
             policy=policy,
@@ -564,6 +566,7 @@ class URLabClient(ClientState):
         Raises:
             KeyError: The articulation is unknown.
             ValueError: A kind or the policy is unknown, or the buffer is empty.
+            ClientClosed: The client was closed.
             URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
                 model.
         """
@@ -576,6 +579,7 @@ class URLabClient(ClientState):
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
         wanted = RowFilter(keys, kinds, components, entities=articulation is None)
+        self._publishers.check_open()
         source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
         if not self._session.features.publishes_rows:
             # From the socket, which delivers every snapshot; a region holds only the newest.
