@@ -6,7 +6,7 @@ They are registered with Gymnasium under `urlab/`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final, Literal
 
 import gymnasium
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import URLabEnv
-from urlab_client.integrations.gym.spaces import SpaceMode
+from urlab_client.integrations.gym.spaces import Actions, SpaceMode
 from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 from urlab_client.protocol.base import Floats
@@ -161,9 +161,10 @@ class PushPictures(Push):
 class Walk(Task):
     """The quadruped follows a velocity command (forward, left and yaw rate), drawn for each episode.
 
-    Actions are joint targets of its PD controller. Observations add the command, m/s and rad/s, base frame, to the
-    positions and velocities. The reward, between 0 and 1.5, measures how closely the robot follows the command. The
-    episode terminates when the robot falls. Success means that the velocity error is below `CLOSE`.
+    Actions from -1 to 1 move the joint targets of its PD controller around the standing pose. Observations add the
+    command, m/s and rad/s, base frame, to the positions and velocities. The reward, between 0 and 1.5, measures how
+    closely the robot follows the command. The episode terminates when the robot falls. Success means that the velocity
+    error is below `CLOSE`.
     """
 
     LOW: Final = np.array([-0.2, -0.1, -0.4])
@@ -172,6 +173,7 @@ class Walk(Task):
 
     scene_address: ClassVar[str] = "sim://quadruped?controller=quadruped=pd,kp=60,kv=2"
     n_observed: ClassVar[int] = 3
+    actions: ClassVar[Actions | Mapping[str, Actions] | None] = Actions(scale=(0.3, 0.6, 0.8) * 4)  # rad
     max_episode_steps: ClassVar[int | None] = 500
 
     def reset(self, rng: np.random.Generator, start: Start) -> None:
