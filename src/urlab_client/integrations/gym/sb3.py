@@ -54,9 +54,9 @@ class Sb3VecEnv(_VecEnv):
                 "Stable-Baselines3 resets in the step that ends an episode: make the environment with "
                 f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
             )
-        self.env = env
+        self.env: Any = env
         self._actions: Any = None
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, self.env.single_observation_space, self.env.single_action_space)
 
     def reset(self) -> Observation:
         """Start an episode in all environments, with the seeds of `seed()`."""
@@ -92,7 +92,7 @@ class Sb3VecEnv(_VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return the picture of each environment, None without a render mode."""
-        pictures = cast("Any", self.env).render()
+        pictures = self.env.render()
         return [None] * self.env.num_envs if pictures is None else list(pictures)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
