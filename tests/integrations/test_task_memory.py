@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import mujoco
@@ -334,3 +335,53 @@ def test_gymnasiums_wrappers_compose(serving: Callable[..., str], made: list[Any
         total += rewards
     assert truncated.all()
     np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-5)
+
+
+HILLS = """
+<mujoco>
+  <option timestep="0.002"/>
+  <asset><hfield name="hills" nrow="3" ncol="3" size="2 2 1 0.1" elevation="0 0 0  0 0.5 0  0 0 1"/></asset>
+  <worldbody>
+    <geom name="hills" type="hfield" hfield="hills"/>
+    <geom name="ramp" type="box" size="1 1 0.05" pos="6 0 0.5" euler="0 -30 0"/>
+    <body name="ball" pos="0 0 5">
+      <freejoint/>
+      <geom name="ball" type="sphere" size="0.1" mass="1"/>
+    </body>
+    <body name="arm" pos="0 0 6"><joint name="turn" axis="0 0 1"/><geom name="rod" size="0.5"/></body>
+  </worldbody>
+  <actuator><motor name="turn" joint="turn"/></actuator>
+</mujoco>
+"""
+
+
+def test_episodes_start_on_slopes_and_height_fields(tmp_path: Path, made: list[Any]) -> None:
+    """The same place on a server and in a batch, whatever moves above it."""
+
+    class Settle(Task):
+        seen: ClassVar[list[float]] = []
+        n_substeps: ClassVar[int] = 1
+
+        def reset(self, rng: np.random.Generator, start: Start) -> None:
+            x, y = rng.choice([-1.0, 0.0, 1.0, 6.0]), 0.0
+            self.seen.append(start.ground(x, y))
+            start.place("hills/ball", [x, y, start.ground(x, y) + 0.3])
+            with pytest.raises(ValueError, match="no ground at x = 9, y = 0"):
+                start.ground(9.0, 0.0)
+
+        def reward(self, states: States, actions: Any) -> Any:
+            return -states.body_position("hills/ball")[:, 2]
+
+    model = tmp_path / "hills.xml"
+    model.write_text(HILLS)
+    with SimulatedServer(model, play=True, step_mode="direct") as server:
+        address = f"{server.address}:{server.step_port}"
+        batch = URLabBatchEnv(address, 1, task=Settle())
+        env = URLabEnv.connect(address, task=Settle())
+        made += [batch, env]
+        for seed in range(6):
+            assert np.array_equal(batch.reset(seed=seed)[0][0], env.reset(seed=seed)[0])
+        env.close()
+    assert Settle.seen[:12:2] == Settle.seen[1:12:2]
+    found = {round(height, 3) for height in Settle.seen}
+    assert found == {0.25, 0.5, 0.558}, "the slope, the summit and the ramp"
