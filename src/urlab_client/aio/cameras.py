@@ -15,8 +15,9 @@ from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
+from urlab_client.values.html import fields
 from urlab_client.values.names import PublicDir
-from urlab_client.values.pictures import Pixels
+from urlab_client.values.pictures import Pixels, thumbnail
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -164,3 +165,10 @@ class URLabCameraView(PublicDir):
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"
+
+    def _repr_html_(self) -> str:
+        frame = self.latest_frame
+        shown = None if frame is None else thumbnail(frame, self.mode, self.name)
+        return fields(
+            "URLabCameraView", {**self.describe().to_dict(), "sim_time": self.sim_time, "latest_frame": shown}
+        )

@@ -64,6 +64,7 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicyName,
 )
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.html import fields
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -677,6 +678,18 @@ class URLabClient(ClientState):
     def __repr__(self) -> str:
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
         return f"<URLabClient {self.address} {state}>"
+
+    def _repr_html_(self) -> str:
+        playing = "running" if self.manager_present else "not running, as far as this client knows"
+        found = {
+            "server": self.urlab_version and f"URLab {self.urlab_version}, MuJoCo {self.mujoco_version}",
+            "play": playing,
+            "step mode": str(self.step_mode),
+            "simulation time": f"{self.sim_time:.3f} s",
+            "robots": ", ".join(self.articulations),
+            "other bodies": ", ".join(name for name in self.entities if name not in self.articulations),
+        }
+        return fields(repr(self)[1:-1], found)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
