@@ -152,7 +152,7 @@ class Agent:
         self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
     ) -> types.CallToolResult | types.InputRequiredResult:
         console, caller = self._console, self._caller(context)
-        call = Call(console, caller, self._limits, self._models, context.session.report_progress)
+        call = self._new_call(context, caller)
         began = time.perf_counter()
         try:
             found = self._tool(params.name)
@@ -175,6 +175,9 @@ class Agent:
             milliseconds = 1e3 * (time.perf_counter() - began)
             console.view.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
+
+    def _new_call(self, context: ServerRequestContext[Any], caller: Caller) -> Call:
+        return Call(self._console, caller, self._limits, self._models, context.session.report_progress)
 
     def _caller(self, context: ServerRequestContext[Any]) -> Caller:
         """Return the caller, identified by token, session, if any, and program.
@@ -247,6 +250,7 @@ class Agent:
         try:
             match kind, name:
                 case "cameras", str() if name:
+                    await self._new_call(context, self._caller(context)).connected()
                     jpeg = base64.b64encode(await tools.jpeg_of(console.client, name)).decode()
                     picture = types.BlobResourceContents(uri=uri, blob=jpeg, mime_type="image/jpeg")
                     return types.ReadResourceResult(contents=[picture])

@@ -33,7 +33,8 @@ TAKEN_OVER = "Another program has taken the server over. Ask a person to take it
 RESTARTED = "The server was started again, and its simulation has begun anew. Call look before going on."
 
 _CONNECT_S = 10.0
-_PROBE_S = 0.5
+_FIRST_S = 0.5
+_PROBE_S = 0.4
 _TOLD_S = 0.5
 _REPORT_S = 0.1
 _REST_S = 5.0
@@ -115,19 +116,20 @@ class Call:
         starts = self.client.address.startswith("sim://")
         waiting = background_task("urlab-mcp-connecting", self._report_connecting())
         try:
-            with (
-                self.console.view.watch() as changed,
-                anyio.move_on_after(self.limits.wall_seconds if starts else _CONNECT_S),
-            ):
-                while (link := self.console.link).state not in {"connected", "taken_over"}:  # which only a person ends
-                    if link.state == "connecting" and link.reason:
-                        break
-                    changed.clear()
-                    await changed.wait()
+            await self._attempted(self.limits.wall_seconds if starts else _CONNECT_S)
         finally:
             waiting.cancel()
         if self.console.link.state != "connected":
             raise URLabConnectionError(await self.missing())
+
+    async def _attempted(self, seconds: float) -> None:
+        """Wait until the session is open, a first attempt has failed, or only a person can open it again."""
+        with self.console.view.watch() as changed, anyio.move_on_after(seconds):
+            while (link := self.console.link).state not in {"connected", "taken_over"}:
+                if link.state == "connecting" and link.reason:
+                    return
+                changed.clear()
+                await changed.wait()
 
     async def _report_connecting(self) -> None:
         began = time.monotonic()
@@ -140,23 +142,28 @@ class Call:
         return f"{doing}: {self.client.address}."
 
     async def missing(self) -> str:
-        """Return why there is no connection, as far as can be found out in half a second; empty if there is one."""
+        """Return why there is no connection, as far as can be found out within a second; empty if there is one."""
+        if self.console.link.state == "connecting":
+            await self._attempted(_FIRST_S)
         link, address = self.console.link, self.client.address
         if link.state == "connected":
             return ""
         if link.state == "taken_over":
             return TAKEN_OVER
-        known = f"There is no connection to {address}: {link.reason.rstrip('.?') or 'a first attempt is under way'}."
-        endpoint = urlsplit(address)
         if address.startswith("sim://") and not link.reason:
             return f"{self._connecting()} Call again in a few seconds."
+        why = link.reason.rstrip(".?") or "a first attempt is under way"
+        endpoint = urlsplit(address)
         if endpoint.scheme == "tcp":
             port = endpoint.port or self.client.config.step_port
-            found = await connection_problem(endpoint.hostname or "localhost", port, _PROBE_S)
-            known += f" At present: {found or 'the port accepts connections; the server may be busy or starting.'}"
+            problem = await connection_problem(endpoint.hostname or "localhost", port, _PROBE_S)
+            why = problem or f"{why}. The port accepts connections, so the server may be busy or starting"
+        known = (
+            f"There is no connection to {address}: {why.rstrip('.?')}. It is retried automatically: call again later."
+        )
         if self.client.session_id:
-            known += " If the server was started again, its simulation begins anew: call look before going on."
-        return f"{known} The connection is retried automatically; explain says when it is there."
+            known += " If the server was started again, its simulation has begun anew: call look before going on."
+        return known
 
     async def drive(self, work: Callable[[], Awaitable[T]]) -> T:
         """Do something that changes the simulation, through the console's controls."""

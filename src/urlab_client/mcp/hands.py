@@ -16,6 +16,7 @@ from msgspec import Meta, Struct
 
 from urlab_client.mcp.call import Call, Stopped
 from urlab_client.mcp.results import HandMoved, HandPose, label
+from urlab_client.values.rotation import normalized
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
@@ -152,7 +153,7 @@ def _planned(
         if pose.gripper is not None:
             _check_gripper(ik, robot, pose.gripper)
         aim = at if pose.position is None else np.array(pose.position)
-        asked = None if pose.quaternion is None else np.array(pose.quaternion) / np.linalg.norm(pose.quaternion)
+        asked = None if pose.quaternion is None else np.array(normalized((*pose.quaternion,)))
         end = ik.solve(aim, turned if asked is None else asked, start=joints, nearest=True)
         turn = turned if asked is None else asked
         if not end.reached and asked is None:
