@@ -18,7 +18,7 @@ class ClaimControlOk(Reply, tag="claim_control_ok", kw_only=True):
     ttl_s: Annotated[float, doc("Seconds without a write after which the claim expires; 0 for never.")]
 
 
-class ClaimControl(ControlRequest[ClaimControlOk], tag="claim_control", kw_only=True, omit_defaults=True):
+class ClaimControl(ControlRequest[ClaimControlOk], tag="claim_control", kw_only=True):
     """Become the only owner of a robot, or renew the ownership."""
 
     articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
@@ -32,7 +32,7 @@ class ReleaseControlOk(Reply, tag="release_control_ok", kw_only=True):
     articulation: Annotated[str, doc("Engine's object name, regardless of the requested name.")]
 
 
-class ReleaseControl(ControlRequest[ReleaseControlOk], tag="release_control", kw_only=True, omit_defaults=True):
+class ReleaseControl(ControlRequest[ReleaseControlOk], tag="release_control", kw_only=True):
     """Release a robot."""
 
     articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
