@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 import urlab_client
@@ -100,3 +101,15 @@ def test_values_that_are_handed_out_cannot_be_changed() -> None:
     found = [cls for module in modules("values") for cls in classes(module) if issubclass(cls, msgspec.Struct)]
     changeable = {cls.__name__ for cls in found if not cls.__struct_config__.frozen}
     assert changeable == {"PIEStartResult", "SimOptions", "URLabAsset"}
+
+
+def test_an_order_of_the_browser_that_says_nothing_asks_for_nothing() -> None:
+    from urlab_client.console import messages
+
+    fields = [
+        field for cls in classes(messages) if issubclass(cls, msgspec.Struct) for field in msgspec.structs.fields(cls)
+    ]
+    numbers = {
+        np.any(field.default) for field in fields if field.default is not msgspec.NODEFAULT and not field.required
+    }
+    assert numbers == {False}

@@ -278,7 +278,7 @@ def places(code: str) -> dict[int, list[list[Callable[[], str]]]]:
     untouched = (
         (m.Annotation() | m.Decorator() | m.Import() | m.ImportFrom())
         | m.Call(func=m.Name("len") | m.Name("isinstance") | m.Name("cast"))
-        | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger"))))
+        | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger") | m.Name("log") | m.Name("_log"))))
         | m.If(test=m.Name("TYPE_CHECKING") | m.Comparison(left=m.Attribute(value=m.Name("sys"))))
         | m.Assign(targets=[m.AssignTarget(target=m.Name("__all__"))])
         | m.Assign(value=m.Call(func=m.Name("TypeVar") | m.Name("TypeVarTuple") | m.Name("ParamSpec")))
