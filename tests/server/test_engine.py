@@ -842,6 +842,20 @@ def test_a_warning_handler_of_the_host_program_stays() -> None:
         mujoco.set_mju_user_warning(None)
 
 
+def test_warnings_of_mujoco_go_to_the_log_as_long_as_anybody_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduling, "_mujoco_warnings", scheduling._WarningLog())
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(None)
+    try:
+        with Engine(make_scene(bot=BOT)):
+            with Engine(make_scene(bot=BOT)):
+                handler = mujoco.get_mju_user_warning()
+            assert mujoco.get_mju_user_warning() == handler is not None
+        assert mujoco.get_mju_user_warning() is None
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 @WAYS
 @pytest.mark.parametrize("controlled", [False, True], ids=["raw", "controlled"])
 def test_closing_ends_a_very_long_request(way: InlineOrQueued, pool: ThreadPoolExecutor, *, controlled: bool) -> None:
