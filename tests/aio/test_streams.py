@@ -753,6 +753,14 @@ class TestEnds:
         gc.collect()
         await publisher.subscribed()
 
+    async def test_a_closed_stream_of_pictures_stops_receiving(
+        self, publisher: Publisher, subscriptions: Subscriptions
+    ) -> None:
+        camera = camera_at(f"tcp://127.0.0.1:{publisher.port}")
+        async with latest(CameraSource(subscriptions, camera, lambda: "127.0.0.1")):
+            await publisher.subscribed(b"arm0/camera/wrist ")
+        await publisher.subscribed()
+
     async def test_a_stream_stays_with_its_loop(self, publisher: Publisher, state: StateSource) -> None:
         async with latest(state) as states:
             await publisher.subscribed(STATE)

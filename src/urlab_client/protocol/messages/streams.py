@@ -65,7 +65,7 @@ class StreamStats(Serializable, Struct, kw_only=True, frozen=True):
     last_age_s: Annotated[float | None, doc("Seconds since the last message arrived; None before the first.")]
 
 
-class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True, eq=False):
+class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, eq=False):
     """State of everything at the end of one tick, always at observation level `standard`."""
 
     time: Annotated[float, doc("`mjData.time`, seconds. Order live snapshots by this, not by `step`.")]
