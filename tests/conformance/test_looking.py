@@ -54,6 +54,7 @@ def read(thing: Any, seen: dict[int, Any]) -> None:
             read(one, seen)
         return
     repr(thing)
+    getattr(thing, "_repr_html_", str)()  # as in a notebook
     ours = type(thing).__module__.startswith(("urlab_client.aio", "urlab_client.sync"))
     for name in dir(thing) if ours and not isinstance(thing, np.ndarray) else ():
         value = None if name.startswith("_") else getattr(thing, name)

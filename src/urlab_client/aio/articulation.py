@@ -170,6 +170,9 @@ class URLabEntity(PublicDir):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r}>"
 
+    def _repr_html_(self) -> str | None:
+        return self.describe()._repr_html_()  # pyright: ignore[reportPrivateUsage]
+
 
 class URLabArticulation(URLabEntity):
     """A robot imported from MJCF.

@@ -15,8 +15,9 @@ from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
+from urlab_client.values.html import fields
 from urlab_client.values.names import PublicDir
-from urlab_client.values.pictures import Pixels
+from urlab_client.values.pictures import Pixels, thumbnail
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -141,7 +142,9 @@ class URLabCameraView(PublicDir):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.camera(self.camera, policy),
             policy=policy,
@@ -162,3 +165,10 @@ class URLabCameraView(PublicDir):
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"
+
+    def _repr_html_(self) -> str:
+        frame = self.latest_frame
+        shown = None if frame is None else thumbnail(frame, self.mode, self.name)
+        return fields(
+            "URLabCameraView", {**self.describe().to_dict(), "sim_time": self.sim_time, "latest_frame": shown}
+        )

@@ -64,6 +64,7 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicyName,
 )
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.html import fields
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -521,7 +522,9 @@ class URLabClient(ClientState):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.state(policy),
             policy=policy,
@@ -564,6 +567,7 @@ class URLabClient(ClientState):
         Raises:
             KeyError: The articulation is unknown.
             ValueError: A kind or the policy is unknown, or the buffer is empty.
+            ClientClosed: The client was closed.
             URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
                 model.
         """
@@ -576,6 +580,7 @@ class URLabClient(ClientState):
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
         wanted = RowFilter(keys, kinds, components, entities=articulation is None)
+        self._publishers.check_open()
         source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
         if not self._session.features.publishes_rows:
             # From the socket, which delivers every snapshot; a region holds only the newest.
@@ -673,6 +678,18 @@ class URLabClient(ClientState):
     def __repr__(self) -> str:
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
         return f"<URLabClient {self.address} {state}>"
+
+    def _repr_html_(self) -> str:
+        playing = "running" if self.manager_present else "not running, as far as this client knows"
+        found = {
+            "server": self.urlab_version and f"URLab {self.urlab_version}, MuJoCo {self.mujoco_version}",
+            "play": playing,
+            "step mode": str(self.step_mode),
+            "simulation time": f"{self.sim_time:.3f} s",
+            "robots": ", ".join(self.articulations),
+            "other bodies": ", ".join(name for name in self.entities if name not in self.articulations),
+        }
+        return fields(repr(self)[1:-1], found)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

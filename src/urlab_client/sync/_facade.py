@@ -67,6 +67,10 @@ class Facade(PublicDir):
             return super().__repr__()
         return repr(self._aio)
 
+    def _repr_html_(self) -> str | None:
+        shown = getattr(self._aio, "_repr_html_", None)
+        return None if shown is None else shown()
+
     def __reduce__(self) -> tuple[Any, ...]:
         raise TypeError(
             f"{type(self).__name__} cannot be pickled or copied: its connection belongs to this process. "

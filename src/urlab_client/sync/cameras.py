@@ -139,6 +139,7 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
         return self._wrap(
             Stream[CameraSample],

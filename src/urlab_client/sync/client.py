@@ -407,6 +407,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
         return self._wrap(
             Stream[StateSnapshot],
@@ -447,6 +448,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Raises:
             KeyError: The articulation is unknown.
             ValueError: A kind or the policy is unknown, or the buffer is empty.
+            ClientClosed: The client was closed.
             URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
                 model.
         """

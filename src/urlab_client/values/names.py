@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
+from urlab_client.values.html import fields
+
 T = TypeVar("T")
 D = TypeVar("D")
 
@@ -214,6 +216,9 @@ class NameMap(PublicDir, dict[str, T]):
     def _ipython_key_completions_(self) -> list[str]:
         """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""
         return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
+
+    def _repr_html_(self) -> str:
+        return fields(self.kind, {name: repr(one) for name, one in self.items()})
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")

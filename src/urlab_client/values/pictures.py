@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from urlab_client._installation import need
+from urlab_client._installation import MissingExtra, need
 from urlab_client.enums import CameraMode
+from urlab_client.values.html import picture
 from urlab_client.values.layouts import BytesLike, damaged
 from urlab_client.values.plain import Serializable
 
@@ -28,6 +29,7 @@ Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
+_THUMBNAIL = 240  # pixels
 _MAX_SIDE = 16_384  # maximum of graphics cards
 _CACHED = 65_536  # pixels that stay in a core's cache between two passes
 _CENTIMETRES = np.float32(100)
@@ -316,6 +318,35 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
     if max_size is not None:
         image.thumbnail((max_size, max_size))
     return encoded(image, "JPEG", quality=quality)
+
+
+def shown_png(pixels: Pixels, mode: CameraMode | str) -> bytes | None:
+    """Return a picture as PNG for display, depths in grey; None without Pillow.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: Meaning of the pixels.
+    """
+    try:
+        return encoded(_image(to_rgb(pixels, mode)), "PNG")
+    except MissingExtra:
+        return None
+
+
+def thumbnail(pixels: Pixels, mode: CameraMode | str, description: str) -> str:
+    """Return a small picture for a table; without Pillow a sentence that says so.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: Meaning of the pixels.
+        description: Text for those who cannot see it.
+    """
+    try:
+        image = _image(to_rgb(pixels, mode))
+        image.thumbnail((_THUMBNAIL, _THUMBNAIL))
+        return picture(encoded(image, "PNG"), "png", description)
+    except MissingExtra as missing:
+        return str(missing)
 
 
 def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:

@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client.values import html
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -84,6 +85,11 @@ class Serializable:
             TypeError: There is no field with this name.
         """
         return cast("Self", msgspec.structs.replace(cast("Struct", self), **changes))
+
+    def _repr_html_(self) -> str | None:
+        struct = cast("Struct", self)
+        values = {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
+        return html.fields(type(self).__name__, values)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:

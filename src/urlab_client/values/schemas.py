@@ -38,7 +38,25 @@ def schemas(structs: Iterable[type[Struct]], ref_template: str) -> dict[str, dic
         for name, note in field_notes(kind).items():
             if name in part["properties"]:
                 part["properties"][name].setdefault("description", note)
+    for part in parts.values():
+        _simplify_tuples(part)
     return parts
+
+
+def _simplify_tuples(schema: Any) -> None:
+    """Describe tuples of one type by `items`: few code generators understand `prefixItems`."""
+    match schema:
+        case {"prefixItems": [first, *others]} if all(other == first for other in others):
+            schema["items"] = first
+            del schema["prefixItems"]
+        case {**parts}:
+            for part in parts.values():
+                _simplify_tuples(part)
+        case [*parts]:
+            for part in parts:
+                _simplify_tuples(part)
+        case _:
+            pass
 
 
 def prose(struct: type[Struct]) -> str:

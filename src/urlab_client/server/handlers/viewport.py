@@ -153,7 +153,7 @@ def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
     return (x, y, z), xyzw((quat[0], quat[1], quat[2], quat[3]))
 
 
-class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True, omit_defaults=True):
+class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True):
     """A box request with the angles that the plugin also reads, although its clients do not send them."""
 
     rotation_euler: EulerDeg | None = None
