@@ -161,7 +161,7 @@ class Call:
         known = (
             f"There is no connection to {address}: {why.rstrip('.?')}. It is retried automatically: call again later."
         )
-        if self.client.session_id:
+        if link.state != "connecting":
             known += " If the server was started again, its simulation has begun anew: call look before going on."
         return known
 
