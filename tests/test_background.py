@@ -52,6 +52,7 @@ AWAITED = {
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
     "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
     "cli/mcp.py:_serve_stdio_and_console": "waits for the task and raises its error",
+    "cli/mcp.py:_serve_unless_start_fails": "waits for both tasks, and raises or returns the error of the first",
 }
 """Functions that make tasks or threads without the helpers, and who sees their end."""
 

@@ -145,3 +145,16 @@ def test_a_servo_that_is_told_less_than_its_joint_can_do_is_the_limit(tmp_path: 
         assert caught.value.nearest.joints == pytest.approx({"swing": 0.5}, abs=1e-3)  # of length over gear
         reached = ik.solve([math.cos(0.4), math.sin(0.4), 0.0])
         assert reached.set_points == pytest.approx({"swing": 0.8}, abs=2e-3)
+
+
+def test_a_path_collides_where_the_robot_would_run_into_itself(ik: InverseKinematics) -> None:
+    folded = ik.solve((0.0, 0.0, 0.1), nearest=True).joints
+    still = dict.fromkeys(ik.joints, 0.0)
+    assert ik.collisions([still, still]) is None
+    hit = ik.collisions([still, folded])
+    assert hit is not None
+    assert hit[0] == 1
+    assert all(name.startswith("arm_") for name in hit[1:])
+    assert ik.gripper is not None
+    assert ik.gripper.name == "gripper"
+    assert ik.set_points(still) == still

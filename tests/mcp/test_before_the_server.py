@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -51,10 +52,8 @@ async def test_it_answers_before_a_server_runs_and_connects_when_it_appears(tmp_
 
 
 async def test_a_server_that_accepts_and_says_nothing_is_told_from_one_that_refuses(tmp_path: Path) -> None:
-    import asyncio
-
-    async with await asyncio.start_server(lambda _reader, _writer: None, "127.0.0.1", 0) as silent:
-        port = silent.sockets[0].getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the system accepts, and nobody reads
+        port = silent.getsockname()[1]
         client = URLabClient(f"tcp://127.0.0.1:{port}", live_pictures=False)
         session = ConsoleSession(client, recordings=tmp_path)
         async with client, session.open(), Client(Agent(session).server) as mcp:

@@ -75,4 +75,5 @@ async def desk(
         site.router.lifespan_context(site),
         Client(agent.server, read_timeout_seconds=60) as mcp,
     ):
+        await site.state.console.opened()  # without which `look` says within a second that there is no connection
         yield Desk(client, site.state.console, agent, mcp)

@@ -37,6 +37,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._common import CommandError, import_mujoco, sigterm_interrupts
 from urlab_client.enums import StepMode
+from urlab_client.errors import ServerUnreachable, URLabError
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -167,24 +168,33 @@ async def _serve(arguments: Namespace) -> None:
                 serving = _serve_stdio_and_console(arguments, agent, session)
             else:
                 serving = serve_stdio(agent)
+            failure = None
             if arguments.address.startswith("sim://"):
-                await _serve_unless_start_fails(serving, session)
+                failure = await _serve_unless_start_fails(serving, session)
             else:
                 await serving
+    if failure is not None:
+        raise failure  # outside of the session, whose tasks would wrap it
 
 
-async def _serve_unless_start_fails(serving: Coroutine[Any, Any, None], session: ConsoleSession) -> None:
-    """Serve while the simulated server starts. Its failure is final, whereas a running server may start later."""
+async def _serve_unless_start_fails(serving: Coroutine[Any, Any, None], session: ConsoleSession) -> URLabError | None:
+    """Serve while the simulated server starts, and return its failure.
+
+    It is final, whereas a server that somebody else starts may come later.
+    """
     served, opened = asyncio.create_task(serving), asyncio.create_task(session.opened())
     try:
         await asyncio.wait((served, opened), return_when=asyncio.FIRST_COMPLETED)
         if not served.done():
-            opened.result()
+            await opened
         await served
+    except ServerUnreachable as error:
+        return error
     finally:
         served.cancel()
         opened.cancel()
         await asyncio.wait((served, opened))
+    return None
 
 
 async def _serve_stdio_and_console(arguments: Namespace, agent: Agent, session: ConsoleSession) -> None:

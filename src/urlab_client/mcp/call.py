@@ -114,7 +114,7 @@ class Call:
         is not waited for once an attempt has failed.
         """
         starts = self.client.address.startswith("sim://")
-        waiting = background_task("urlab-mcp-connecting", self._report_connecting())
+        waiting = background_task("urlab-mcp-progress", self._report_connecting())
         try:
             await self._attempted(self.limits.wall_seconds if starts else _CONNECT_S)
         finally:
@@ -161,7 +161,7 @@ class Call:
         known = (
             f"There is no connection to {address}: {why.rstrip('.?')}. It is retried automatically: call again later."
         )
-        if self.client.session_id:
+        if link.state != "connecting":
             known += " If the server was started again, its simulation has begun anew: call look before going on."
         return known
 

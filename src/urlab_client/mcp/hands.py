@@ -16,12 +16,12 @@ from msgspec import Meta, Struct
 
 from urlab_client.mcp.call import Call, Stopped
 from urlab_client.mcp.results import HandMoved, HandPose, label
-from urlab_client.values.rotation import normalized
+from urlab_client.protocol.base import Floats
+from urlab_client.values.rotation import Quat, normalized
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
     from urlab_client.integrations.ik import InverseKinematics
-    from urlab_client.protocol.base import Floats
 
 _STEP_M: Final = 0.02
 _STEP_RAD: Final = 0.1
@@ -153,7 +153,7 @@ def _planned(
         if pose.gripper is not None:
             _check_gripper(ik, robot, pose.gripper)
         aim = at if pose.position is None else np.array(pose.position)
-        asked = None if pose.quaternion is None else np.array(normalized((*pose.quaternion,)))
+        asked = None if pose.quaternion is None else np.array(unit(pose.quaternion))
         end = ik.solve(aim, turned if asked is None else asked, start=joints, nearest=True)
         turn = turned if asked is None else asked
         if not end.reached and asked is None:
@@ -267,6 +267,12 @@ def _between(one: Floats, other: Floats, share: float) -> Floats:
     if angle < 1e-6:
         return other
     return (math.sin((1 - share) * angle) * one + math.sin(share * angle) * other) / math.sin(angle)
+
+
+def unit(quaternion: list[float]) -> Quat:
+    """Return an orientation that an agent gave as a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return normalized((w, x, y, z))
 
 
 def _listed(values: Floats) -> str:

@@ -37,7 +37,7 @@ from urlab_client.mcp.results import (
     label,
 )
 from urlab_client.values.names import did_you_mean
-from urlab_client.values.rotation import normalized, xyzw
+from urlab_client.values.rotation import Quat, xyzw
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
@@ -416,12 +416,9 @@ async def remove(call: Call, actor: Actor) -> Edited:
     return await apply_scene.function(call, [], [actor])
 
 
-def _turn(quaternion: list[float] | None) -> list[float] | None:
+def _turn(quaternion: list[float] | None) -> Quat | None:
     """Return an orientation in the order of the wire."""
-    if quaternion is None:
-        return None
-    w, x, y, z = quaternion
-    return [*xyzw(normalized((w, x, y, z)))]
+    return None if quaternion is None else xyzw(hands.unit(quaternion))
 
 
 async def _target(call: Call, named: str) -> dict[str, Any]:
