@@ -239,7 +239,8 @@ def _baselines(policy: Policy) -> dict[str, Policy]:
 def _print(runs: dict[str, PolicyRun]) -> None:
     last = runs["policy"]
     live = last.step_mode is StepMode.LIVE
-    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"]
+    walks = any(found.distance for found in runs.values())  # a fixed base neither walks nor falls
+    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"] if walks else []
     headings += ["goal\nerror"] if last.goal_error is not None else []
     headings += ["actions/s", "late\nactions" if live else "physics\nsteps/s"]
     title = f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation"
@@ -247,10 +248,11 @@ def _print(runs: dict[str, PolicyRun]) -> None:
     for name, found in runs.items():
         results.add_row(
             name,
-            f"{found.reward:.3f}",
-            f"{found.forward:.2f}",
-            f"{found.velocity_error:.3f}",
-            str(found.falls),
+            *(
+                (f"{found.reward:.3f}", f"{found.forward:.2f}", f"{found.velocity_error:.3f}", str(found.falls))
+                if walks
+                else ()
+            ),
             *((f"{found.goal_error:.4f}",) if found.goal_error is not None else ()),
             f"{found.actions / found.wall_time:.0f}",
             str(found.late) if live else f"{found.steps_per_second:.0f}",
