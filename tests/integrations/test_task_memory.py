@@ -15,7 +15,6 @@ from urlab_client.errors import UnknownKeyframe
 from urlab_client.integrations.gym import (
     Actions,
     EpisodeEnd,
-    Reach,
     Start,
     States,
     Task,
@@ -38,7 +37,7 @@ LEVER = """
     </body>
   </worldbody>
   <actuator><position name="servo" joint="hinge" kp="4" dampratio="1" ctrlrange="-1 1"/></actuator>
-  <keyframe><key name="raised" qpos="0.5" ctrl="0.5"/></keyframe>
+  <keyframe><key name="raised" qpos="0.5" ctrl="0.4375"/></keyframe>
 </mujoco>
 """
 
@@ -97,7 +96,7 @@ def test_what_a_task_keeps_is_the_same_on_servers_and_in_a_batch_and_reset_with_
     ours, theirs = (env.reset(seed=5)[0] for env in (wire, batch))
     assert np.array_equal(ours, theirs)
     assert theirs[:, -5:].tolist() == [[0, 0, 0, 0, 0], [1, 10, 0, 0, 0]]
-    up = np.array([0.0, 10.0])
+    up, earlier = np.array([0.0, 10.0]), np.zeros(2)
     for step in range(1, 10):
         actions = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
         ours, theirs = wire.step(actions), batch.step(actions)
@@ -106,8 +105,10 @@ def test_what_a_task_keeps_is_the_same_on_servers_and_in_a_batch_and_reset_with_
         over = step % (5 if mode is AutoresetMode.NEXT_STEP else 4) == 0
         up = np.array([0.0, 10.0]) if over else up + (actions[:, 0] > 0)
         assert theirs[0][:, -4].tolist() == up.tolist()
-        if not over:
-            assert theirs[0][:, -3].tolist() == actions[:, 0].tolist()
+        chosen = np.zeros(2) if over else actions[:, 0].astype(np.float64)
+        assert theirs[0][:, -3].tolist() == chosen.tolist()
+        assert theirs[0][:, -1].tolist() == (0.0 * chosen if over else earlier - chosen).tolist()
+        earlier = chosen
     wire.close()
     single = URLabEnv.connect(levers[0], task=Hold(), **{k: v for k, v in options.items() if k == "randomise"})
     made.append(single)
@@ -140,12 +141,24 @@ def test_before_a_delayed_action_takes_effect_the_keyframe_is_held(
         expected, _ = env.step(np.array([-0.5], dtype=np.float32))[:2]
         copies = batch.step(np.array([[-0.5]], dtype=np.float32))[0]
         for _ in range(5):
-            data.ctrl[:] = 0.5 if wait > 0 else -0.5
+            data.ctrl[:] = model.key_ctrl[0] if wait > 0 else -0.5
             wait -= 1
             mujoco.mj_step(model, data)
         assert np.array_equal(expected, data.qpos)
         assert np.array_equal(copies[0], data.qpos)
-    assert data.qpos[0] < 0.45, "the action has taken effect"
+    assert data.qpos[0] < 0.4, "the action has taken effect"
+
+
+def test_a_keyframe_is_held_by_its_set_points_or_its_joint_positions(
+    levers: list[str], tmp_path: Path, made: list[Any]
+) -> None:
+    model = tmp_path / "lever.xml"
+    model.write_text(LEVER)
+    pd = {"lever": ControllerConfig(kp=4.0, kv=0.1)}
+    with SimulatedServer(model, play=True, step_mode="direct", controllers=pd) as server:
+        made += [URLabBatchEnv(each, 1) for each in (levers[0], f"{server.address}:{server.step_port}")]
+    assert [env.mapping.held("raised")["lever"].tolist() for env in made] == [[0.4375], [0.5]]
+    assert [env.mapping.held(None)["lever"].tolist() for env in made] == [[0.0], [0.0]]
 
 
 def test_set_points_for_a_controller_are_bounded_by_the_joints_and_walk_takes_actions_of_one(
@@ -320,21 +333,6 @@ def test_a_curriculum_advances_while_a_policy_is_trained(levers: list[str], made
     learned = trained(0.4)
     assert learned.span > 0.5
     assert learned.spans[:10] != learned.spans[-10:]
-
-
-def test_gymnasiums_wrappers_compose(serving: Callable[..., str], made: list[Any]) -> None:
-    from gymnasium.wrappers.vector import RecordEpisodeStatistics, RescaleAction
-
-    bare = URLabBatchEnv(serving("arm"), 3, task=Reach(), max_episode_steps=2)
-    made.append(bare)
-    env = RecordEpisodeStatistics(RescaleAction(bare, np.float32(-1.0), np.float32(1.0)))
-    env.reset(seed=1)
-    total = np.zeros(3)
-    for _ in range(2):
-        _, rewards, _, truncated, infos = env.step(np.zeros((3, 7), dtype=np.float32))
-        total += rewards
-    assert truncated.all()
-    np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-5)
 
 
 HILLS = """

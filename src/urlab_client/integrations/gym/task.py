@@ -544,7 +544,10 @@ class Task:
         """
 
     def update(self, states: States) -> None:
-        """Advance the arrays in `states.memory`, in place. Called once after each action, before the methods below."""
+        """Advance the arrays in `states.memory`, in place.
+
+        Called once after each action, before the methods below; not in teleoperation, which has no actions.
+        """
 
     def observe(self, states: States) -> Floats:
         """Return what observations hold besides the fields, such as goals and commands, shape (n, n_observed)."""

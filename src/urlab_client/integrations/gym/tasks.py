@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal, TypeGuard
 
 import gymnasium
 import numpy as np
@@ -244,7 +244,7 @@ def register_task(task_id: str, task: type[Task]) -> None:
         ValueError: The class is not a task, lacks a scene, or the id already names another one.
         gymnasium.error.Error: The id has another form.
     """
-    if not issubclass(task, Task) or not hasattr(task, "scene_address"):
+    if not _is_task(task) or not hasattr(task, "scene_address"):
         raise ValueError(f"{task.__name__} must be a subclass of Task with a scene_address")
     if TASKS.get(task_id, task) is not task:
         raise ValueError(f"{task_id!r} already names {TASKS[task_id].__name__}")
@@ -276,9 +276,13 @@ def task_named(name: str) -> type[Task]:
         found = getattr(import_module(module), attribute, None)
     except ImportError as error:
         raise ValueError(f"the module of the task {name!r} cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Task)):
-        raise ValueError(f"{attribute!r} in module {module!r} is not a subclass of Task")  # noqa: TRY004 - a wrong name
+    if not _is_task(found):
+        raise ValueError(f"{attribute!r} in module {module!r} is not a subclass of Task")
     return found
+
+
+def _is_task(found: object) -> TypeGuard[type[Task]]:
+    return isinstance(found, type) and issubclass(found, Task)
 
 
 def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
