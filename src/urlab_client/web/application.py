@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _STATIC = Path(__file__).parent / "static"
 _ENDPOINTS = tuple(one for module in (api, file_routes) for one in vars(module).values() if isinstance(one, Endpoint))
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_TAKEN = frozenset({"api", "metrics"})
+_TAKEN = frozenset({"api", "healthz", "metrics"})
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>URLab consoles</title><body><h1>Servers</h1><ul>{items}</ul></body></html>"""
 
@@ -118,7 +118,7 @@ def apps(
     for name in clients:
         if not _NAME.fullmatch(name) or name in _TAKEN:
             raise ValueError(
-                f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not 'api' or 'metrics'"
+                f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not {sorted(_TAKEN)}"
             )
     if not clients:
         raise ValueError("apps: pass at least one client")
@@ -172,7 +172,7 @@ def _index(sessions: Mapping[str, ConsoleSession], access: Access, metrics: Coll
         return json_response(found)
 
     site = Site(next(iter(sessions.values())), access, metrics)
-    shared = [api.enter, *([] if metrics is None else [api.metrics])]
+    shared = [api.enter, api.health, *([] if metrics is None else [api.metrics])]
     return [Route("/", page), Route("/api/servers", servers), *routes(shared, site)]
 
 
