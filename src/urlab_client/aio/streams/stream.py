@@ -11,7 +11,8 @@ from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams.buffer import StreamBuffer
 from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.errors import URLabError
-from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
+from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamPolicyName, StreamStats
+from urlab_client.values.names import PublicDir
 
 T = TypeVar("T", bound=StreamItem)
 
@@ -22,7 +23,7 @@ BUFFER_BYTES = 64 * 1024 * 1024
 """Default limit of a stream's buffer, bytes."""
 
 
-class Stream(Generic[T]):
+class Stream(PublicDir, Generic[T]):
     """Items that the server publishes, as they arrive.
 
     The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
@@ -48,7 +49,7 @@ class Stream(Generic[T]):
         self,
         source: Source[T],
         *,
-        policy: str | StreamPolicy,
+        policy: StreamPolicy | StreamPolicyName,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
