@@ -669,6 +669,9 @@ def test_the_viewer_s_files_are_sent_once(http: TestClient) -> None:
     script = http.get("/viewer/web_client.js")
     again = http.get("/viewer/web_client.js", headers={"if-none-match": script.headers["etag"]})
     assert (script.status_code, again.status_code) == (200, 304)
+    for large in ("web_client.wasm", "assets/pbr.filamat"):
+        sent = http.get(f"/viewer/{large}", headers={"accept-encoding": "gzip"})
+        assert sent.headers["content-encoding"] == "gzip", large
 
 
 def test_another_program_takes_over_and_the_console_takes_it_back(http: TestClient, server: SimulatedServer) -> None:

@@ -122,6 +122,8 @@ def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
     page.until(f"!({RUNNING})")
     page.slide(0.9)
     page.until("document.querySelector('#log').innerText.includes('set paused')")
+    page.until("document.querySelector('#age').innerText === 'paused'")
+    assert not page.look("document.querySelector('#age').classList.contains('old')")
     assert not page.look(page.elbow_is(0.9))
     page.driver.execute_script("document.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
     page.driver.execute_script("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
@@ -470,6 +472,8 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     page.until(RUNNING)
     stack.close()  # kills it
     page.until("!document.querySelector('#banner').hidden && document.body.dataset.link === 'lost'")
+    page.until("['#play', '#stop'].every((one) => document.querySelector(one).disabled)")
+    page.until("document.querySelector('#log').innerText.includes('The server is unreachable.')")
     page.until("document.body.classList.contains('stale')")
     ports = [f"--{n}-port={ready[f'{n}_port']}" for n in ("step", "state", "ctrl", "info", "camera")]
     stack.enter_context(serve(*ports))

@@ -14,6 +14,7 @@ import socket
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.responses import JSONResponse
@@ -68,6 +69,7 @@ async def serve(
     started: Callable[[], None],
     ended: asyncio.Event | None = None,
     *,
+    public_url: str = "",
     lifespan: bool = True,
     head_s: float = _HEAD_S,
     body_s: float = _BODY_S,
@@ -80,12 +82,13 @@ async def serve(
         listener: A listening socket.
         started: Callback invoked once Ctrl-C ends the server cleanly.
         ended: Event that ends the server, too.
+        public_url: URL by which browsers reach the application through a proxy, which removes its path.
         lifespan: Whether the server runs the application's lifespan; otherwise the caller does.
         head_s: See `bounded_connections`.
         body_s: Likewise.
         connections: Likewise, `most`.
     """
-    requests = RunningRequests(application)
+    requests = RunningRequests(application, encrypted=public_url.startswith("https:"))
     config = uvicorn.Config(
         requests,
         http=bounded_connections(head_s, body_s, connections),
@@ -96,6 +99,7 @@ async def serve(
         timeout_graceful_shutdown=round(_FINISHING_S + _GRACE_S),
         proxy_headers=False,
         server_header=False,
+        root_path=urlsplit(public_url).path.rstrip("/"),
         lifespan="on" if lifespan else "off",
     )
 
@@ -224,10 +228,14 @@ class _Request:
 
 
 class RunningRequests:
-    """ASGI middleware that cancels the requests which still run when the server ends, without a traceback."""
+    """ASGI middleware that cancels the requests which still run when the server ends, without a traceback.
 
-    def __init__(self, application: ASGIApp) -> None:
+    If they are `encrypted`, up to a proxy, the application hears so.
+    """
+
+    def __init__(self, application: ASGIApp, *, encrypted: bool = False) -> None:
         self._application = application
+        self._encrypted = encrypted
         self._running: set[_Request] = set()
         self._connections: Iterable[Any] | None = None
 
@@ -248,6 +256,8 @@ class RunningRequests:
         if scope["type"] == "lifespan" or task is None:
             await self._application(scope, receive, send)
             return
+        if self._encrypted:
+            scope["scheme"] = "https" if scope["type"] == "http" else "wss"
         request = _Request(task, scope)
 
         async def sending(message: Message) -> None:

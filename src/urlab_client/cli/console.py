@@ -1,14 +1,20 @@
 """`urlab console`: a page in the browser that shows a simulation and lets people interact with it.
 
 Serve a page that shows a simulation and lets you interact with it, only on this machine, and print a link that admits
-one browser. The page can create more links. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
+one browser. The page can create more links; a key in URLAB_CONSOLE_KEY admits programs, such as Prometheus. Exits with
+code 0 on SIGINT (Ctrl-C) and SIGTERM.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
+import logging
+import os
 import webbrowser
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
+from datetime import UTC, datetime
+from urllib.parse import urlsplit
 
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
@@ -25,6 +31,8 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, import_mujoco
 
 _PORT = 8355
+_KEY = "URLAB_CONSOLE_KEY"
+_KEY_CHARACTERS = 16
 
 
 EXAMPLES = (
@@ -32,6 +40,7 @@ EXAMPLES = (
     ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
     ("urlab console --port 0", "any free port for the page"),
     ("urlab console --handshake robot.hello", "watch alongside the driving client"),
+    ("urlab console --public-url https://lab.example/robots/", "behind a proxy, which has that address"),
 )
 
 
@@ -40,6 +49,20 @@ def add_arguments(parser: Parser) -> None:
     add_address(parser)
     add_client(parser, handshake=True)
     add_page(parser, _PORT)
+    parser.add_argument(
+        "--public-url",
+        type=_public_url,
+        metavar="URL",
+        help="URL by which browsers reach the page through a proxy, which removes its path",
+    )
+    parser.add_argument("--json-log", action="store_true", help="write the log as lines of JSON")
+
+
+def _public_url(text: str) -> str:
+    parts = urlsplit(text)
+    if parts.scheme not in {"http", "https"} or not parts.hostname or parts.query or parts.fragment:
+        raise ArgumentTypeError(f"{text!r} is not a URL of a page, such as https://lab.example/robots/")
+    return text.rstrip("/")
 
 
 def run(arguments: Namespace) -> int:
@@ -51,13 +74,40 @@ def run(arguments: Namespace) -> int:
         from urlab_client.web import Access  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise CommandError(f"{error.name or error} is not installed; run: {install_command('web')}") from None
+    if host := urlsplit(str(arguments.public_url or "")).hostname:
+        arguments.allow_host = [*arguments.allow_host, host]
     check_page(arguments)
+    if any(len(key) < _KEY_CHARACTERS for key in _keys()):
+        raise CommandError(f"${_KEY}: a key must have at least {_KEY_CHARACTERS} characters")
+    if arguments.json_log:
+        _log_json()
     import_mujoco()
     from urlab_client.cli._pages import graceful_exit
 
     with graceful_exit():
         asyncio.run(_serve(arguments))
     return 0
+
+
+def _keys() -> list[str]:
+    return os.environ.get(_KEY, "").split()
+
+
+def _log_json() -> None:
+    """Write what this program and its libraries log, from INFO, as lines of JSON to standard error."""
+    logging.getLogger("urlab_client").handlers.clear()  # the one for people
+    lines = logging.StreamHandler()
+    lines.setFormatter(_JsonLines())
+    logging.basicConfig(level=logging.INFO, handlers=[lines], force=True)
+
+
+class _JsonLines(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        at = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        line = {"at": at, "level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        if record.exc_info:
+            line["error"] = self.formatException(record.exc_info)
+        return json.dumps(line)
 
 
 async def _serve(arguments: Namespace) -> None:
@@ -67,12 +117,13 @@ async def _serve(arguments: Namespace) -> None:
     from urlab_client.integrations.telemetry import PrometheusObserver
     from urlab_client.web import Access, app
 
-    access = Access(hosts=host_names(arguments))
+    access = Access(hosts=host_names(arguments), keys=_keys())
     # Each camera is streamed while a browser shows it.
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
-            link = f"{page_url(arguments, listener.getsockname()[1])}/?token={access.invite()}"
+            url = arguments.public_url or page_url(arguments, listener.getsockname()[1])
+            link = f"{url}/?token={access.invite()}"
 
             def started() -> None:
                 print(f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.", flush=True)
@@ -86,4 +137,4 @@ async def _serve(arguments: Namespace) -> None:
                 metrics=REGISTRY,
                 recordings=arguments.recordings,
             )
-            await serve(site, listener, started)
+            await serve(site, listener, started, public_url=arguments.public_url or "")

@@ -49,11 +49,11 @@ def _simplify_tuples(schema: Any) -> None:
         case {"prefixItems": [first, *others]} if all(other == first for other in others):
             schema["items"] = first
             del schema["prefixItems"]
-        case {**parts}:
-            for part in parts.values():
+        case dict():
+            for part in cast("dict[str, Any]", schema).values():
                 _simplify_tuples(part)
-        case [*parts]:
-            for part in parts:
+        case list():
+            for part in cast("list[Any]", schema):
                 _simplify_tuples(part)
         case _:
             pass

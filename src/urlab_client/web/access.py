@@ -17,6 +17,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """Names of this machine for itself."""
 
+HEALTH = "/healthz"
+"""Path that needs neither a key nor a host name."""
+
 _MOST = 1000  # unused invitations and keys of closed browsers would accumulate
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
@@ -129,7 +132,8 @@ class Guarded:
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
-        refused = self._access.refusal(scope)
+        path = _path(scope)
+        refused = None if path == HEALTH else self._access.refusal(scope)  # probes reach it by an address
         if refused is None and self._access.tokens:
             admitted = self._exchange_token(scope)
             if admitted is not None:
@@ -137,7 +141,8 @@ class Guarded:
                 return
             key = self._access.key_of(Headers(scope=scope))
             scope["urlab_key"] = key
-            if key is None and not _is_login(scope):
+            # Where there is no document, programs must hear so: a 401 makes them look for an authorization server.
+            if key is None and not _is_login(scope) and path != HEALTH and not path.startswith("/.well-known/"):
                 refused = 401, "no_key", self._advice
         if refused is None:
             await self._app(scope, receive, _with_headers(send))
@@ -159,7 +164,12 @@ class Guarded:
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(
-                self._access.cookie, key, httponly=True, samesite="strict", secure=scope["scheme"] == "https"
+                self._access.cookie,
+                key,
+                path=f"{scope.get('root_path', '')}/",
+                httponly=True,
+                samesite="strict",
+                secure=scope["scheme"] == "https",
             )
         return response
 
@@ -194,9 +204,10 @@ def _is_login(scope: Scope) -> bool:
 
 def _denied(scope: Scope, refusal: _Refusal) -> Response:
     status, code, text = refusal
+    headers = {"www-authenticate": 'Bearer realm="URLab"'} if status == 401 else None
     if "text/html" in Headers(scope=scope).get("accept", ""):
-        return HTMLResponse(_PAGE.format(title="Access denied", text=html.escape(text)), status)
-    return JSONResponse({"error": {"code": code, "message": text}}, status)
+        return HTMLResponse(_PAGE.format(title="Access denied", text=html.escape(text)), status, headers)
+    return JSONResponse({"error": {"code": code, "message": text}}, status, headers)
 
 
 async def _close(receive: Receive, send: Send) -> None:

@@ -20,6 +20,7 @@ from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
 from urlab_client.integrations.forwarding import EventStream
 from urlab_client.web import documents
+from urlab_client.web.access import HEALTH
 from urlab_client.web.endpoints import BYTES, JSON, Call, endpoint, json_response, read_body, refusal
 
 if TYPE_CHECKING:
@@ -278,6 +279,11 @@ async def enter(call: Call, body: LoginRequest) -> Response:
     if key is None:
         return refusal(401, "bad_token", "This token is unknown or has been used.")
     return json_response(Key(key))
+
+
+@endpoint("GET", HEALTH, public=True)
+async def health(call: Call) -> None:
+    """Answers while the console runs, whatever the server does. Needs no key."""
 
 
 @endpoint("GET", "/metrics", media="text/plain")

@@ -7,6 +7,9 @@ import { pauseReplay, toggleReplay } from "./replay.js";
 export const now = { status: null, state: null, socket: false };
 const ui = {};
 
+/** Whether simulation time stands still, and nothing is wrong with that. */
+export const paused = () => now.socket && now.status?.link.state === "connected" && !now.status.moving;
+
 const LINKS = {
   connected: "Connected",
   connecting: "Connecting",
@@ -125,8 +128,8 @@ export function makeBar() {
     if (now.state) {
       const age = Date.now() + clock.offset - now.state.made;
       const replayed = now.status?.replay != null;
-      text(ui.age, replayed ? "replay" : duration(age));
-      ui.age.classList.toggle("old", !replayed && age > 1000);
+      text(ui.age, replayed ? "replay" : paused() ? "paused" : duration(age));
+      ui.age.classList.toggle("old", !replayed && !paused() && age > 1000);
       text(ui.time, `${now.state.time.toFixed(2)} s`);
     }
     if (!now.socket || now.status?.link.state !== "connected") banner();
@@ -142,9 +145,11 @@ function show(status) {
   if (!status || !now.socket) return;
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
   text(ui.address, status.address);
-  text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "stopped");
+  text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "paused");
   text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
-  ui.play.disabled = !status.playing && !status.replay;
+  const unreachable = ["lost", "connecting"].includes(link) && !status.replay;
+  ui.play.disabled = unreachable || (!status.playing && !status.replay);
+  ui.stop.disabled = unreachable;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
   if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
   if (document.activeElement !== ui.source) ui.source.value = status.source ?? "";

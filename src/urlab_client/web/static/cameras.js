@@ -1,6 +1,7 @@
 // Cameras: one WebSocket per visible camera. The console sends the next picture when the last one has been shown.
 // During a replay they show the recorded pictures; cameras that were not recorded stay live and are marked.
 
+import { paused } from "./bar.js";
 import { $, duration, h, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
 import { clockTime } from "./recording.js";
@@ -73,8 +74,8 @@ class CameraView {
     }
     const age = Date.now() + clock.offset - this.head.received;
     const rate = this.frames.filter((at) => at > performance.now() - 1000).length;
-    text(this.note, age > 1500 ? `${duration(age)} old` : `${rate} fps · ${duration(age)}`);
-    this.note.classList.toggle("old", age > 1500);
+    text(this.note, age <= 1500 ? `${rate} fps · ${duration(age)}` : paused() ? "paused" : `${duration(age)} old`);
+    this.note.classList.toggle("old", age > 1500 && !paused());
   }
 
   end() {

@@ -12,10 +12,10 @@ const EVENTS = {
   session_opened: (text) => `A session was opened${/mujoco_version ([^,]+)/.test(text) ? `; MuJoCo ${/mujoco_version ([^,]+)/.exec(text)[1]}` : ""}.`,
   play_started: (text) => `Play began${/\[(.*)\]/.test(text) ? ` with ${/\[(.*)\]/.exec(text)[1].replaceAll("'", "")}` : ""}.`,
   play_ended: () => "Play ended.",
-  server_lost: () => "The server is unreachable.",
-  server_reconnected: () => "The server is reachable again.",
-  server_silent: () => "The server is not answering.",
-  server_answers: () => "The server is answering again.",
+  lost: () => "The server is unreachable.",
+  reconnected: () => "The server is reachable again.",
+  silent: () => "The server is not answering.",
+  answers: () => "The server is answering again.",
   session_lost: () => "Another program took the session over.",
 };
 
