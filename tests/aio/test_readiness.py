@@ -223,7 +223,7 @@ def test_a_socket_that_was_closed_meanwhile_does_not_hide_the_others(
     async def main(client: URLabClient) -> None:
         loop = asyncio.get_running_loop()
         with zmq.Context() as context, context.socket(zmq.PAIR) as pair:
-            dead = transport_waiting.watch_socket(loop, pair, lambda: None)
+            dead = transport_waiting.Watch(loop, lambda: None, fd=pair.fileno())
             closed.add(pair.fileno())
             assert await client.meta()
             dead.close()
@@ -246,7 +246,7 @@ def test_what_a_reader_raises_does_not_deafen_it() -> None:
                     heard.append(pull.recv())
                 raise RuntimeError("what was heard")
 
-            watched = transport_waiting.watch_socket(loop, pull, hear)
+            watched = transport_waiting.Watch(loop, hear, fd=pull.fileno())
             push.connect("inproc://here")
             for word in (b"one", b"two"):
                 push.send(word)
@@ -264,7 +264,7 @@ async def test_news_in_a_region_is_reported_once_each_time_it_is_expected() -> N
         reports.append(news.is_set())
         news.clear()
 
-    watch = transport_waiting.watch_memory(asyncio.get_running_loop(), news.is_set, report, fastest_s=1e-4)
+    watch = transport_waiting.Watch(asyncio.get_running_loop(), report, has_news=news.is_set, fastest_s=1e-4)
     assert len(watchers()) == 1
     for _ in range(3):
         news.set()
@@ -284,7 +284,7 @@ async def test_a_thread_that_sleeps_until_a_signal_looks_when_it_comes() -> None
         signal.wait(DEADLINE_S)
 
     loop = asyncio.get_running_loop()
-    watch = transport_waiting.watch_memory(loop, signal.is_set, came.set, fastest_s=1e-4, block=block)
+    watch = transport_waiting.Watch(loop, came.set, has_news=signal.is_set, fastest_s=1e-4, block=block)
     watch.expect()
     await until(lambda: pauses)
     signal.set()
@@ -304,8 +304,8 @@ def test_one_thread_watches_sockets_and_regions_of_a_loop() -> None:
                 while pull.get(zmq.EVENTS) & zmq.POLLIN:
                     heard.append(pull.recv())
 
-            socket_watch = transport_waiting.watch_socket(loop, pull, hear)
-            region_watch = transport_waiting.watch_memory(loop, news.is_set, news.clear, fastest_s=1e-4)
+            socket_watch = transport_waiting.Watch(loop, hear, fd=pull.fileno())
+            region_watch = transport_waiting.Watch(loop, news.clear, has_news=news.is_set, fastest_s=1e-4)
             region_watch.expect()
             assert len(watchers()) == 1
             push.send(b"one")

@@ -39,6 +39,15 @@ class TransportStats(Struct):
     over_zmq: dict[str, int] = {}
 
 
+class SentRequest(Struct):
+    """A request on its way, and the loop times of its sending and its deadline."""
+
+    op: Op
+    reply: asyncio.Future[bytes]
+    at: float
+    deadline: float | None
+
+
 class RequestTransport(Protocol):
     """Sends requests and returns their replies. Use from one event loop."""
 

@@ -22,7 +22,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._platform.signals import uninterrupted
 from urlab_client.aio.background import Tell
-from urlab_client.aio.transport.waiting import Socket, Watch, watch_socket
+from urlab_client.aio.transport.waiting import Socket, Watch
 from urlab_client.keys import KeyPair, public_key, read_pair
 
 HEARTBEAT_MS = 1000
@@ -180,12 +180,12 @@ class Connection:
         except zmq.ZMQError as error:
             self.close()
             raise ValueError(f"{endpoint!r} is not an address that ZeroMQ can connect to: {error}") from error
-        self._watches.append(watch_socket(loop, self._monitor, self.read_events, tell=tell))
+        self._watches.append(Watch(loop, self.read_events, fd=self._monitor.fileno(), tell=tell))
         loop.call_soon(self.read_events)
 
     def watch(self, on_readable: Callable[[], object], *, on_demand: bool = False) -> Watch:
-        """Call `on_readable` whenever the socket is readable; see `watch_socket`."""
-        watch = watch_socket(self._loop, self.socket, on_readable, on_demand=on_demand)
+        """Call `on_readable` whenever the socket is readable; see `Watch`."""
+        watch = Watch(self._loop, on_readable, fd=self.socket.fileno(), on_demand=on_demand)
         self._watches.append(watch)
         return watch
 

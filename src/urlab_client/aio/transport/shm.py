@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
-from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats, lost, no_reply
+from urlab_client.aio.transport.base import LateReply, RequestTransport, SentRequest, TransportStats, lost, no_reply
 from urlab_client.aio.transport.shm_channel import RegionChannel, answers, envelope_of, succeeded
 from urlab_client.aio.transport.shm_regions import RegionInUse, ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
@@ -60,40 +60,16 @@ _UNBOUNDED: Final = frozenset({"hello", "meta", "get_contacts", "list_keyframes"
 _UPLOADS: Final = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 
 
-class Route(NamedTuple):
-    """Properties of an op that determine the transport of its requests.
-
-    Attributes:
-        zmq: Why its requests always use ZeroMQ; empty if they may use shared memory.
-        pictures: Whether its requests may ask for pictures, which do not fit.
-        state: Whether its replies contain the state, whose size is nearly constant.
-    """
-
-    zmq: str
-    pictures: bool
-    state: bool
-
-
 @cache
-def route_of(op: Op) -> Route:
-    """Return the properties of an op that determine its transport."""
-    zmq = ""
+def _always_over_zmq(op: Op) -> str:
+    """Return why requests of an op always use ZeroMQ; empty if they may use shared memory."""
     if op.needs is Needs.EDITOR:
-        zmq = "editor op"
-    elif op.ns == "scene" or op.name in _UPLOADS:
-        zmq = "upload"  # its chunks and its reply exceed a slot
-    elif op.name in _UNBOUNDED:
-        zmq = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
-    return Route(zmq, op.name == "step", issubclass(op.reply, StateReply))
-
-
-class _Pending(NamedTuple):
-    """The request in progress."""
-
-    op: Op
-    future: asyncio.Future[bytes]
-    at: float
-    deadline: float | None
+        return "editor op"
+    if op.ns == "scene" or op.name in _UPLOADS:
+        return "upload"  # its chunks and its reply exceed a slot
+    if op.name in _UNBOUNDED:
+        return "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
+    return ""
 
 
 class ShmTransport:
@@ -115,7 +91,7 @@ class ShmTransport:
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
         self._used_at = 0.0
-        self._pending: _Pending | None = None
+        self._pending: SentRequest | None = None
         # One for all requests: most replies arrive long before, and creating and cancelling a timer takes a tenth of
         # the time of a step.
         self._timer: asyncio.TimerHandle | None = None
@@ -191,9 +167,9 @@ class ShmTransport:
         """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
         if self._channel is not None and self._channel.abandoned_at is not None:
             await self._let_it_end(op, deadline)
-        route = route_of(op)
-        pictures = route.pictures and b"include_cameras" in frame
-        why_zmq = route.zmq or ("pictures" if pictures else self._refused.get(op.name, ""))
+        pictures = op.name == "step" and b"include_cameras" in frame
+        has_state = issubclass(op.reply, StateReply)  # whose size is nearly constant
+        why_zmq = _always_over_zmq(op) or ("pictures" if pictures else self._refused.get(op.name, ""))
         if not why_zmq and self._inner.owed:
             why_zmq = "behind an abandoned request"
         if not why_zmq:
@@ -204,18 +180,20 @@ class ShmTransport:
                 why_zmq = self._obstacle
             elif len(frame) > channel.limit:
                 why_zmq = "request too large"
-            elif route.state and not 0 < self._largest_state * _GROWTH <= channel.limit:
+            elif has_state and not 0 < self._largest_state * _GROWTH <= channel.limit:
                 why_zmq = "reply may be too large" if self._largest_state else "size of the reply not known yet"
             else:
-                answer = await self._over_shm(channel, frame, _Pending(op, loop.create_future(), now, deadline), loop)
+                answer = await self._over_shm(
+                    channel, frame, SentRequest(op, loop.create_future(), now, deadline), loop
+                )
                 why_zmq = self._refusal(answer, op)
                 if not why_zmq:
-                    if route.state and len(answer) > self._largest_state:
+                    if has_state and len(answer) > self._largest_state:
                         self._largest_state = len(answer)
                     return answer
         self.stats.over_zmq[why_zmq] = self.stats.over_zmq.get(why_zmq, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if route.state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
+        if has_state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
@@ -330,9 +308,9 @@ class ShmTransport:
     # Over shared memory
 
     async def _over_shm(
-        self, channel: RegionChannel, frame: bytes, pending: _Pending, loop: asyncio.AbstractEventLoop
+        self, channel: RegionChannel, frame: bytes, pending: SentRequest, loop: asyncio.AbstractEventLoop
     ) -> bytes:
-        op, future, _, deadline = pending
+        op, reply, deadline = pending.op, pending.reply, pending.deadline
         self._pending = pending
         # If the wait ends without the reply, that reply is still outstanding.
         channel.dirty = True
@@ -346,10 +324,10 @@ class ShmTransport:
                 self._look_at(loop, deadline)
             awake = self._busy_poll.pays(op.name)
             if awake:
-                await self._busy_poll.look(op.name, future, self._look)
-            if not future.done() and self._regions.doorbell is None:
+                await self._busy_poll.look(op.name, reply, self._look)
+            if not reply.done() and self._regions.doorbell is None:
                 self._on_news()
-            answer = await future
+            answer = await reply
         except BaseException:
             channel.abandoned_at = loop.time()
             raise
@@ -369,14 +347,14 @@ class ShmTransport:
     def _on_news(self) -> None:
         """Deliver the reply if it has arrived; otherwise wait for the next news."""
         self._look()
-        waits = self._pending is not None and not self._pending.future.done()
+        waits = self._pending is not None and not self._pending.reply.done()
         if waits and self._regions.doorbell is None and self._channel is not None:
             self._channel.expect(self._on_news, self._regions.tell)
 
     def _look(self) -> None:
         """Deliver the reply if it has arrived."""
         pending, channel = self._pending, self._channel
-        if pending is None or pending.future.done() or channel is None:
+        if pending is None or pending.reply.done() or channel is None:
             return
         if not channel.replies.intact():
             self._drop("the reply region was cut off")
@@ -384,7 +362,7 @@ class ShmTransport:
         try:
             found = channel.replies.region.read_latest(channel.seen)
         except ProtocolError as error:
-            pending.future.set_exception(
+            pending.reply.set_exception(
                 ProtocolError(f"{pending.op.name}: {channel.replies.path}: {error.args[0]}", op=pending.op.name)
             )
             self._drop("the reply region is damaged")
@@ -398,7 +376,7 @@ class ShmTransport:
             return
         channel.seen = found.sequence
         if answers(found.payload, pending.op):
-            pending.future.set_result(found.payload)
+            pending.reply.set_result(found.payload)
         else:
             self.stats.late += 1
             log.debug("%s: dropped a reply to another request", channel.replies.path)
@@ -422,10 +400,10 @@ class ShmTransport:
         if not expired:
             self._look_at(loop, pending.deadline)  # first, whatever happens below
         self._on_news()
-        if pending.future.done():
+        if pending.reply.done():
             return
         if expired:
-            pending.future.set_exception(no_reply(pending.op, "in shared memory", self._due - pending.at))
+            pending.reply.set_exception(no_reply(pending.op, "in shared memory", self._due - pending.at))
         elif self._channel is not None and self._channel.replaced():
             self._drop("the regions were replaced")
 
@@ -448,8 +426,8 @@ class ShmTransport:
 
     def _fail(self, error: Callable[[Op], URLabError]) -> None:
         pending = self._pending
-        if pending is not None and not pending.future.done():
-            pending.future.set_exception(error(pending.op))
+        if pending is not None and not pending.reply.done():
+            pending.reply.set_exception(error(pending.op))
 
 
 def _reason(error: Exception) -> str:

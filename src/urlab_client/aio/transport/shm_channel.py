@@ -15,7 +15,7 @@ from msgspec import Struct
 from urlab_client._platform.windows import NamedEvent
 from urlab_client.aio.background import Tell
 from urlab_client.aio.transport.shm_regions import MappedRegion
-from urlab_client.aio.transport.waiting import Watch, watch_memory
+from urlab_client.aio.transport.waiting import Watch
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.messages.runtime import ReadMocapPose
@@ -116,7 +116,9 @@ class RegionChannel:
         if self._watch is None:
             block = self._reply_event.wait if self._reply_event.exists else None
             loop = asyncio.get_running_loop()
-            self._watch = watch_memory(loop, self._has_news, on_news, fastest_s=_FASTEST_POLL_S, block=block, tell=tell)
+            self._watch = Watch(
+                loop, on_news, has_news=self._has_news, block=block, fastest_s=_FASTEST_POLL_S, tell=tell
+            )
         self._watch.expect()
 
     def ignore(self) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path, PurePath
 from urlab_client._platform.processors import processor_fence
 from urlab_client._platform.windows import NamedLock
 from urlab_client.aio.background import Tell
-from urlab_client.aio.transport.waiting import watch_socket
+from urlab_client.aio.transport.waiting import Watch
 from urlab_client.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol import shm
 from urlab_client.protocol.messages.session import HelloOk
@@ -280,7 +280,7 @@ class Doorbell:
         self._socket.setblocking(False)
         try:
             self._socket.connect(str(path))
-            self._watch = watch_socket(loop, self._socket, self._on_readable)
+            self._watch = Watch(loop, self._on_readable, fd=self._socket.fileno())
         except BaseException:
             self._socket.close()
             raise

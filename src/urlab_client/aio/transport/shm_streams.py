@@ -24,7 +24,7 @@ from urlab_client.aio.transport.subscriber import (
     Subscriptions,
     client_closed,
 )
-from urlab_client.aio.transport.waiting import Watch, watch_memory
+from urlab_client.aio.transport.waiting import Watch
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.shm import Publication, Ring
 from urlab_client.values.layouts import BytesLike
@@ -283,8 +283,12 @@ class Regions:
         if there and self._location.doorbell is None and self._loop is not None:
             if reader.watch is None:
                 tell = self._location.tell
-                reader.watch = watch_memory(
-                    self._loop, reader.has_news, lambda: self._look_at(reader), fastest_s=_FASTEST_POLL_S, tell=tell
+                reader.watch = Watch(
+                    self._loop,
+                    lambda: self._look_at(reader),
+                    has_news=reader.has_news,
+                    fastest_s=_FASTEST_POLL_S,
+                    tell=tell,
                 )
             reader.watch.expect()
 

@@ -38,50 +38,21 @@ _DRAIN_BYTES: Final = 4096
 _POLLIN: Final = int(zmq.POLLIN)
 
 
-def watch_socket(
-    loop: asyncio.AbstractEventLoop,
-    watched: Socket | socket.socket,
-    on_readable: Callable[[], object],
-    *,
-    on_demand: bool = False,
-    tell: Tell | None = None,
-) -> Watch:
-    """Call `on_readable` on the event loop whenever a socket is readable. It may find nothing to read.
-
-    Args:
-        on_demand: Whether a watching thread is active only from `expect` until the socket is readable, because waking
-            it would delay a reply that the loop polls for itself.
-        tell: Publishes the event that a watching thread died. Another one follows after a pause.
-    """
-    return Watch(loop, on_readable, fd=watched.fileno(), on_demand=on_demand, tell=tell)
-
-
-def watch_memory(
-    loop: asyncio.AbstractEventLoop,
-    has_news: Callable[[], bool],
-    on_news: Callable[[], object],
-    *,
-    fastest_s: float,
-    block: Callable[[float], object] | None = None,
-    tell: Tell | None = None,
-) -> Watch:
-    """Call `on_news` on the event loop once after each `expect`, as soon as a region has news.
-
-    The pauses between two looks grow with the time that it has waited, to five milliseconds. The thread looks because
-    the loop's timers round up to a millisecond.
-
-    Args:
-        has_news: Called on the thread until `close`; must not block or raise.
-        fastest_s: Pause in the first millisecond, seconds; later ones are longer in proportion.
-        block: Sleeps until the server signals, for at most the given seconds; None without signals.
-    """
-    return Watch(loop, on_news, has_news=has_news, block=block, fastest_s=fastest_s, on_demand=True, tell=tell)
-
-
 class Watch:
-    """The watch on one socket or region. Made by `watch_socket` and `watch_memory`.
+    """The watch on one socket or one region of shared memory; calls `on_news` on the event loop.
 
-    Where the thread watches, it reports news once and then waits for `expect`.
+    A socket that is readable is news, though there may be nothing to read. Where the loop cannot watch it, and for a
+    region, the thread does, which reports news once and then waits for `expect`. The thread looks at a region
+    with pauses that grow with the time that it has waited, to five milliseconds; the loop's timers are too coarse.
+
+    Args:
+        fd: The socket; None for a region.
+        has_news: Whether a region has news. Called on the thread until `close`; must not block or raise.
+        block: Sleeps until a region's server signals, for at most the given seconds; None without signals.
+        fastest_s: Pause between two looks at a region in the first millisecond, seconds.
+        on_demand: Whether the thread watches a socket only from `expect` until it is readable, because waking it would
+            delay a reply that the loop polls for itself. So it always does for a region.
+        tell: Publishes the event that a watching thread died. Another one follows after a pause.
     """
 
     def __init__(
@@ -93,8 +64,8 @@ class Watch:
         has_news: Callable[[], bool] | None = None,
         block: Callable[[float], object] | None = None,
         fastest_s: float = 0.0,
-        on_demand: bool,
-        tell: Tell | None,
+        on_demand: bool = False,
+        tell: Tell | None = None,
     ) -> None:
         self.fd = fd
         self.has_news = has_news
@@ -103,7 +74,7 @@ class Watch:
         self._loop = loop
         self._on_news = on_news
         self.fastest_s = fastest_s
-        self._on_demand = on_demand
+        self._on_demand = on_demand or fd is None
         self._since = 0.0
         self._armed = False
         self._closed = False
@@ -113,7 +84,7 @@ class Watch:
                 loop.add_reader(fd, on_news)
                 return
         self._watcher = _Watcher.of(loop, self)
-        if not on_demand:
+        if not self._on_demand:
             self.expect()
 
     @property

@@ -15,10 +15,9 @@ from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import zmq
-from msgspec import Struct
 
 from urlab_client.aio.background import running_loop
-from urlab_client.aio.transport.base import LateReply, TransportStats, lost, no_reply
+from urlab_client.aio.transport.base import LateReply, SentRequest, TransportStats, lost, no_reply
 from urlab_client.aio.transport.connection import (
     FAILED_HANDSHAKES,
     UNANSWERED,
@@ -72,15 +71,6 @@ class _Open(NamedTuple):
     get: _Get
 
 
-class _Sent(Struct):
-    """A request on the wire."""
-
-    op: Op
-    reply: asyncio.Future[bytes]
-    at: float
-    deadline: float | None
-
-
 class ZmqTransport:
     """Transport over one DEALER socket. It connects on first use and reconnects automatically.
 
@@ -105,7 +95,7 @@ class ZmqTransport:
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
-        self._sent: dict[bytes, _Sent] = {}
+        self._sent: dict[bytes, SentRequest] = {}
         self._late: tuple[bytes, asyncio.Future[bytes]] | None = None  # id of the last abandoned handshake, its reply
         self._abandoned = b""  # id of the last request whose caller gave up, until a reply shows that it is done
         self._waiting: set[asyncio.Future[None]] = set()
@@ -151,7 +141,7 @@ class ZmqTransport:
                 continue
             break
         reply: asyncio.Future[bytes] = loop.create_future()
-        self._sent[key] = _Sent(op, reply, started, deadline)
+        self._sent[key] = SentRequest(op, reply, started, deadline)
         self.stats.sent += 1
         sent = time.perf_counter()
         if deadline is not None and (self._timer is None or deadline < self._due):
@@ -280,7 +270,7 @@ class ZmqTransport:
                 else:
                     self._expire_at(loop, entry.deadline)
 
-    def _give_up(self, entry: _Sent, seconds: float) -> None:
+    def _give_up(self, entry: SentRequest, seconds: float) -> None:
         entry.reply.set_exception(no_reply(entry.op, f"from {self.endpoint}", seconds))
         if self._silent_since is None:
             self._silent_since = entry.at
@@ -443,7 +433,7 @@ class ZmqTransport:
             hint="Other work kept the event loop busy, or the timeout is too short.",
         )
 
-    def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
+    def _fail_sent(self, error: Callable[[SentRequest], URLabError]) -> None:
         self._forget_late()
         self._abandoned = b""
         for entry in self._sent.values():
