@@ -13,15 +13,16 @@ from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
 from urlab_client.values.html import fields
+from urlab_client.values.names import PublicDir
 from urlab_client.values.pictures import Pixels, thumbnail
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
 
-class URLabCameraView:
+class URLabCameraView(PublicDir):
     """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
     delivered: bool
@@ -115,7 +116,7 @@ class URLabCameraView:
 
     def frames(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -141,7 +142,9 @@ class URLabCameraView:
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.camera(self.camera, policy),
             policy=policy,

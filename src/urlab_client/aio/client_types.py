@@ -11,7 +11,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from urlab_client.aio.features import Features
-from urlab_client.enums import CameraTiming, StepMode, Transport
+from urlab_client.enums import CameraTiming, EncodingName, StepMode, Transport
 from urlab_client.protocol.messages.session import InstanceInfo, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.html import bold, table
@@ -168,7 +168,7 @@ class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
     auto_promote_step_mode: bool = True
     transport: Transport = Transport.ZMQ
     shm_dir: str | None = None
-    encoding: str = "msgpack"
+    encoding: EncodingName = "msgpack"
     server_key: str | None = None
     client_key: str | None = None
     trust_server: bool = False

@@ -119,7 +119,16 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
     return f" {conjunction} ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
 
 
-class NameMap(dict[str, T]):
+class PublicDir:
+    """Keeps private attributes out of `dir()`, from which consoles and editors complete."""
+
+    __slots__ = ()
+
+    def __dir__(self) -> list[str]:
+        return [name for name in super().__dir__() if not name.startswith("_") or name.startswith("__")]
+
+
+class NameMap(PublicDir, dict[str, T]):
     """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
 
     `map[name]`, `map.get(name)` and `name in map` agree: an exact key first, else an alias. Length, iteration, `keys`,

@@ -231,35 +231,6 @@ def to_rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[np.uint8]:
     return without_alpha(pixels if mode == CameraMode.REAL else pixels[..., 2::-1])
 
 
-def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:
-    """Return the bare pixels of a picture, the inverse of `decode_camera`.
-
-    Args:
-        pixels: As in `CameraImage`, top row first; mode `real` also takes RGB, shape (H, W, 3). Alpha is sent as 255.
-        mode: Mode of the camera.
-
-    Raises:
-        ValueError: The array does not have the shape and type of the mode.
-    """
-    if mode == CameraMode.DEPTH:
-        if pixels.ndim != 2 or pixels.dtype != np.float32:
-            raise ValueError(f"depth pixels are {pixels.dtype} {pixels.shape}, expected float32 (H, W)")
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.multiply(pixels, _CENTIMETRES, dtype="<f4").tobytes()
-    channels = (3, 4) if mode == CameraMode.REAL else (4,)
-    if pixels.ndim != 3 or pixels.shape[2] not in channels or pixels.dtype != np.uint8:
-        expected = "(H, W, 3) or (H, W, 4)" if len(channels) == 2 else "(H, W, 4)"
-        raise ValueError(f"{mode} pixels are {pixels.dtype} {pixels.shape}, expected uint8 {expected}")
-    if mode != CameraMode.REAL:
-        return pixels.tobytes()
-    bgra = np.empty((*pixels.shape[:2], 4), np.uint8)
-    bgra[..., 0] = pixels[..., 2]
-    bgra[..., 1] = pixels[..., 1]
-    bgra[..., 2] = pixels[..., 0]
-    bgra[..., 3] = 255
-    return bgra.tobytes()
-
-
 # For a stream's reader: one picture in use, the stream's latest, and one being converted.
 _KEPT = 2
 

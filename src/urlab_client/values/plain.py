@@ -94,13 +94,13 @@ class Serializable:
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
         # Only pydantic calls this. The code below builds plain dictionaries and does not import pydantic.
-        from urlab_client.values.pydantic_schema import core_schema
+        from urlab_client.values.schemas import core_schema
 
         return core_schema(cast("type[Struct]", cls), handler)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
-        from urlab_client.values.pydantic_schema import json_schema
+        from urlab_client.values.schemas import json_schema
 
         return json_schema(cast("type[Struct]", cls), schema, handler)
 

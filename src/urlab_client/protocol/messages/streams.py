@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Struct
@@ -29,6 +29,10 @@ class StreamPolicy(StrEnum):
     """The newest message of each topic."""
     ALL = "all"
     """Every message, up to a limit."""
+
+
+StreamPolicyName: TypeAlias = Literal["latest", "latest_per_key", "all"]
+"""A policy of streams, by name."""
 
 
 class StreamItem(Serializable, Struct, kw_only=True, omit_defaults=True):
@@ -61,7 +65,7 @@ class StreamStats(Serializable, Struct, kw_only=True, frozen=True):
     last_age_s: Annotated[float | None, doc("Seconds since the last message arrived; None before the first.")]
 
 
-class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True, eq=False):
+class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, eq=False):
     """State of everything at the end of one tick, always at observation level `standard`."""
 
     time: Annotated[float, doc("`mjData.time`, seconds. Order live snapshots by this, not by `step`.")]
