@@ -21,6 +21,7 @@ DEADLINE_S = 240
 NOT_RUN = {
     r"(python3 -m venv|uv run|\S*pip install|trial/bin/)": "sets an environment up from an index: .ci/run begins "
     "with the README's line, and tests/packaging installs the wheel",
+    r"git clone ": "fetches the repository, in which this runs",
     r"python3 -m pip wheel": "fetches the build backend: tests/packaging builds the wheel with the one installed",
     r"\.venv/bin/python -m pytest$": "is this run",
     r"\.venv/bin/python -m pytest tests/protocol/test_registry.py ": "test_docs_adding_an_op.py runs it in a copy",

@@ -360,6 +360,35 @@ async def test_live_mode_records_every_snapshot_and_modes_may_change(tmp_path: P
     )
 
 
+def test_a_recording_shows_the_robot_without_anything_else(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with record(client, path):
+        client.step()
+    model = read_run(path).model()
+    assert client.model is not None
+    assert (model.nq, model.ngeom) == (client.model.nq, client.model.ngeom)
+    with path.open("rb") as file:
+        scenes = [message for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/scene"]
+    (update,) = [json.loads(message.data) for message in scenes]
+    frames = {entity["frame_id"] for entity in update["entities"]}
+    assert {"arm", "quadruped"} <= {frame.partition("_")[0] for frame in frames}
+    shapes = [
+        shape for entity in update["entities"] for kind in ("cubes", "spheres", "cylinders") for shape in entity[kind]
+    ]
+    assert len(shapes) > 10
+
+
+def test_a_recording_without_a_model_says_so(server: SimulatedServer, tmp_path: Path) -> None:
+    options = {**server.client_options(), "local_model": False, "step_mode": "direct"}
+    path = tmp_path / "run.mcap"
+    with urlab_client.URLabClient(**options) as client:
+        client.discover()
+        with record(client, path, pose_hz=0):
+            client.step()
+    with pytest.raises(RecordingError, match="no model"):
+        read_run(path).model()
+
+
 # What goes wrong
 
 CHILD = """
@@ -384,8 +413,8 @@ def test_a_killed_process_leaves_what_was_written(server: SimulatedServer, tmp_p
         assert recording.stdout is not None
         start = written = 0
         for line in recording.stdout:
-            _, _, written = map(int, line.split())
-            start = start or written
+            _, states, written = map(int, line.split())
+            start = start if start and states > 1 else written  # with the model, which is written at the first state
             if written > start:  # a chunk is in the file
                 break
     run = read_run(path)
@@ -492,6 +521,8 @@ def test_a_full_disk_is_told_and_costs_the_simulation_nothing(
                 client.step()
                 if recorder.failed:
                     break
+                if recorder.stats.states <= 1:  # the model is written at the first state
+                    start = recorder.stats.file_bytes
                 if recorder.stats.file_bytes > start and resource.getrlimit(resource.RLIMIT_FSIZE) == before:
                     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))
             assert recorder.failed

@@ -164,6 +164,78 @@ class CameraCalibration(Struct, frozen=True):
     P: list[float]
 
 
+class Pose(Struct, frozen=True):
+    """A position and an orientation."""
+
+    position: Vector3
+    orientation: Quaternion
+
+
+class Color(Struct, frozen=True):
+    """Each component is 0 to 1."""
+
+    r: float
+    g: float
+    b: float
+    a: float
+
+
+class SolidPrimitive(Struct, frozen=True):
+    """A box or an ellipsoid; `size` is the length of each side or axis, metres."""
+
+    pose: Pose
+    size: Vector3
+    color: Color
+
+
+class CylinderPrimitive(Struct, frozen=True):
+    """A cylinder along z: diameters and length, metres."""
+
+    pose: Pose
+    size: Vector3
+    bottom_scale: float
+    top_scale: float
+    color: Color
+
+
+class TriangleListPrimitive(Struct, frozen=True):
+    """A mesh: each three indices of points are a triangle."""
+
+    pose: Pose
+    points: list[Vector3]
+    color: Color
+    colors: list[Color]
+    indices: list[Count]
+
+
+class SceneEntity(Struct, frozen=True):
+    """The shapes of one body, in its frame."""
+
+    timestamp: Time
+    frame_id: str
+    id: str
+    frame_locked: bool
+    cubes: list[SolidPrimitive]
+    spheres: list[SolidPrimitive]
+    cylinders: list[CylinderPrimitive]
+    triangles: list[TriangleListPrimitive]
+
+
+class SceneEntityDeletion(Struct, frozen=True):
+    """Removes what was shown before; type 1 stands for everything."""
+
+    timestamp: Time
+    type: int
+    id: str
+
+
+class SceneUpdate(Struct, frozen=True):
+    """The geometry of all bodies."""
+
+    deletions: list[SceneEntityDeletion]
+    entities: list[SceneEntity]
+
+
 class ContactMessage(Struct, frozen=True):
     """One contact: metres; the force is the one on the second body, newtons, world frame."""
 
@@ -225,7 +297,7 @@ class GapMessage(Struct, frozen=True):
     frames: Annotated[int, Meta(ge=0, lt=2**32)]
 
 
-_FOXGLOVE = (CameraCalibration, CompressedImage, FrameTransforms, JointStates, RawImage)
+_FOXGLOVE = (CameraCalibration, CompressedImage, FrameTransforms, JointStates, RawImage, SceneUpdate)
 _URLAB: dict[type[Struct], str] = {
     ArticulationMessage: "urlab.ArticulationState",
     EntityMessage: "urlab.EntityState",

@@ -8,14 +8,18 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import struct
 import threading
+import zlib
 from array import array
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import msgspec
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from urlab_client.errors import URLabError
@@ -42,10 +46,13 @@ from urlab_client.integrations.record.contents import (
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
 from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
-from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.integrations.record.writer import MODEL_NAME, RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.values.html import curve, fields, table
 from urlab_client.values.pictures import thumbnail
+
+if TYPE_CHECKING:
+    import mujoco
 
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -58,6 +65,7 @@ _MOST_VALUES = 8 << 20
 _VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
 _NAMES_CHARS = 32 << 20
 _CURVE_POINTS = 100
+_MODEL_BYTES = 1 << 30
 _T = TypeVar("_T")
 
 
@@ -255,6 +263,36 @@ class Run:
                 names = names if len(names) == count else [str(i) for i in range(count)]
                 found.setdefault(channel.topic.removeprefix(_ARTICULATION), names)
         return found
+
+    def model(self) -> mujoco.MjModel:
+        """Return the compiled model of the first scene.
+
+        MuJoCo does not check binary models, so call this only for recordings from sources that you trust.
+
+        Raises:
+            RecordingError: The file has no model, or one of another version of MuJoCo.
+        """
+        import mujoco
+
+        with self.path.open("rb") as file:
+            try:
+                attachments = make_reader(file).iter_attachments()
+                found = next((one for one in attachments if one.name == MODEL_NAME), None)
+                data = None if found is None else zlib.decompressobj().decompress(found.data, _MODEL_BYTES)
+            except (McapError, OSError, zlib.error, struct.error) as error:
+                raise RecordingError(f"{self.path}: the model in it cannot be read: {error}.") from error
+        if data is None:
+            raise RecordingError(
+                f"{self.path}: the recording has no model.",
+                hint="A client without a local model records none; neither does a server.",
+            )
+        try:
+            return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": data})
+        except ValueError as error:
+            raise RecordingError(
+                f"{self.path}: this MuJoCo ({mujoco.__version__}) does not read the model in it: {error}.",
+                hint="Install the MuJoCo with which it was recorded; `urlab info` names it.",
+            ) from error
 
     def cameras(self) -> list[str]:
         """Return the names of the cameras with pictures in the file."""

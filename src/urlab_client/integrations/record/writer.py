@@ -8,6 +8,7 @@ import io
 import logging
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +21,9 @@ from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
 from urlab_client.aio.background import background_thread
+from urlab_client.aio.model.mirror import binary_model
 from urlab_client.errors import URLabError
+from urlab_client.integrations._feed.geometry import scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
     ContactsMessage,
     EntityMessage,
@@ -55,6 +58,9 @@ log: logging.Logger = logging.getLogger("urlab_client.record")
 
 FORMAT = "1"
 """Version of the recording format."""
+
+MODEL_NAME, MODEL_TYPE = "model.mjb.zlib", "application/zlib"
+"""Attachment with the compiled model, as MuJoCo saves it; the last one before a state applies to it."""
 
 _WAKE_S = 0.02  # in batches: waking for each state would take the interpreter lock from the stepping thread
 _STALL_S = 30.0
@@ -337,9 +343,9 @@ class _Sink:
 
     def _write_state(self, item: State) -> None:
         reply = item.reply
-        if item.scene is not self._scene:
-            self._use(item.scene)
         now = self._clock.advance(item.nanoseconds, item.restarts)
+        if item.scene is not self._scene:
+            self._use(item.scene, now, item.wall_ns)
         stamp, clock = Time.of(now), self._clock
         self._write_episode(item, now)
         for key in reply.per_articulation:
@@ -402,10 +408,17 @@ class _Sink:
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
 
-    def _use(self, scene: FollowedScene) -> None:
-        self._scene = scene
-        wanted = scene.model is not None and self.options.pose_ns > 0
-        self._simulation = Simulation(scene, scene.model) if wanted and scene.model is not None else None
+    def _use(self, scene: FollowedScene, now: int, wall_ns: int) -> None:
+        """Write a scene once: its model, and the geometry to which the poses belong."""
+        self._scene, self._simulation = scene, None
+        if scene.model is None:
+            return
+        self._writer.flush()  # attachments are outside of chunks
+        self._writer.add_attachment(wall_ns, now, MODEL_NAME, MODEL_TYPE, zlib.compress(binary_model(scene.model)))
+        if self.options.pose_ns > 0:
+            self._simulation = Simulation(scene, scene.model)
+            shapes = shapes_of(scene.model, self._simulation.bodies)
+            self._add("/scene", scene_update(shapes, Time.of(now)), now, wall_ns, {})
 
     def _report(self, dropped_states: int, dropped_frames: int) -> None:
         if (dropped_states, dropped_frames) != self._reported:

@@ -14,6 +14,7 @@ from msgspec import Struct
 from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
+from urlab_client.integrations._feed.geometry import Shape, scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
     ContactsMessage,
     FrameTransforms,
@@ -25,7 +26,6 @@ from urlab_client.integrations._feed.messages import (
 )
 from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
-from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
 from urlab_client.sync.client import URLabClient
 
@@ -49,7 +49,6 @@ class _Foxglove(ViewBackend):
         self._sensors = sensors
         self._server: WebSocketServer | None = None
         self._context: foxglove.Context | None = None
-        self._scene_channel: SceneUpdateChannel | None = None
         self._contact_channel: SceneUpdateChannel | None = None
         self._channels: dict[tuple[str, str], foxglove.Channel] = {}
         self._shapes: list[Shape] = []
@@ -76,7 +75,6 @@ class _Foxglove(ViewBackend):
                 backend._joined = time.monotonic()
 
         self._context = foxglove.Context()
-        self._scene_channel = SceneUpdateChannel("/scene", context=self._context)
         self._contact_channel = SceneUpdateChannel("/contact_markers", context=self._context)
         try:
             self._server = foxglove.start_server(
@@ -124,7 +122,8 @@ class _Foxglove(ViewBackend):
         now = time.monotonic()
         if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
             self._shown = now
-            self._send_geometry(self._last.ns)
+            ns = self._last.ns
+            self._send("/scene", lambda: scene_update(self._shapes, Time.of(ns)), ns)
             self.show(self._last)
         return True
 
@@ -162,19 +161,6 @@ class _Foxglove(ViewBackend):
                 sensors=self._sensors,
             )
             self._send(f"/state/{key}", make, moment.ns, to_metadata(names) if names else {})
-
-    def _send_geometry(self, ns: int) -> None:
-        from foxglove import messages as fox
-
-        by_body: dict[str, list[Shape]] = {}
-        for shape in self._shapes:
-            by_body.setdefault(shape.body, []).append(shape)
-        if self._scene_channel is not None:
-            everything = fox.SceneEntityDeletion(type=fox.SceneEntityDeletionType.All)
-            update = fox.SceneUpdate(
-                deletions=[everything], entities=[_entity(body, shapes) for body, shapes in by_body.items()]
-            )
-            self._scene_channel.log(update, log_time=ns)
 
     def _send_contacts(self, moment: Moment) -> None:
         from foxglove import messages as fox
@@ -222,82 +208,6 @@ def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quate
         return fox.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
     scale = float(np.sqrt(2 * (1 + x)))
     return fox.Quaternion(x=0.0, y=-z / scale, z=y / scale, w=scale / 2)
-
-
-def _entity(body: str, shapes: Sequence[Shape]) -> fox.SceneEntity:
-    from foxglove import messages as fox
-
-    cubes: list[fox.CubePrimitive] = []
-    spheres: list[fox.SpherePrimitive] = []
-    cylinders: list[fox.CylinderPrimitive] = []
-    models: list[fox.ModelPrimitive] = []
-    for shape in shapes:
-        pose, (x, y, z) = _pose(shape), shape.size
-        red, green, blue, alpha = shape.rgba
-        colour = fox.Color(r=red, g=green, b=blue, a=alpha)
-        match shape.kind:
-            case Kind.BOX:
-                cubes.append(fox.CubePrimitive(pose=pose, size=_vector(2 * x, 2 * y, 2 * z), color=colour))
-            case Kind.ELLIPSOID:
-                spheres.append(fox.SpherePrimitive(pose=pose, size=_vector(2 * x, 2 * y, 2 * z), color=colour))
-            case Kind.CYLINDER | Kind.CAPSULE:
-                size = _vector(2 * x, 2 * x, 2 * y)
-                cylinders.append(
-                    fox.CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
-                )
-                if shape.kind is Kind.CAPSULE:
-                    ball = _vector(2 * x, 2 * x, 2 * x)
-                    ends = [_pose(shape, end) for end in (-y, y)]
-                    spheres += [fox.SpherePrimitive(pose=end, size=ball, color=colour) for end in ends]
-            case Kind.MESH:
-                models.append(
-                    fox.ModelPrimitive(
-                        pose=pose,
-                        scale=_vector(1.0, 1.0, 1.0),
-                        color=colour,
-                        override_color=True,
-                        media_type="model/stl",
-                        data=_stl(shape),
-                    )
-                )
-    return fox.SceneEntity(
-        id=body,
-        frame_id=body,
-        frame_locked=True,
-        cubes=cubes,
-        spheres=spheres,
-        cylinders=cylinders,
-        models=models,
-    )
-
-
-def _pose(shape: Shape, along_z: float = 0.0) -> fox.Pose:
-    """Return a shape's pose in its body's frame, or that of a point on the shape's z axis."""
-    from foxglove import messages as fox
-
-    w, x, y, z = shape.orientation
-    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    at = np.asarray(shape.position) + along_z * axis
-    return fox.Pose(
-        position=fox.Vector3(x=float(at[0]), y=float(at[1]), z=float(at[2])),
-        orientation=fox.Quaternion(x=x, y=y, z=z, w=w),
-    )
-
-
-_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
-
-
-def _stl(shape: Shape) -> bytes:
-    """Return a mesh as a binary STL file."""
-    if shape.vertices is None or shape.triangles is None:
-        return b""
-    corners = shape.vertices[shape.triangles]
-    facets = np.zeros(len(corners), _FACET)
-    facets["corners"] = corners
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    facets["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-    return bytes(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
 
 
 @overload

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -10,11 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.integrations._feed.messages import (
+    Color,
+    CylinderPrimitive,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneUpdate,
+    SolidPrimitive,
+    Time,
+    TriangleListPrimitive,
+    Vector3,
+)
 
 if TYPE_CHECKING:
     import mujoco
 
 _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers: 0 to 2 are shown; collision geometry is usually in 3
+_EVERYTHING = 1  # SceneEntityDeletion.ALL
 _PLANE_M = 20.0  # size of infinite planes
 _PLANE_THICKNESS_M = 0.001
 
@@ -140,3 +155,41 @@ def _height_field(model: mujoco.MjModel, field: int) -> tuple[NDArray[np.float32
     index = np.arange(rows * columns, dtype=np.uint32).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     return vertices.reshape(-1, 3), np.concatenate([np.stack([a, b, c], axis=-1), np.stack([b, d, c], axis=-1)])
+
+
+def scene_update(shapes: Iterable[Shape], time: Time) -> SceneUpdate:
+    """Return shapes as the message that Foxglove's 3-D panel draws, in place of everything drawn before."""
+    by_body: dict[str, list[Shape]] = {}
+    for shape in shapes:
+        by_body.setdefault(shape.body, []).append(shape)
+    entities = [_entity(body, those, time) for body, those in by_body.items()]
+    return SceneUpdate([SceneEntityDeletion(time, _EVERYTHING, "")], entities)
+
+
+def _entity(body: str, shapes: Iterable[Shape], time: Time) -> SceneEntity:
+    entity = SceneEntity(time, body, body, frame_locked=True, cubes=[], spheres=[], cylinders=[], triangles=[])
+    for shape in shapes:
+        pose, (x, y, z), colour = _pose(shape), shape.size, Color(*shape.rgba)
+        match shape.kind:
+            case Kind.BOX | Kind.ELLIPSOID:
+                solids = entity.cubes if shape.kind is Kind.BOX else entity.spheres
+                solids.append(SolidPrimitive(pose, Vector3(2 * x, 2 * y, 2 * z), colour))
+            case Kind.CYLINDER | Kind.CAPSULE:
+                entity.cylinders.append(CylinderPrimitive(pose, Vector3(2 * x, 2 * x, 2 * y), 1.0, 1.0, colour))
+                if shape.kind is Kind.CAPSULE:
+                    ball, ends = Vector3(2 * x, 2 * x, 2 * x), (_pose(shape, -y), _pose(shape, y))
+                    entity.spheres.extend(SolidPrimitive(end, ball, colour) for end in ends)
+            case Kind.MESH:
+                if shape.vertices is not None and shape.triangles is not None:
+                    points = [Vector3(*point) for point in shape.vertices.tolist()]
+                    mesh = TriangleListPrimitive(pose, points, colour, [], shape.triangles.ravel().tolist())
+                    entity.triangles.append(mesh)
+    return entity
+
+
+def _pose(shape: Shape, along_z: float = 0.0) -> Pose:
+    """Return a shape's pose in its body's frame, or that of a point on the shape's z axis."""
+    w, x, y, z = shape.orientation
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    at = np.asarray(shape.position) + along_z * axis
+    return Pose(Vector3(*at.tolist()), Quaternion(x, y, z, w))
