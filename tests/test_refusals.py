@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from urlab_client.randomise import Randomisation
 from urlab_client.server import SimulatedServer, faults
 from urlab_client.simulation.joint_recording import decode_csv, decode_json
 from urlab_client.values.pictures import jpeg
-from urlab_client.values.plain import read_array, read_bytes
+from urlab_client.values.plain import read, read_array, read_bytes
 from urlab_client.values.rotation import normalized
 
 FAR = "tcp://192.0.2.1"
@@ -62,6 +63,7 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
             ValueError,
             "a quaternion has finite components, not [nan, 0, 0, 1]",
         ),
+        (partial(read, Literal["sim", "wall"], "sun", "clock"), ValueError, "clock: 'sun' does not fit "),
         (partial(read_bytes, 3), ValueError, "int is not base64 text"),
         (partial(read_array, [0.5, 300], np.dtype(np.uint8)), ValueError, "the numbers are not uint8"),
         (faults.Fault, TypeError, "a fault is "),
