@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from urlab_client.conformance.relay import Passed, Ports, Relay
+from urlab_client.conformance.sessions import Passed, Ports, Relay
 from urlab_client.server import SimulatedServer
 
 Fields = dict[str, Any]

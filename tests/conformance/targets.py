@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from urlab_client.conformance import Bench, Wire
-from urlab_client.conformance.bench import ROBOT
+from urlab_client.conformance.bench import write_robot
 from urlab_client.server import SimulatedServer
 
 BOT = """
@@ -36,7 +36,7 @@ BOT = """
 def server(folder: Path, dialect: Any, *, shm: bool) -> Iterator[SimulatedServer]:
     """Serve an editor that may import the two models of a folder."""
     (folder / "bot.xml").write_text(BOT)
-    (folder / "urlab_conformance_robot.xml").write_text(ROBOT)
+    write_robot(folder)
     options: dict[str, Any] = {"shm_dir": folder} if shm else {}
     made = SimulatedServer(dialect=dialect, model_roots=[folder], camera_size=(64, 48), **options)
     with made as served:
@@ -60,13 +60,13 @@ async def bench(
 
 async def furnish(bench: Bench, folder: Path, *, play: bool = True) -> None:
     """Open a saved level with two robots, one of them without an actor id."""
-    await bench.edit("create_level", name="lab")
-    await bench.edit("ensure_manager")
-    blueprint = (await bench.edit("import_xml", path=str(folder / "bot.xml")))["blueprint_class_path"]
-    await bench.edit("spawn_actor", blueprint=blueprint, actor_id="arm a")
-    await bench.edit("spawn_actor", blueprint=blueprint, actor_id="", location=[0.0, 2.0, 0.0])
-    await bench.edit("save_level")
+    await bench.ask("create_level", name="lab")
+    await bench.ask("ensure_manager")
+    blueprint = (await bench.ask("import_xml", path=str(folder / "bot.xml")))["blueprint_class_path"]
+    await bench.ask("spawn_actor", blueprint=blueprint, actor_id="arm a")
+    await bench.ask("spawn_actor", blueprint=blueprint, actor_id="", location=[0.0, 2.0, 0.0])
+    await bench.ask("save_level")
     if play:
-        started = await bench.wire.ask("begin_pie", timeout_s=60)
+        started = await bench.ask("begin_pie", timeout_s=60)
         assert started["state"] == "ready", started
     await bench.greet()

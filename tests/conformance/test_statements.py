@@ -28,9 +28,9 @@ async def test_our_server_passes_every_check(generation: str, way: str, tmp_path
             await furnish(made, tmp_path)
             report = await run(made, EVERYTHING)
             assert (report.left, report.stopped) == ([], "")
-            assert (await made.wire.ask("current_level"))["level_path"] == "/Game/Levels/lab"
-            assert (await made.wire.ask("pie_status"))["state"] == "ready"
-            blueprints = (await made.wire.ask("list_blueprints"))["blueprints"]
+            assert (await made.ask("current_level"))["level_path"] == "/Game/Levels/lab"
+            assert (await made.ask("pie_status"))["state"] == "ready"
+            blueprints = (await made.ask("list_blueprints"))["blueprints"]
             assert [row["blueprint_short_name"] for row in blueprints] == ["bot"]
             assert made.wire.over_shm > 100 if shm else made.wire.over_shm == 0
     results = [*before.checks, *report.checks]
@@ -104,9 +104,9 @@ async def test_the_level_is_open_again_after_an_interruption(tmp_path: Path, int
             assert interrupted
             assert running.cancelled() == (interruption == "cancelled")
             assert made.undone == 0
-            assert (await made.wire.ask("current_level"))["level_path"] == "/Game/Levels/lab"
-            assert (await made.wire.ask("pie_status"))["state"] == "ready"
-            rows = (await made.wire.ask("list_actors"))["actors"]
+            assert (await made.ask("current_level"))["level_path"] == "/Game/Levels/lab"
+            assert (await made.ask("pie_status"))["state"] == "ready"
+            rows = (await made.ask("list_actors"))["actors"]
             assert [row["actor_id"] for row in rows if row.get("is_articulation")] == ["arm a", ""]
-            gone = await made.edit("destroy_asset", asset_path="/Game/Levels/urlab_conformance.urlab_conformance")
+            gone = await made.ask("destroy_asset", asset_path="/Game/Levels/urlab_conformance.urlab_conformance")
             assert gone["was_found"] is False

@@ -15,8 +15,7 @@ from targets import BOT
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
 from urlab_client.cli.tap import departures, described
-from urlab_client.conformance.relay import Passed, Ports, Relay
-from urlab_client.conformance.sessions import Recorded, Replay, SessionWriter, read_session
+from urlab_client.conformance.sessions import Passed, Ports, Recorded, Relay, Replay, SessionWriter, read_session
 from urlab_client.errors import URLabError, URLabTimeoutError
 from urlab_client.keys import KeyPair
 from urlab_client.server import SimulatedServer

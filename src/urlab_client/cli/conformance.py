@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import tempfile
 from argparse import Namespace
 from pathlib import Path
 from typing import Final
+from urllib.parse import urlencode
 
 from urlab_client.aio.launch import SCHEME
 from urlab_client.aio.transport.connection import client_keys
@@ -22,7 +24,7 @@ from urlab_client.cli._common import (
     sigterm_interrupts,
     table,
 )
-from urlab_client.conformance.bench import Bench
+from urlab_client.conformance.bench import Bench, write_robot
 from urlab_client.conformance.declarations import Differs, Group, Verdict, statement_titles
 from urlab_client.conformance.reports import (
     WORDS,
@@ -122,15 +124,28 @@ def _choice(arguments: Namespace) -> Choice:
 
 async def _check(arguments: Namespace, choice: Choice) -> tuple[Bench, Report]:
     own = arguments.address.startswith(SCHEME)
-    address = arguments.address
-    if own and arguments.mjcf_options:
-        address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
+    with tempfile.TemporaryDirectory(prefix="urlab-") as folder:
+        if not own:
+            return await _checked(arguments, choice, arguments.address)
+        # What the checks import lies in a folder that the server may read.
+        options = {"model-root": folder, **({"mjcf-options": ""} if arguments.mjcf_options else {})}
+        if "shm" not in arguments.address:
+            options["shm-dir"] = folder
+        separator = "&" if "?" in arguments.address else "?"
+        address = f"{arguments.address}{separator}{urlencode(options)}"
+        return await _checked(arguments, choice, address, write_robot(folder))
+
+
+async def _checked(
+    arguments: Namespace, choice: Choice, address: str, own_robot: str | None = None
+) -> tuple[Bench, Report]:
     with refusing(ValueError):
         keys = client_keys(address, arguments.server_key, arguments.client_key)
         shm = arguments.transport == "shm"
         wire = Wire(address, arguments.step_port, keys, shm=shm, timeout=arguments.timeout)
     trusted = True if arguments.trust_server or keys is not None else None
-    bench = Bench(wire, own_server=own, trusted=trusted, import_file=arguments.import_file)
+    file = arguments.import_file or own_robot
+    bench = Bench(wire, own_server=own_robot is not None, trusted=trusted, import_file=file)
     try:
         try:
             await bench.open()

@@ -14,7 +14,7 @@ import math
 import platform
 import time
 from argparse import Namespace
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +29,6 @@ from urlab_client.cli._arguments import Parser, add_dialect, count
 from urlab_client.cli._common import CommandError, import_mujoco, one_line, output, table
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.progress import Progress
 
     from urlab_client import URLabArticulation, URLabClient, aio
@@ -40,11 +39,10 @@ if TYPE_CHECKING:
 
 _ASYNC_SHARE = 4  # the async run takes a quarter of the steps
 _SEED = 0
-_TURNS = (-0.4, 0.4)  # the robot on the right walks to the right
 _PICTURE = (1280, 960)
 _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
-
+_PACKAGES = ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")
 
 EXAMPLES = (
     ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
@@ -84,66 +82,64 @@ def run(arguments: Namespace) -> int:
 
     from urlab_client import URLabClient
 
-    name, file = _model(arguments.model)
-    folder, console = arguments.output, output()
-    steps = arguments.steps
+    file = _model(arguments.model)
+    folder, steps, console = arguments.output, arguments.steps, output()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CommandError(f"--output {folder}: cannot write there: {error.strerror or error}") from None
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console) as progress:
-        with _serving(name, file, 1, arguments.dialect) as (server, options), URLabClient(**options) as client:
+        with _serving(file, 1, arguments.dialect) as (server, options), URLabClient(**options) as client:
             client.discover()
             client.reset(seed=_SEED)
-            run = _Run(client, progress, "blocking client, one robot", steps)
+            one = Run(client, progress, "blocking client, one robot", steps)
             for _ in range(steps):
-                run.act()
+                one.act()
                 client.step()
-                run.note()
-            one, physics = run.outcome("blocking"), _physics(client)
-            picture = "not drawn: --no-render" if arguments.no_render else _draw(server, one.sim_time, folder)
-        with _serving(name, file, 2, arguments.dialect) as (_, options):
-            two = asyncio.run(_drive_two(options, progress, max(1, steps // _ASYNC_SHARE)))
-    _print_table(console, name, [one, two])
-    if one.controllers == ["none"]:
-        console.print(f"{name}: 0 actuators: nothing is driven; gravity alone moves it.", soft_wrap=True)
-    run.plot(f"{name}, {steps} steps through the blocking client", folder / "joints.png")
-    _write_record(folder / "run.json", file, {"options": physics, "runs": [one, two]})
-    for written, note in (
-        ("joints.png", f"joint positions over the {one.sim_time:.3f} s of the blocking run"),
+                one.note()
+            runs = [one.outcome("blocking")]
+            picture = "not drawn: --no-render" if arguments.no_render else _draw(server, folder / "last_state.png")
+        with _serving(file, 2, arguments.dialect) as (_, options):
+            runs.append(asyncio.run(_drive_two(options, progress, max(1, steps // _ASYNC_SHARE))))
+    console.print(_table(file.stem, runs))
+    if runs[0]["controllers"] == ["none"]:
+        console.print(f"{file.stem}: 0 actuators: nothing is driven; gravity alone moves it.", soft_wrap=True)
+    one.plot(f"{file.stem}, {steps} steps through the blocking client", folder / "joints.png")
+    with replaced(folder / "run.json") as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(_record(file, client, runs)), indent=2) + b"\n")
+    for name, note in (
+        ("joints.png", f"joint positions over the {runs[0]['sim_time']:.3f} s of the blocking run"),
         ("last_state.png", picture),
         ("run.json", "versions, model, options, seed and results"),
     ):
-        console.print(f"{folder / written}  {note}", soft_wrap=True, highlight=False)
+        console.print(f"{folder / name}  {note}", soft_wrap=True, highlight=False)
     return 0
 
 
-async def _drive_two(options: dict[str, Any], progress: Progress, steps: int) -> Outcome:
+async def _drive_two(options: dict[str, Any], progress: Progress, steps: int) -> dict[str, Any]:
     from urlab_client import aio
 
     async with aio.URLabClient(**options) as client:
         await client.discover()
         await client.reset(seed=_SEED)
-        run = _Run(client, progress, "async client, two robots", steps)
+        two = Run(client, progress, "async client, two robots", steps)
         for _ in range(steps):
-            run.act()
+            two.act()
             await client.step()
-            run.note()
-        return run.outcome("async")
+            two.note()
+        return two.outcome("async")
 
 
-def _model(given: str) -> tuple[str, str]:
-    """Return a robot's name, and what the server takes for it."""
+def _model(given: str) -> Path:
+    """Return the file of a robot that can move."""
     import mujoco
 
     from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
     from urlab_client.server.assets.importer import mujoco_messages
 
-    path = Path(given)
-    if not path.is_file():
-        path = bundled_models().get(given, path)
-    if not path.is_file():
+    path = Path(given) if Path(given).is_file() else bundled_models().get(given)
+    if path is None:
         raise CommandError(unknown_model(given))
     try:
         with mujoco_messages():  # the server repeats MuJoCo's messages about the model
@@ -152,40 +148,37 @@ def _model(given: str) -> tuple[str, str]:
         raise CommandError(f"MuJoCo rejects {path}: {one_line(error)}") from None
     if not model.njnt:
         raise CommandError(f"{path} has no joints, so nothing in it can move; name a robot")
-    return path.stem, str(path.resolve())
+    return path.resolve()
 
 
 @contextlib.contextmanager
-def _serving(
-    name: str, file: str, number: int, dialect: DialectName
-) -> Generator[tuple[SimulatedServer, dict[str, Any]]]:
+def _serving(file: Path, number: int, dialect: DialectName) -> Generator[tuple[SimulatedServer, dict[str, Any]]]:
     """Serve a number of equal robots, in play, on a floor if they can fall and bring none; yield a client's options."""
     import mujoco
 
     from urlab_client.server import SimulatedServer, bundled_models
 
-    model = mujoco.MjModel.from_xml_path(file)
+    model = mujoco.MjModel.from_xml_path(str(file))
     falls = (model.jnt_type == _FREE).any() and not model.nhfield
     floor = ["floor"] if falls and not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any() else []
     logger = logging.getLogger("urlab_client.server")
     before = logger.level
-    if name in bundled_models():
+    if file.stem in bundled_models():
         logger.setLevel(logging.ERROR)  # the only warning would be about the floor in each copy
     try:
-        models = *[file] * number, *floor
+        models = *[str(file)] * number, *floor
         with SimulatedServer(*models, play=True, mjcf_options=True, render_quality="high", dialect=dialect) as server:
             yield server, {**server.client_options(), "step_mode": "direct"}
     finally:
         logger.setLevel(before)
 
 
-def _draw(server: SimulatedServer, moment: float, folder: Path) -> str:
+def _draw(server: SimulatedServer, file: Path) -> str:
     """Draw the robot as the editor's viewport would show it; return what is in the picture, or why there is none."""
     from PIL import Image
 
     from urlab_client.server import RenderingUnavailable
 
-    file = folder / "last_state.png"
     try:
         picture = server.snapshot(_PICTURE, frame_all=True)
     except RenderingUnavailable as reason:
@@ -193,7 +186,37 @@ def _draw(server: SimulatedServer, moment: float, folder: Path) -> str:
         return f"not drawn: {one_line(reason)}"
     with replaced(file) as temporary:
         Image.fromarray(picture).convert("RGB").save(temporary, format="png")
-    return f"last state of the blocking run, after {moment:.3f} s"
+    return "last state of the blocking run"
+
+
+def _table(name: str, runs: list[dict[str, Any]]) -> Any:
+    columns = "robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"
+    made = table(["client"], columns, f"{name}, direct mode")
+    made.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
+    for one in runs:
+        numbers = "{robots} {steps} {sim_time:.3f} {steps_per_second:.0f} {real_time_factor:.2f}".format(**one)
+        rows = [values for pose in one["final_base_poses"] for values in (pose[:3], pose[3:])]
+        poses = "\n".join(" ".join(f"{value:6.3f}" for value in values) for values in rows)
+        made.add_row(one["client"], *numbers.split(), poses)
+    return made
+
+
+def _record(file: Path, client: URLabClient, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    import mujoco
+
+    system = {"python": platform.python_version(), "platform": platform.platform()}
+    option: Any = client.model.opt if client.model is not None else None
+    kinds = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
+    physics = {name: kind(getattr(option, name)).name for name, kind in kinds.items()}
+    physics |= {"timestep": option.timestep, "gravity": option.gravity.tolist()}
+    return {
+        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {**system, **{package: version(package) for package in _PACKAGES}},
+        "model": {"path": str(file), "sha256": hashlib.sha256(file.read_bytes()).hexdigest()},
+        "seed": _SEED,
+        "options": {"step_mode": "direct", **physics},
+        "runs": runs,
+    }
 
 
 class Trot:
@@ -201,6 +224,10 @@ class Trot:
 
     A foot moves straight back on the ground and in an arc forward through the air; the leg's two equal links give the
     joint angles in closed form.
+
+    Args:
+        robot: The bundled quadruped, standing.
+        turn: How much longer the strides of the right legs are than average, as a share; positive turns left.
     """
 
     STRIDES_PER_S = 2.0
@@ -209,19 +236,13 @@ class Trot:
     KP, KD = 150.0, 4.0  # N m / rad, N m s / rad
     RAMP_S = 0.6  # until full stride
     BEND = math.pi / 4  # slope of both links where the joint angles are zero, radians
-    LEGS = ("FL", "FR", "RL", "RR")
+    JOINTS = tuple(f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf"))
     PHASES = np.array([0.0, 0.5, 0.5, 0.0])
     SIDES = np.array([-1.0, 1.0, -1.0, 1.0])
 
     def __init__(self, robot: Robot, turn: float = 0.0) -> None:
-        """Control a standing robot.
-
-        Args:
-            robot: The bundled quadruped.
-            turn: How much longer the strides of the right legs are than average, as a share; positive turns left.
-        """
         self._robot = robot
-        joints = [robot.joints[f"{leg}_{part}"] for leg in self.LEGS for part in ("hip", "thigh", "calf")]
+        joints = [robot.joints[name] for name in self.JOINTS]
         self._qpos = np.array([joint.qpos_local_offset for joint in joints])
         self._qvel = np.array([joint.qvel_local_offset for joint in joints])
         self._ctrl = np.array([robot.actuators[joint.name].ctrl_local.start for joint in joints])
@@ -249,7 +270,7 @@ class Trot:
 
 
 class Swing:
-    """Moves each actuator gently back and forth within its control range, each with its own phase."""
+    """Moves each actuator of a robot at rest gently back and forth within its control range."""
 
     HERTZ = 0.5
     SHARE = 0.2  # amplitude as a share of half the control range
@@ -258,7 +279,6 @@ class Swing:
     PHASE_STEP = math.pi * (3 - math.sqrt(5))  # golden angle: no two actuators are ever in phase
 
     def __init__(self, robot: Robot) -> None:
-        """Control a robot that starts at rest."""
         self._robot = robot
         count = len(robot.ctrl_array)
         self._centre, self._amplitude = np.zeros(count), np.zeros(count)
@@ -277,34 +297,18 @@ class Swing:
         self._robot.ctrl_array[:] = self._centre + min(1.0, time / self.RAMP_S) * self._amplitude * swing
 
 
-def _controller(robot: Robot, turn: float = 0.0) -> Trot | Swing:
-    trots = all(f"{leg}_{part}" in robot.actuators for leg in Trot.LEGS for part in ("hip", "thigh", "calf"))
-    return Trot(robot, turn) if trots and len(robot.actuators) == 12 else Swing(robot)
-
-
-class Outcome(msgspec.Struct):
-    """Result of a run; times in seconds, positions in metres, quaternions (w, x, y, z), world frame."""
-
-    client: str
-    robots: int
-    steps: int
-    sim_time: float
-    wall_time: float
-    steps_per_second: float
-    real_time_factor: float
-    final_base_poses: list[list[float]]
-    controllers: list[str]
-
-
-class _Run:
+class Run:
     """A run under way: the robots with their controllers, and the positions of the first robot."""
 
     def __init__(self, client: URLabClient | aio.URLabClient, progress: Progress, description: str, steps: int) -> None:
         self._client, self._progress = client, progress
         self._task = progress.add_task(description, total=steps)
         self._robots: list[Robot] = [one for one in client.articulations_by_id.values() if one.joints]  # no floor
-        turns = _TURNS if len(self._robots) > 1 else (0.0,)
-        self._controllers = [_controller(robot, turn) for robot, turn in zip(self._robots, turns, strict=True)]
+        turns = (-0.4, 0.4) if len(self._robots) > 1 else (0.0,)  # the robot on the right walks to the right
+        self._controllers = [
+            Trot(robot, turn) if set(robot.actuators) == set(Trot.JOINTS) else Swing(robot)
+            for robot, turn in zip(self._robots, turns, strict=True)
+        ]
         self._times: list[float] = []
         self._positions: list[Floats] = []
         self._began = time.perf_counter()
@@ -320,15 +324,21 @@ class _Run:
         self._positions.append(self._robots[0].qpos_array.copy())
         self._progress.advance(self._task)
 
-    def outcome(self, flavour: str) -> Outcome:
-        """Return the result so far."""
+    def outcome(self, flavour: str) -> dict[str, Any]:
+        """Return the result so far: seconds, metres, quaternions (w, x, y, z), world frame."""
         wall, steps, passed = time.perf_counter() - self._began, self._client.step_count, self._client.sim_time
-        poses = [[*robot.root_pos_w.tolist(), *robot.root_quat_w.tolist()] for robot in self._robots]
-        kinds = [
-            type(controller).__name__.lower() if robot.actuators else "none"
-            for controller, robot in zip(self._controllers, self._robots, strict=True)
-        ]
-        return Outcome(flavour, len(self._robots), steps, passed, wall, steps / wall, passed / wall, poses, kinds)
+        pairs = list(zip(self._controllers, self._robots, strict=True))
+        return {
+            "client": flavour,
+            "robots": len(self._robots),
+            "steps": steps,
+            "sim_time": passed,
+            "wall_time": wall,
+            "steps_per_second": steps / wall,
+            "real_time_factor": passed / wall,
+            "final_base_poses": [[*robot.root_pos_w.tolist(), *robot.root_quat_w.tolist()] for robot in self._robots],
+            "controllers": [type(one).__name__.lower() if robot.actuators else "none" for one, robot in pairs],
+        }
 
     def plot(self, title: str, file: Path) -> None:
         """Draw the positions over simulation time."""
@@ -347,48 +357,3 @@ class _Run:
             for label, some in lines.items()
         ]
         plot_curves(title, np.array(self._times), curves, file)
-
-
-def _print_table(console: Console, name: str, outcomes: Sequence[Outcome]) -> None:
-    columns = "robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"
-    runs = table(["client"], columns, f"{name}, direct mode")
-    runs.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
-    for one in outcomes:
-        numbers = f"{one.robots} {one.steps} {one.sim_time:.3f} {one.steps_per_second:.0f} {one.real_time_factor:.2f}"
-        rows = [values for pose in one.final_base_poses for values in (pose[:3], pose[3:])]
-        poses = "\n".join(" ".join(f"{value:6.3f}" for value in values) for values in rows)
-        runs.add_row(one.client, *numbers.split(), poses)
-    console.print(runs)
-
-
-def _physics(client: URLabClient) -> dict[str, Any]:
-    import mujoco
-
-    if client.model is None:  # never so for the bundled server
-        return {}
-    option = client.model.opt
-    return {
-        "step_mode": "direct",
-        "timestep": option.timestep,
-        "integrator": mujoco.mjtIntegrator(option.integrator).name,
-        "cone": mujoco.mjtCone(option.cone).name,
-        "solver": mujoco.mjtSolver(option.solver).name,
-        "gravity": option.gravity.tolist(),
-    }
-
-
-def _write_record(target: Path, model: str, results: dict[str, Any]) -> None:
-    packages = ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")
-    record = {
-        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            **{package: version(package) for package in packages},
-        },
-        "model": {"path": model, "sha256": hashlib.sha256(Path(model).read_bytes()).hexdigest()},
-        "seed": _SEED,
-        **results,
-    }
-    with replaced(target) as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")

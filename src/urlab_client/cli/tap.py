@@ -14,8 +14,8 @@ import msgspec
 from urlab_client.aio.transport.connection import client_keys
 from urlab_client.cli._arguments import Parser, add_address, port
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
-from urlab_client.conformance.frames import oddities, plain
-from urlab_client.conformance.relay import Passed, Ports, Relay
+from urlab_client.conformance.sessions import Passed, Ports, Relay
+from urlab_client.conformance.wire import oddities, plain
 from urlab_client.keys import KeyPair, read_pair
 from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.session import ErrorReply

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from urlab_client.aio.features import Features
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.aio.transport.connection import is_local
-from urlab_client.conformance.declarations import Differs, NotTried
-from urlab_client.conformance.frames import plain
-from urlab_client.conformance.wire import OWNER, Message, Wire
-from urlab_client.errors import ProtocolError, URLabConnectionError, URLabError, URLabTimeoutError
+from urlab_client.conformance.declarations import Differs, NotTried, expecting, has, holds, same
+from urlab_client.conformance.wire import Message, Wire, plain
+from urlab_client.errors import URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.protocol.codec import decode_reply
 from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, HelloOk
 from urlab_client.protocol.registry import OPS
@@ -46,6 +45,14 @@ ROBOT: Final = """<mujoco model="urlab_conformance_robot">
   <sensor><jointpos name="s" joint="j"/></sensor>
 </mujoco>
 """
+
+
+def write_robot(folder: str | Path) -> str:
+    """Write the robot of the checks into a folder; return the file."""
+    path = Path(folder) / "urlab_conformance_robot.xml"
+    path.write_text(ROBOT, encoding="utf-8")
+    return str(path)
+
 
 _BACK_S: Final = 20.0
 _POLL_S: Final = 0.05
@@ -79,6 +86,8 @@ class Bench:
         features: What the server can do.
         model: The model of the handshake; None without play or with another MuJoCo.
         robots: The robots of the handshake.
+        start: State at the start of a check that plays.
+        blueprint: Of the robot in the level of this run.
         own_server: Whether the server was started for this run.
         trusted: Whether its binary model is loaded; by default if it is on this machine.
         import_file: The user's MJCF for the checks that import one; None for one in a temporary folder.
@@ -89,12 +98,15 @@ class Bench:
         self, wire: Wire, *, own_server: bool = False, trusted: bool | None = None, import_file: str | None = None
     ) -> None:
         self.wire = wire
+        self.ask, self.refused = wire.ask, wire.refused
         self.plain_hello: dict[str, Any] = {}
         self.hello: HelloOk
         self.ops: dict[str, dict[str, Any]] = {}
         self.features: Features = Features()
         self.model: mujoco.MjModel | None = None
         self.robots: list[Robot] = []
+        self.start: dict[str, Any] = {}
+        self.blueprint: str = ""
         self.own_server = own_server
         self.trusted: bool = is_local(wire.endpoint) if trusted is None else trusted
         self.import_file = import_file
@@ -134,19 +146,17 @@ class Bench:
 
     async def open(self) -> None:
         """Open a session and learn who answers."""
-        meta = await self.wire.ask("meta")
+        meta = await self.ask("meta")
         self.ops = {op["name"]: op for op in meta["ops"]}
         await self.greet()
         self.features = self.features.with_ops(self.ops).with_hello(self.hello)
 
     async def greet(self, **fields: Any) -> None:
         """Open a session anew, and take over the handshake with its model."""
-        reply = await self.wire.ask("hello", client_version="urlab conformance", **fields)
+        reply = await self.ask("hello", client_version="urlab conformance", **fields)
         self.plain_hello, self.wire.session_id = reply, str(reply.get("session_id", ""))
-        try:
+        with expecting("a handshake"):
             self.hello = decode_reply(OPS["hello"], HelloOk, msgspec.msgpack.encode(reply))
-        except ProtocolError as error:
-            raise Differs("a handshake", str(error)) from error
         self.model = _model_of(self.hello) if self.trusted else None
         prefixes = {info.prefix: info.compiled_prefix for info in self.hello.articulations}
         layouts = {} if self.model is None else articulation_layouts(self.model, prefixes)
@@ -199,7 +209,7 @@ class Bench:
         give_up = asyncio.get_running_loop().time() + _BACK_S
         while True:
             try:
-                reply = await self.job(op, **fields)
+                reply = await self.wire.job(op, **fields)
             except (URLabConnectionError, URLabTimeoutError):
                 if asyncio.get_running_loop().time() > give_up:
                     raise
@@ -207,7 +217,7 @@ class Bench:
                 continue
             if reply.get("code") != "session_expired" or asyncio.get_running_loop().time() > give_up:
                 return reply
-            hello = await self.wire.ask("hello")
+            hello = await self.ask("hello")
             self.wire.session_id = hello["session_id"]
 
     # A world to act in
@@ -223,12 +233,8 @@ class Bench:
             if started.get("op") != "begin_pie_ok" or started.get("state") != "ready":
                 raise NotTried(f"needs a level that can be played: begin_pie says {started.get('state') or started}")
             await self.greet()
-        elif "pie_status" in self.ops:
-            times = [(await self.wire.ask("pie_status")).get("sim_time")]
-            await asyncio.sleep(0.2)
-            times.append((await self.wire.ask("pie_status")).get("sim_time"))
-            if times[0] == times[1]:
-                self.later("set_paused", paused=True)
+        else:
+            self.later("set_paused", paused=await self._stands_still())
         mode = await self.wire.raw("set_mode", mode="direct")
         if mode.get("op") == "error":
             raise NotTried(f"needs a server whose step mode is free: {mode.get('message')}")
@@ -245,16 +251,32 @@ class Bench:
         if self.features.claims and not self.robots and self.hello.articulations:
             raise NotTried("needs a robot that no other client controls")
 
-    async def direct(self) -> dict[str, Any]:
-        """Bring the play session to its start in direct mode; return the state."""
-        await self.wire.ask("set_mode", mode="direct")
-        await self.wire.ask("set_paused", paused=False)
-        return await self.wire.ask("reset")
+    async def _stands_still(self) -> bool:
+        """Whether play is paused, which no op says."""
+        if "pie_status" not in self.ops:
+            return False
+        before = (await self.ask("pie_status")).get("sim_time")
+        await asyncio.sleep(0.2)
+        return (await self.ask("pie_status")).get("sim_time") == before
 
-    def drive(self, robot: Robot, values: Any, **command: Any) -> dict[str, Any]:
+    async def enter(self, mode: str = "direct", *, paused: bool = False) -> None:
+        """Choose the step mode; the next check begins in direct mode again."""
+        await self.ask("set_mode", mode=mode)
+        await self.ask("set_paused", paused=paused)
+
+    async def restart(self) -> dict[str, Any]:
+        """Bring the play session to its start in direct mode; return the state."""
+        await self.enter()
+        return await self.ask("reset")
+
+    async def step(self, **fields: Any) -> dict[str, Any]:
+        """Send a step that must succeed."""
+        return await self.ask("step", **fields)
+
+    def drive(self, values: Iterable[float] = (), /, robot: Robot | None = None, **command: Any) -> dict[str, Any]:
         """Return the fields of a step that sets a robot's controls, past its controller."""
-        numbers = [float(value) for value in values]
-        return {"per_articulation": {robot.key: {"ctrl": numbers, "control_mode": "raw", **command}}}
+        command = {"ctrl": [float(value) for value in values], "control_mode": "raw", **command}
+        return {"per_articulation": {(robot or self.robot).key: command}}
 
     def states(self, reply: Mapping[str, Any]) -> dict[str, Any]:
         """Return the robots' states in a reply."""
@@ -263,72 +285,53 @@ class Bench:
             raise Differs(f"a map {self.state_key}", states)
         return cast("dict[str, Any]", states)
 
+    def state(self, reply: Mapping[str, Any], robot: Robot | None = None) -> dict[str, Any]:
+        """Return a robot's state in a reply, without what only some robots have."""
+        state: dict[str, Any] = self.states(reply).get((robot or self.robot).key) or {}
+        return {name: value for name, value in state.items() if name not in {"twist", "actions", "user"}}
+
     def vector(self, reply: Mapping[str, Any], field: str, robot: Robot | None = None) -> NDArray[np.float64]:
         """Return an array of a robot's state."""
-        key = (robot or self.robot).key
-        state: dict[str, Any] = self.states(reply).get(key) or {}
+        state = self.state(reply, robot)
         if not isinstance(state.get(field), list):
-            raise Differs(f"{field} of {key}", state)
+            raise Differs(f"{field} of {(robot or self.robot).key}", state)
         return np.array(state[field], dtype=np.float64)
 
-    async def job(self, op: str, /, **fields: Any) -> dict[str, Any]:
-        """Send an editor op, and return what its job comes to, whatever that says."""
-        reply = await self.wire.raw(op, **fields)
-        while reply.get("op") == "op_started":
-            await asyncio.sleep(_POLL_S)
-            status = await self.wire.ask("op_status", job_id=reply["job_id"])
-            if status["state"] in {"done", "failed"}:
-                return status["result"]
-        return reply
-
-    async def edit(self, op: str, /, **fields: Any) -> dict[str, Any]:
-        """Send an editor op, and return its successful result."""
-        result = await self.job(op, **fields)
-        if result.get("op") != OPS[op].reply_name:
-            raise Differs(OPS[op].reply_name, result)
-        return result
-
-    async def refuse(self, code: str, op: str, /, **fields: Any) -> None:
-        """Send an editor op that must fail, at once or as a job."""
-        result = await self.job(op, **fields)
-        if result.get("op") != "error" or result.get("code") != code:
-            raise Differs(f"{op} to be refused with {code}", result)
-
-    async def author(self) -> str:
-        """Open a level of this run's own; return the blueprint of a robot."""
+    async def author(self) -> None:
+        """Open a level of this run's own, with the blueprint of a robot."""
         if "create_level" not in self.ops:
             raise NotTried("needs an editor; this is a packaged build")
-        level = str((await self.wire.ask("current_level"))["level_path"])
+        level = str((await self.ask("current_level"))["level_path"])
         if not self.own_server and (not level.startswith("/Game/") or level.startswith("/Game/Levels/Untitled")):
             raise NotTried("needs the open level to be saved under a name, so that it can be opened again")
         if self.hello.manager_present:
             if not self.own_server:
                 self.later("begin_pie", timeout_s=60)
-            await self.wire.ask("stop_pie")
-        name, made = LEVEL, dict[str, Any]()
-        for number in range(2, 100):
-            self.later("destroy_asset", asset_path=f"/Game/Levels/{name}.{name}")
-            if not self.own_server:
-                self.later("load_level", level_path=level)
-            made = await self.job("create_level", name=name)
-            if made.get("op") == "create_level_ok":
-                break
-            del self._undo[-1 if self.own_server else -2 :]
-            name = f"{LEVEL}_{number}"
-        else:
-            raise NotTried(f"needs a level that can be created: {made}")
-        await self.edit("ensure_manager")
+            await self.ask("stop_pie")
+        await self._create_level(level)
+        await self.ask("ensure_manager")
         with tempfile.TemporaryDirectory(prefix="urlab-") as folder:
-            own = Path(folder) / "urlab_conformance_robot.xml"
-            own.write_text(ROBOT, encoding="utf-8")
-            imported = await self.job("import_xml", path=self.import_file or str(own))
+            imported = await self.wire.job("import_xml", path=self.import_file or write_robot(folder))
         if imported.get("op") != "import_xml_ok":
             text = f"{imported.get('code')}: {imported.get('message')}"
             raise NotTried(f"needs an MJCF that the server can read and may import (--import FILE): {text}")
-        blueprint = str(imported["blueprint_class_path"])
+        self.blueprint = str(imported["blueprint_class_path"])
         if imported["imported_now"]:  # otherwise it is the user's
-            self._undo.insert(0, ("destroy_asset", {"asset_path": re.sub(r"_C$", "", blueprint)}))
-        return blueprint
+            self._undo.insert(0, ("destroy_asset", {"asset_path": re.sub(r"_C$", "", self.blueprint)}))
+
+    async def _create_level(self, opened: str) -> None:
+        made: dict[str, Any] = {}
+        for number in range(1, 100):
+            name = LEVEL if number == 1 else f"{LEVEL}_{number}"
+            before = self.undone
+            self.later("destroy_asset", asset_path=f"/Game/Levels/{name}.{name}")
+            if not self.own_server:
+                self.later("load_level", level_path=opened)
+            made = await self.wire.job("create_level", name=name)
+            if made.get("op") == "create_level_ok":
+                return
+            del self._undo[before:]
+        raise NotTried(f"needs a level that can be created: {made}")
 
     # Streams
 
@@ -348,41 +351,65 @@ class Bench:
     """Port of the state stream where the server tells none."""
 
     async def state_messages(self, count: int, seconds: float = 5.0) -> list[Message]:
-        """Return the first messages of the state stream, a number of whole ticks."""
-        return await self.wire.listen(
+        """Return the first messages of the state stream, a number of whole ticks; at least one."""
+        messages = await self.wire.listen(
             self.state_endpoint, seconds, lambda got: sum(m.topic == b"state/full" for m in got) >= count
         )
+        holds(messages, f"messages at {self.state_endpoint}", f"none within {seconds:g} s")
+        return messages
 
 
-def same(what: str, expected: Any, got: Any, tolerance: float = 0.0) -> None:
-    """Check that two values agree, arrays within a tolerance.
+class Twin:
+    """The model of the handshake in MuJoCo here, which starts as the server does and takes the same steps.
 
-    Raises:
-        Differs: They do not.
+    Attributes:
+        model: The model.
+        data: Its state.
+        values: The controls of the first robot; those of the others are 0.
     """
-    if isinstance(expected, np.ndarray) or isinstance(got, np.ndarray):
-        one, other = np.asarray(expected, dtype=float), np.asarray(got, dtype=float)
-        if one.shape != other.shape:
-            raise Differs(f"{what} of shape {one.shape}", other.shape)
-        gap = np.abs(one - other) > tolerance * np.maximum(1.0, np.abs(one))
-        if np.any(gap | (np.isnan(one) != np.isnan(other))):
-            at = int(np.argmax(gap))
-            raise Differs(f"{what}[{at}] = {one.flat[at]!r}", f"{other.flat[at]!r}")
-    elif isinstance(expected, float) and tolerance and isinstance(got, int | float):
-        if abs(expected - got) > tolerance:
-            raise Differs(f"{what} = {expected!r}", got)
-    elif expected != got:
-        raise Differs(f"{what} = {expected!r}", got)
 
+    def __init__(self, bench: Bench) -> None:
+        import mujoco
 
-def holds(condition: object, expected: str, got: object) -> None:
-    """Check a condition.
+        self._bench = bench
+        self.model: mujoco.MjModel = bench.compiled
+        self.data: mujoco.MjData = mujoco.MjData(self.model)
+        self.values: NDArray[np.float64] = np.zeros(len(bench.robot.layout.ctrl_adr))
+        mujoco.mj_forward(self.model, self.data)
 
-    Raises:
-        Differs: It is false.
-    """
-    if not condition:
-        raise Differs(expected, got)
+    def inputs(self, scale: float = 1.0) -> None:
+        """Choose small controls that float32 represents, different for each input."""
+        place = np.arange(len(self.values))
+        self.values = np.asarray(scale * 0.0625 * (1 + place % 4) * np.where(place % 2, -1.0, 1.0), np.float64)
+
+    async def step(self, n: int = 1, tolerance: float = 1e-9, **fields: Any) -> dict[str, Any]:
+        """Let both take steps in which no controller acts, and compare them; `command` is for the first robot."""
+        import mujoco
+
+        bench, layout = self._bench, self._bench.robot.layout
+        command: dict[str, Any] = fields.pop("command", {})
+        commands: dict[str, Any] = {}
+        for robot in bench.robots:
+            idle = np.zeros(len(robot.layout.ctrl_adr))
+            commands |= bench.drive(idle, robot)["per_articulation"]
+        commands |= bench.drive(self.values, **command)["per_articulation"]
+        fields |= {"n_steps": n} if n > 1 else {}
+        reply = await bench.step(per_articulation=commands, **fields)
+        self.data.ctrl[layout.ctrl_adr] = self.values
+        mujoco.mj_step(self.model, self.data, nstep=n)
+        self.agrees(reply, tolerance)
+        return reply
+
+    def agrees(self, reply: Mapping[str, Any], tolerance: float = 1e-12) -> None:
+        """Check that the robots of a reply, and its time, are those of this model."""
+        for robot in self._bench.robots:
+            layout = robot.layout
+            for name, expected in {
+                "qpos": self.data.qpos[layout.qpos_adr],
+                "qvel": self.data.qvel[layout.qvel_adr],
+            }.items():
+                same(f"{name} of {robot.key}", expected, self._bench.vector(reply, name, robot), tolerance)
+        has(reply, tolerance, time=float(self.data.time))
 
 
 def _model_of(hello: HelloOk) -> mujoco.MjModel | None:
@@ -390,13 +417,11 @@ def _model_of(hello: HelloOk) -> mujoco.MjModel | None:
 
     if hello.mjb is None or hello.mujoco_version_int != mujoco.mj_version():
         return None
-    try:
+    with expecting("a model in `mjb`"):
         return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": hello.mjb})
-    except ValueError as error:
-        raise Differs("a model in `mjb`", str(error)) from error
 
 
-_GONE: Final = frozenset({"not_control_owner", "no_active_manager", "unknown_op", "not_ready"})
+_GONE: Final = frozenset({"not_control_owner", "no_active_manager", "unknown_op", "not_ready", "destroy_failed"})
 """Refusals of an undoing op that mean that nothing is left to undo."""
 
 NEEDS: Final[Mapping[str, tuple[Callable[[Bench], object], str]]] = {
@@ -427,10 +452,5 @@ NEEDS: Final[Mapping[str, tuple[Callable[[Bench], object], str]]] = {
 
 def decoded(message: Message) -> dict[str, Any]:
     """Return a published map as plain data."""
-    try:
+    with expecting("a map"):
         return plain(message.payload)
-    except ValueError as error:
-        raise Differs("a map", str(error)) from error
-
-
-__all__ = ["NEEDS", "OWNER", "Bench", "Robot", "decoded", "holds", "same"]

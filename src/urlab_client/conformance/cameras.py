@@ -5,18 +5,31 @@ from __future__ import annotations
 import asyncio
 import struct
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from urlab_client.conformance.bench import Bench, holds, same
-from urlab_client.conformance.declarations import ALPHA, BETA, NEWER, Differs, Group, NotTried, check
+from urlab_client.conformance.bench import Bench
+from urlab_client.conformance.declarations import (
+    ALPHA,
+    BETA,
+    NEWER,
+    Differs,
+    Group,
+    NotTried,
+    check,
+    expecting,
+    has,
+    holds,
+    same,
+)
 from urlab_client.conformance.wire import Message
-from urlab_client.errors import ProtocolError
 from urlab_client.protocol import shm
 from urlab_client.values.pictures import PictureStamp, picture_stamp
 
-PLAY: Final = Group.PLAY
-_WAIT_MS: Final = 10_000.0
+pictured = partial(check, group=Group.PLAY, needs=("camera",))
+
+_WAIT: Final[dict[str, Any]] = {"render": "sync", "camera_timeout_ms": 10_000.0}
 _HEADER: Final = 40
 _DAY_S: Final = 86_400
 
@@ -24,7 +37,7 @@ _DAY_S: Final = 86_400
 async def _drawn(bench: Bench, how: Any = "sync", **fields: Any) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Take a step with a picture of the first camera; return the reply and the picture."""
     name, info = bench.camera
-    reply = await bench.wire.ask("step", include_cameras={name: how}, **fields)
+    reply = await bench.step(include_cameras={name: how}, **fields)
     pictures: dict[str, dict[str, Any]] = reply.get("cameras") or {}
     same("names of pictures", set(), pictures.keys() - {name})
     picture = pictures.get(name)
@@ -32,41 +45,34 @@ async def _drawn(bench: Bench, how: Any = "sync", **fields: Any) -> tuple[dict[s
         size = int(picture["width"]), int(picture["height"])
         same("size", tuple(info.resolution), size)
         same("bytes", 4 * size[0] * size[1], len(picture["data"]))
-        same("dtype", "float32" if info.mode == "depth" else "bgra8", picture["dtype"])
+        has(picture, dtype="float32" if info.mode == "depth" else "bgra8")
     return reply, picture
 
 
-async def _fresh(bench: Bench) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Take steps until one brings a picture of its own."""
+async def _fresh(bench: Bench, how: Any = "sync", **fields: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Take steps until one brings a picture."""
     for _ in range(5):
-        reply, picture = await _drawn(bench, render="sync", camera_timeout_ms=_WAIT_MS)
+        reply, picture = await _drawn(bench, how, **fields)
         if picture is not None:
             return reply, picture
     raise NotTried("needs a server that draws: five steps brought no picture")
 
 
-@check("Session 8.4", group=PLAY, dialects=ALPHA, needs=("camera",))
+@pictured("Session 8.4", dialects=ALPHA)
 async def pictures_in_steps(bench: Bench) -> None:
     """A step brings the picture that it asks for, in the size of the handshake"""
-    await bench.direct()
     for how in ("sync", "latest"):
-        for _ in range(5):
-            if (await _drawn(bench, how))[1] is not None:
-                break
-        else:
-            raise NotTried("needs a server that draws: five steps brought no picture")
-    reply = await bench.wire.ask("step", include_cameras={"no such camera": "latest"})
-    same("pictures of an unknown camera", None, reply.get("cameras"))
+        await _fresh(bench, how)
+    has(await bench.step(include_cameras={"no such camera": "latest"}), cameras=None)
 
 
-@check("Beta 50", "Generation 2 25", group=PLAY, dialects=BETA, needs=("camera",))
+@pictured("Beta 50", "Generation 2 25", dialects=BETA)
 async def rendered_with_the_step(bench: Bench) -> None:
     """With `render` `sync` a step brings a picture of its own state, with the step's number and time"""
-    await bench.direct()
-    await _fresh(bench)
+    await _fresh(bench, **_WAIT)
     before = 0
     for _ in range(3):
-        reply, picture = await _fresh(bench)
+        reply, picture = await _fresh(bench, **_WAIT)
         same("fields", {"width", "height", "frame_id", "sim_time", "dtype", "data"}, set(picture))
         number, own = int(picture["frame_id"]), int(reply["frame_id"])
         holds(number >= own, f"frame_id {own} or more", number)
@@ -76,89 +82,84 @@ async def rendered_with_the_step(bench: Bench) -> None:
         before = number
 
 
-@check("Session 8.4", group=PLAY, dialects=NEWER, needs=("camera",))
+@pictured("Session 8.4", dialects=NEWER)
 async def pictures_change(bench: Bench) -> None:
     """Pictures have the size of the handshake, and are not the same bytes for ever where the world moves"""
-    await bench.direct()
-    first = bytes((await _fresh(bench))[1]["data"])
+    first = bytes((await _fresh(bench, **_WAIT))[1]["data"])
     holds(any(first), "a picture that is not all zero", f"{len(first)} zero bytes")
 
 
-@check("Beta 48", group=PLAY, dialects=BETA, needs=("camera",))
+@pictured("Beta 48", dialects=BETA)
 async def bare_names(bench: Bench) -> None:
     """A camera's bare name means nothing, without error"""
-    await bench.direct()
     bare = bench.camera[0].partition("/")[2]
-    same("cameras", None, (await bench.wire.ask("step", include_cameras={bare: "latest"})).get("cameras"))
+    has(await bench.step(include_cameras={bare: "latest"}), cameras=None)
 
 
-@check("Beta 49", group=PLAY, dialects=BETA, needs=("camera",))
+@pictured("Beta 49", dialects=BETA)
 async def pictures_in_live(bench: Bench) -> None:
     """A live step brings a picture"""
-    await bench.direct()
-    bench.later("set_mode", mode="direct")
-    await bench.wire.ask("set_mode", mode="live")
-    await bench.wire.ask("set_paused", paused=False)
-    await _fresh(bench)
+    await bench.enter("live")
+    await _fresh(bench, **_WAIT)
 
 
-@check("Beta 51", group=PLAY, dialects=BETA, needs=("camera",))
+@pictured("Beta 51", dialects=BETA)
 async def short_waits(bench: Bench) -> None:
     """A step that waits a millisecond for its picture succeeds"""
-    await bench.direct()
-    await _fresh(bench)
+    await _fresh(bench, **_WAIT)
     reply, picture = await _drawn(bench, render="sync", camera_timeout_ms=1.0)
     if picture is not None and int(picture["frame_id"]) < int(reply["frame_id"]):
         holds(float(picture["sim_time"]) <= float(reply["time"]), "an older sim_time", picture["sim_time"])
 
 
-@check("Beta 52", "Generation 2 27", "Generation 2 28", group=PLAY, dialects=NEWER, needs=("camera",))
+@pictured("Beta 52", "Generation 2 27", "Generation 2 28", dialects=NEWER)
 async def pictures_by_number(bench: Bench) -> None:
     """A picture is asked for by number: one not drawn yet brings none, an earlier one that or a later"""
-    await bench.direct()
-    _, picture = await _fresh(bench)
+    _, picture = await _fresh(bench, **_WAIT)
     same("cameras", None, (await _drawn(bench, {"frame_id": 1e15}))[1])
     number = int(picture["frame_id"])
     found = (await _drawn(bench, {"frame_id": number}))[1]
     holds(found is None or int(found["frame_id"]) >= number, f"frame_id {number} or more, or none", found)
 
 
-@check("Generation 2 26", group=PLAY, dialects=NEWER, needs=("camera",))
+@pictured("Generation 2 26", dialects=NEWER)
 async def pictures_stay(bench: Bench) -> None:
     """The newest picture is there for a second request"""
-    await bench.direct()
-    await _fresh(bench)
+    await _fresh(bench, **_WAIT)
     for _ in range(2):
         holds((await _drawn(bench, "latest"))[1] is not None, "a picture", "none")
 
 
+# Streams
+
+
 async def _switch(bench: Bench, how: Any) -> dict[str, Any]:
+    """Switch the stream of the first camera until the check is over; return its state."""
     name = bench.camera[0]
-    reply = (await bench.wire.ask("set_camera_streaming", cameras={name: how}))["cameras"]
-    same("names", {name} if bench.dialect == "beta" else set(reply), set(reply))
+    if how is not False:
+        bench.later("set_camera_streaming", cameras={name: False})
+    reply = (await bench.ask("set_camera_streaming", cameras={name: how}))["cameras"]
+    same("number of cameras", 1, len(reply))
+    holds(bench.dialect != "beta" or name in reply, name, set(reply))
     return next(iter(reply.values()))
 
 
-@check("Beta 53", "Generation 2 37", "Generation 2 38", group=PLAY, dialects=NEWER, needs=("camera",))
+@pictured("Beta 53", "Generation 2 36", "Generation 2 37", "Generation 2 38", dialects=NEWER)
 async def switch(bench: Bench) -> None:
     """Cameras are switched on twice alike, and off; unknown ones are left out"""
-    bench.later("set_camera_streaming", cameras={bench.camera[0]: False})
     first = await _switch(bench, {"zmq": True})
-    same("state", (True, True, False), (first["streaming"], first["zmq"], first["shm"]))
+    has(first, streaming=True, zmq=True, shm=False)
     same("the same again", first, await _switch(bench, {"zmq": True}))
-    off = await _switch(bench, False)
-    same("streaming", False, off["streaming"])
-    same("cameras", {}, (await bench.wire.ask("set_camera_streaming", cameras={"no such/camera": True}))["cameras"])
-    await bench.wire.refused("bad_request", "set_camera_streaming", cameras={})
-    await bench.wire.refused("missing_field", "set_camera_streaming")
+    has(await _switch(bench, False), streaming=False)
+    same("cameras", {}, (await bench.ask("set_camera_streaming", cameras={"no such/camera": True}))["cameras"])
+    await bench.refused("bad_request", "set_camera_streaming", cameras={})
+    await bench.refused("missing_field", "set_camera_streaming")
 
 
 def _stamp(bench: Bench, message: Message) -> PictureStamp:
     width, height = bench.camera[1].resolution
-    try:
+    with expecting("a picture with its header"):
         stamp = picture_stamp(message.payload, width, height)
-    except ProtocolError as error:
-        raise Differs("a picture with its header", str(error)) from error
     if stamp is None:
         raise Differs(f"a header of {_HEADER} bytes and {4 * width * height} of pixels", len(message.payload))
     return stamp
@@ -167,28 +168,19 @@ def _stamp(bench: Bench, message: Message) -> PictureStamp:
 async def _watch(bench: Bench, endpoint: str, count: int, n_steps: int) -> tuple[list[Message], list[dict[str, Any]]]:
     """Step while a camera streams; return its messages and the replies."""
     replies: list[dict[str, Any]] = []
-    heard = asyncio.Event()
-
-    async def listen() -> list[Message]:
-        try:
-            return await bench.wire.listen(bench.endpoint(endpoint), 15.0, lambda got: len(got) >= count)
-        finally:
-            heard.set()
-
-    async def steps() -> None:
-        while not heard.is_set():
-            replies.append(await bench.wire.ask("step", n_steps=n_steps))
+    listening = asyncio.ensure_future(bench.wire.listen(bench.endpoint(endpoint), 15.0, lambda got: len(got) >= count))
+    try:
+        while not listening.done():
+            replies.append(await bench.step(n_steps=n_steps))
             await asyncio.sleep(0.02)
+        return await listening, replies
+    finally:
+        listening.cancel()
 
-    messages, _ = await asyncio.gather(listen(), steps())
-    return messages, replies
 
-
-@check("Beta 56", "Generation 2 35", "Generation 2 40", group=PLAY, dialects=NEWER, needs=("camera",))
+@pictured("Beta 56", "Generation 2 35", "Generation 2 40", dialects=NEWER)
 async def streamed(bench: Bench) -> None:
     """Streamed pictures come under their topic and one space, with numbers, time and size before the pixels"""
-    await bench.direct()
-    bench.later("set_camera_streaming", cameras={bench.camera[0]: False})
     told = await _switch(bench, {"zmq": True})
     messages, replies = await _watch(bench, told["zmq_endpoint"], 3, 2)
     holds(messages, f"pictures at {told['zmq_endpoint']}", "none within 15 s")
@@ -202,43 +194,48 @@ async def streamed(bench: Bench) -> None:
     if bench.dialect == "beta":
         known = {int(reply["frame_id"]): float(reply["time"]) for reply in replies}
         for stamp in stamps:
-            if stamp.frame_id in known:
-                same(f"sim_time of picture {stamp.frame_id}", known[stamp.frame_id], stamp.sim_time, 1e-6)
+            same(
+                f"sim_time of picture {stamp.frame_id}", known.get(stamp.frame_id, stamp.sim_time), stamp.sim_time, 1e-6
+            )
 
 
-@check("Transports 5.2", group=PLAY, dialects=ALPHA, needs=("camera",))
+@pictured("Beta 55", "Generation 2 34", dialects=BETA)
+async def streams_are_silent(bench: Bench) -> None:
+    """A camera publishes nothing before it is switched on, nor while the simulation is paused"""
+    endpoint = bench.endpoint(bench.camera[1].zmq_endpoint)
+    await bench.enter("live")
+    same("pictures", 0, len(await bench.wire.listen(endpoint, 2.0, bool)))
+    told = await _switch(bench, {"zmq": True})
+    await bench.enter("live", paused=True)
+    await bench.wire.listen(bench.endpoint(told["zmq_endpoint"]), 0.5, lambda _: False)  # what was on its way
+    same("pictures", 0, len(await bench.wire.listen(bench.endpoint(told["zmq_endpoint"]), 1.0, bool)))
+
+
+@check("Transports 5.2", group=Group.PLAY, dialects=ALPHA, needs=("camera",))
 async def streamed_bare(bench: Bench) -> None:
     """Streamed pictures come under their topic and one space, and are the pixels alone"""
-    name, info = bench.camera
-    del name
-    await bench.direct()
-    bench.later("set_mode", mode="direct")
-    await bench.wire.ask("set_mode", mode="live")
+    info = bench.camera[1]
+    await bench.enter("live")
     messages = await bench.wire.listen(bench.endpoint(info.zmq_endpoint), 10.0, lambda got: len(got) >= 2)
     holds(messages, f"pictures at {info.zmq_endpoint}", "none within 10 s")
     topics = {f"{one.zmq_topic} ".encode() for robot in bench.robots for one in robot.info.camera_topics.values()}
     same("topics", set(), {message.topic for message in messages} - topics)
-    mine = [message for message in messages if message.topic == f"{info.zmq_topic} ".encode()]
-    for message in mine:
-        same("bytes", 4 * info.resolution[0] * info.resolution[1], len(message.payload))
+    sizes = {len(message.payload) for message in messages if message.topic == f"{info.zmq_topic} ".encode()}
+    same("other sizes", set(), sizes - {4 * info.resolution[0] * info.resolution[1]})
 
 
-@check("Beta 54", group=PLAY, dialects=BETA, needs=("camera", "model"))
+@check("Beta 54", group=Group.PLAY, dialects=BETA, needs=("camera", "model"))
 async def delays(bench: Bench) -> None:
     """With a delay, `latest` is old, and `sync` is not"""
-    await bench.direct()
-    name = bench.camera[0]
+    name, delay = bench.camera[0], 0.1
     bench.later("set_camera_delay", cameras={name: 0.0})
-    delay = 0.1
-    told = (await bench.wire.ask("set_camera_delay", cameras={name: delay}))["cameras"][name]
+    told = (await bench.ask("set_camera_delay", cameras={name: delay}))["cameras"][name]
     same("fields", {"delay_s", "jitter_s", "clock", "on_state_change", "max_fps"}, set(told))
-    holds(abs(float(told["delay_s"]) - delay) < 1e-6, f"delay_s {delay}", told["delay_s"])
+    has(told, 1e-6, delay_s=delay)
     each = max(1, round(0.02 / float(bench.compiled.opt.timestep)))
     for _ in range(11):
-        await _drawn(bench, "sync", render="sync", camera_timeout_ms=_WAIT_MS, n_steps=each)
-    reply, newest = await _drawn(bench, "sync", render="sync", camera_timeout_ms=_WAIT_MS, n_steps=each)
-    if newest is None:
-        raise NotTried("needs a server that draws")
+        await _drawn(bench, n_steps=each, **_WAIT)
+    reply, newest = await _fresh(bench, n_steps=each, **_WAIT)
     holds(int(newest["frame_id"]) >= int(reply["frame_id"]), "a picture of the step with sync", newest["frame_id"])
     reply, latest = await _drawn(bench, "latest", n_steps=each)
     if latest is not None:
@@ -246,19 +243,27 @@ async def delays(bench: Bench) -> None:
         holds(age >= delay - 1e-3, f"a picture at least {delay} s old", f"{age:.4f} s")
 
 
-@check("Generation 2 41", "Transports 6.8", group=PLAY, dialects=NEWER, needs=("camera", "shm"))
+@check("Beta 94", group=Group.PLAY, dialects=BETA, needs=("camera",))
+async def long_delays(bench: Bench) -> None:
+    """With a delay of 10 s a picture by number does not come, one with `sync` does"""
+    name = bench.camera[0]
+    bench.later("set_camera_delay", cameras={name: 0.0})
+    await bench.ask("set_camera_delay", cameras={name: 10.0})
+    reply, _ = await _fresh(bench, **_WAIT)
+    same("cameras", None, (await _drawn(bench, {"frame_id": reply["frame_id"]}))[1])
+
+
+@check("Generation 2 41", "Transports 6.8", group=Group.PLAY, dialects=NEWER, needs=("camera", "shm"))
 async def camera_region(bench: Bench) -> None:
     """A camera's region has the size of its pictures and their header"""
-    await bench.direct()
     name, info = bench.camera
-    await _fresh(bench)  # the first picture takes seconds where a processor draws
-    bench.later("set_camera_streaming", cameras={name: False})
+    await _fresh(bench, **_WAIT)  # the first picture takes seconds where a processor draws
     await _switch(bench, {"shm": True})
     file = shm.camera_file(*name.split("/", 1)) if "/" in name else shm.camera_file(bench.robot.key, name)
     folders = shm.region_directories(bench.plain_hello["shm_session_dir"], file)
     paths = [Path(folder) / file for folder in folders]
     for _ in range(400):
-        await bench.wire.ask("step")
+        await bench.step()
         path = next((path for path in paths if path.exists()), None)
         if path is not None and path.stat().st_size > shm.HEADER_SIZE:
             header = shm.parse_header(path.read_bytes())

@@ -1,16 +1,19 @@
-"""What a check is: declared next to the statements that it proves, found by the runner, shared by command and tests."""
+"""What a check is, how it says what it expects, and the statements that it proves."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Generator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+import numpy as np
 from msgspec import Struct
+
+from urlab_client.errors import ProtocolError
 
 if TYPE_CHECKING:
     from urlab_client.conformance.bench import Bench
@@ -48,14 +51,13 @@ class NotTried(Exception):
     """A check cannot be made here; its text says what it needs."""
 
 
-@dataclass(frozen=True, eq=False)
-class Check:
+class Check(Struct, frozen=True, eq=False):
     """A check of a server.
 
     Attributes:
         title: What it does, in one sentence.
         statements: The statements that it proves, such as `Beta 12`.
-        group: What it may do to the user's world.
+        group: What it may do to the user's world. One that plays begins at the start, in direct mode.
         dialects: The generations that it is about: `alpha`, `june`, `beta`.
         needs: What must be there; see `bench.NEEDS`.
         body: The check itself.
@@ -71,10 +73,22 @@ class Check:
     last: bool = False
 
 
+class StatementResult(Struct):
+    """What a run says of one statement."""
+
+    id: str
+    title: str
+    verdict: Verdict
+    detail: str = ""
+    frames: list[str] = []
+    """Numbers of the recorded exchanges that belong to it, where it differs."""
+
+
 CHECKS: Final[list[Check]] = []
 """Every check, in the order in which they run."""
 
 ALL: Final = ("alpha", "june", "beta")
+OLDER: Final = ("alpha", "june")
 NEWER: Final = ("june", "beta")
 BETA: Final = ("beta",)
 ALPHA: Final = ("alpha",)
@@ -99,15 +113,53 @@ def check(
     return declare
 
 
-class StatementResult(Struct):
-    """What a run says of one statement."""
+def holds(condition: object, expected: object, got: object) -> None:
+    """Check a condition.
 
-    id: str
-    title: str
-    verdict: Verdict
-    detail: str = ""
-    frames: list[str] = []
-    """Numbers of the recorded exchanges that belong to it, where it differs."""
+    Raises:
+        Differs: It is false.
+    """
+    if not condition:
+        raise Differs(expected, got)
+
+
+@contextmanager
+def expecting(what: str) -> Generator[None]:
+    """Report what the block cannot read as a difference from what was expected."""
+    try:
+        yield
+    except (ValueError, OSError, ProtocolError) as error:
+        raise Differs(what, str(error)) from error
+
+
+def same(what: str, expected: Any, got: Any, tolerance: float = 0.0) -> None:
+    """Check that two values agree; arrays and numbers within a tolerance, relative where they are above 1.
+
+    Raises:
+        Differs: They do not.
+    """
+    if isinstance(expected, np.ndarray) or isinstance(got, np.ndarray):
+        one, other = np.asarray(expected, dtype=float), np.asarray(got, dtype=float)
+        if one.shape != other.shape:
+            raise Differs(f"{what} of shape {one.shape}", other.shape)
+        gap = np.abs(one - other) > tolerance * np.maximum(1.0, np.abs(one))
+        if np.any(gap | (np.isnan(one) != np.isnan(other))):
+            at = int(np.argmax(gap))
+            raise Differs(f"{what}[{at}] = {one.flat[at]!r}", f"{other.flat[at]!r}")
+    elif isinstance(expected, float) and tolerance and isinstance(got, int | float):
+        holds(abs(expected - got) <= tolerance, f"{what} = {expected!r}", got)
+    else:
+        holds(expected == got, f"{what} = {expected!r}", got)
+
+
+def has(reply: Mapping[str, Any], tolerance: float = 1e-9, /, **fields: Any) -> None:
+    """Check that a map has fields of the given values; None stands for a field that is absent.
+
+    Raises:
+        Differs: One of them is another.
+    """
+    for name, expected in fields.items():
+        same(name, expected, reply.get(name), tolerance)
 
 
 @cache
@@ -122,7 +174,7 @@ _CLIENTS: Final[Mapping[str, tuple[range, ...]]] = {
     "Beta": (range(67, 86), range(97, 100)),
     "Generation 2": (range(45, 61),),
 }
-_SUPERSEDED: Final = frozenset({18, 23, 29, 31, 32, 33})
+_SUPERSEDED: Final = frozenset({18, 23, 29, 31, 32, 33, 42})
 
 
 def why_without_check(statement: str, dialect: str) -> str:

@@ -19,7 +19,7 @@ import msgspec
 
 from urlab_client.conformance.declarations import StatementResult, Verdict
 from urlab_client.conformance.runner import Report
-from urlab_client.conformance.wire import Exchange
+from urlab_client.conformance.wire import Exchange, plain
 
 Redact: TypeAlias = Callable[[str], str]
 
@@ -68,23 +68,10 @@ def _user() -> str:
 
 def plain_report(report: Report, redact: Redact) -> dict[str, Any]:
     """Return a report as plain data, as `--json` writes it."""
-    statements = [
-        {"id": row.id, "title": row.title, "verdict": str(row.verdict), "detail": row.detail, "frames": row.frames}
-        for row in report.statements
-    ]
-    checks = [
-        {"title": check.title, "statements": check.statements, "verdict": str(check.verdict), "detail": check.detail}
-        for check in report.checks
-    ]
-    return {
-        "server": _cleaned(report.server, redact),
-        "statements": _cleaned(statements, redact),
-        "checks": _cleaned(checks, redact),
-        "measurements": _cleaned(report.measurements, redact),
-        "left": _cleaned(report.left, redact),
-        "stopped": redact(report.stopped),
-        "versions": versions(),
-    }
+    shown: dict[str, Any] = msgspec.to_builtins(report)
+    for check in shown["checks"]:
+        del check["group"], check["frames"]
+    return {**_cleaned(shown, redact), "versions": versions()}
 
 
 def versions() -> dict[str, str]:
@@ -107,19 +94,16 @@ def _cleaned(value: Any, redact: Redact) -> Any:
             return redact(value)
         case dict():
             items = cast("dict[str, Any]", value).items()
-            return {redact(key): _without(key, item, redact) for key, item in items}
-        case list() | tuple():
+            private = {key for key, item in items if key in _PRIVATE and isinstance(item, str)}
+            return {
+                redact(key): f"({len(item)} bytes)" if key in private else _cleaned(item, redact) for key, item in items
+            }
+        case list():
             return [_cleaned(item, redact) for item in cast("list[Any]", value)]
         case bytes():
             return f"({len(value)} bytes)"
         case _:
             return value
-
-
-def _without(key: str, value: Any, redact: Redact) -> Any:
-    if key in _PRIVATE and isinstance(value, str | bytes):
-        return f"({len(value)} bytes)"
-    return _cleaned(value, redact)
 
 
 def counts(rows: Iterable[StatementResult]) -> str:
@@ -150,12 +134,9 @@ def readable(exchange: Exchange, redact: Redact) -> dict[str, Any]:
 
 def _readable(frame: bytes, size: int, redact: Redact) -> Any:
     try:
-        value = msgspec.json.decode(frame) if frame[:1] == b"{" else msgspec.msgpack.decode(frame)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
-        if len(frame) < size:
-            return f"({size} bytes)"
-        return f"(not a message: {frame[:32].hex()})"
-    return _cleaned(value, redact)
+        return _cleaned(plain(frame), redact)
+    except ValueError:
+        return f"({size} bytes)" if len(frame) < size else f"(not a message: {frame[:32].hex()})"
 
 
 def page(report: Report, exchanges: Iterable[Exchange], redact: Redact) -> str:

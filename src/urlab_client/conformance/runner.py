@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import statistics
+import time
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 
 from msgspec import Struct
 
-from urlab_client.conformance import authoring
+from urlab_client.conformance import authoring as _authoring
 from urlab_client.conformance import cameras as _cameras
 from urlab_client.conformance import playing as _playing
 from urlab_client.conformance import reading as _reading
-from urlab_client.conformance.bench import Bench
+from urlab_client.conformance.bench import Bench, decoded
 from urlab_client.conformance.declarations import (
     CHECKS,
     Check,
@@ -24,11 +27,13 @@ from urlab_client.conformance.declarations import (
     statement_titles,
     why_without_check,
 )
-from urlab_client.conformance.measurements import measure
-from urlab_client.errors import URLabConnectionError, URLabError
+from urlab_client.errors import URLabError
 
 _LONGEST_S: Final = 120.0
-_DECLARING: Final = (_reading, _cameras, _playing, authoring)
+_FRAMES: Final = 8
+_UNREADABLE: Final = (LookupError, TypeError, ValueError, AttributeError)
+"""Errors by which it shows that a reply, which is plain data here, lacks something, or has another type."""
+_DECLARING: Final = (_reading, _cameras, _playing, _authoring)
 """The modules that declare the checks, which are known once these are imported."""
 
 
@@ -95,10 +100,7 @@ Progress = Callable[[CheckResult, int, int], None]
 """Called after each check with its result, its number and the number of all."""
 
 
-def _unseen(*_: object) -> None: ...
-
-
-async def run(bench: Bench, choice: Choice, progress: Progress = _unseen) -> Report:
+async def run(bench: Bench, choice: Choice, progress: Progress = lambda _result, _number, _all: None) -> Report:
     """Run the chosen checks against an opened bench, and bring the user's world back.
 
     Cancelling it brings the world back, too. What was found until then is lost.
@@ -125,7 +127,7 @@ async def run(bench: Bench, choice: Choice, progress: Progress = _unseen) -> Rep
                 results.append(result)
                 progress(result, len(results), len(wanted))
             if choice.measure and not obstacle and not stopped and group in choice.groups and not choice.words:
-                measurements |= await _measured(bench, group)
+                measurements |= await _measure(bench, group)
             left += await asyncio.shield(bench.put_back())
         for check in wanted if not stopped else ():
             if check.last:
@@ -146,6 +148,8 @@ async def one(bench: Bench, check: Check) -> CheckResult:
         for need in check.needs:
             bench.need(need)
         async with asyncio.timeout(_LONGEST_S):
+            if check.group is Group.PLAY:
+                bench.start = await bench.restart()
             await check.body(bench)
     except NotTried as reason:
         verdict, detail = Verdict.NOT_TRIED, str(reason)
@@ -153,8 +157,7 @@ async def one(bench: Bench, check: Check) -> CheckResult:
         verdict, detail = Verdict.DIFFERS, str(error)
     except TimeoutError:
         verdict, detail = Verdict.DIFFERS, f"expected an end within {_LONGEST_S:g} s, got none"
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        # A reply is plain data here: what is missing or of another type shows where it is used.
+    except _UNREADABLE as error:
         verdict, detail = Verdict.DIFFERS, f"expected the declared fields, got {type(error).__name__}: {error}"
     await asyncio.shield(bench.put_back(undone))
     return CheckResult(check.title, check.statements, check.group, verdict, detail, (before + 1, bench.wire.count))
@@ -167,10 +170,10 @@ async def _begin(bench: Bench, group: Group, choice: Choice, checks: Collection[
     if not checks or group is Group.READ:
         return "", False
     try:
-        await (bench.play() if group is Group.PLAY else authoring.prepare(bench))
+        await (bench.play() if group is Group.PLAY else bench.author())
     except NotTried as reason:
         return str(reason), False
-    except (Differs, URLabError, LookupError, TypeError, ValueError) as error:
+    except (Differs, URLabError, *_UNREADABLE) as error:
         return f"the {group} checks could not begin: {error}", True
     return "", False
 
@@ -184,18 +187,11 @@ _BEGINNING: Final = {
 async def _answers(bench: Bench) -> bool:
     try:
         await bench.wire.raw("meta")
-    except (URLabConnectionError, TimeoutError, URLabError):
+    except (TimeoutError, URLabError):
         return False
     except Differs:
         return True
     return True
-
-
-async def _measured(bench: Bench, group: Group) -> dict[str, Any]:
-    try:
-        return await measure(bench, group)
-    except (Differs, NotTried, URLabError, LookupError) as error:
-        return {f"{group}_stopped": str(error)}
 
 
 def _statements(bench: Bench, results: Sequence[CheckResult]) -> list[StatementResult]:
@@ -216,9 +212,6 @@ def _statements(bench: Bench, results: Sequence[CheckResult]) -> list[StatementR
     return rows
 
 
-_FRAMES: Final = 8
-
-
 def _server(bench: Bench) -> dict[str, Any]:
     hello = bench.plain_hello
     return {
@@ -233,3 +226,85 @@ def _server(bench: Bench) -> dict[str, Any]:
         "requests": bench.wire.count,
         "over_shared_memory": bench.wire.over_shm,
     }
+
+
+# Measurements, without judgement: times and rates, such as a simulated server should have, too.
+
+_SAMPLES: Final = 50
+_LIVE_S: Final = 2.0
+
+
+async def _measure(bench: Bench, group: Group) -> dict[str, Any]:
+    """Measure what a group may do to the user's world; what stops it is among the results."""
+    measured: dict[str, Any] = {}
+    try:
+        if group is Group.READ:
+            for _ in range(_SAMPLES):
+                await bench.ask("meta")
+        elif group is Group.PLAY:
+            await bench.restart()
+            measured["steps_per_second"] = {str(n): await _step_rate(bench, n) for n in (1, 10, 100)}
+            measured["live"] = await _live(bench)
+            await bench.restart()
+            measured["pictures"] = await _pictures(bench)
+    except (Differs, NotTried, URLabError, LookupError) as error:
+        measured[f"{group}_stopped"] = str(error)
+    return measured | {"round_trip_ms": {op: _times(times) for op, times in sorted(bench.wire.times.items())}}
+
+
+def _times(seconds: Sequence[float]) -> dict[str, float]:
+    spread = {"min": min(seconds), "median": statistics.median(seconds), "max": max(seconds)}
+    return {"count": len(seconds), **{name: round(1e3 * value, 3) for name, value in spread.items()}}
+
+
+async def _step_rate(bench: Bench, n: int) -> float:
+    await bench.step(n_steps=n)
+    began = time.perf_counter()
+    for _ in range(_SAMPLES):
+        await bench.step(n_steps=n)
+    return round(_SAMPLES * n / (time.perf_counter() - began), 1)
+
+
+async def _live(bench: Bench) -> dict[str, Any]:
+    """Measure how evenly snapshots come in live mode, and how fast time passes."""
+    await bench.enter("live")
+    messages = await bench.wire.listen(bench.state_endpoint, _LIVE_S, lambda _: False)
+    snapshots = [message for message in messages if message.topic == b"state/full"]
+    if len(snapshots) < _FEWEST:
+        return {"snapshots": len(snapshots)}
+    gaps = [1e3 * (after.at - before.at) for before, after in itertools.pairwise(snapshots)]
+    took = snapshots[-1].at - snapshots[0].at
+    passed = float(decoded(snapshots[-1])["time"]) - float(decoded(snapshots[0])["time"])
+    return {
+        "snapshots_per_second": round((len(snapshots) - 1) / took, 1),
+        "gap_ms": {"median": round(statistics.median(gaps), 3), "max": round(max(gaps), 3)},
+        "jitter_ms": round(statistics.pstdev(gaps), 3),
+        "real_time_factor": round(passed / took, 3),
+    }
+
+
+_FEWEST: Final = 3
+
+
+async def _pictures(bench: Bench) -> dict[str, Any]:
+    """Measure the time of steps with a picture, by the picture's size."""
+    sizes: dict[str, Any] = {}
+    for robot in bench.robots:
+        for name, info in robot.info.camera_topics.items():
+            size = "x".join(map(str, info.resolution))
+            if size in sizes:
+                continue
+            times: list[float] = []
+            extra = {"render": "sync", "camera_timeout_ms": 10_000.0} if bench.features.renders_sync else {}
+            for _ in range(5):
+                began = time.perf_counter()
+                reply = await bench.step(include_cameras={name: "sync"}, **extra)
+                if reply.get("cameras"):
+                    times.append(time.perf_counter() - began)
+                await asyncio.sleep(0)
+            sizes[size] = (
+                {"step_to_picture_ms": _times(times), "per_second": round(len(times) / sum(times), 1)}
+                if times
+                else "no picture came"
+            )
+    return sizes

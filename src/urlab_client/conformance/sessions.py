@@ -1,17 +1,20 @@
-"""Recorded sessions: every frame between clients and a server in an MCAP file, and their replay.
+"""Sessions between clients and a server: relayed unchanged, recorded in an MCAP file, and replayed.
 
-A replay answers requests as the recorded server did, in the recorded order, so a session with an editor becomes a test
-that runs anywhere.
+A relay listens at two ports of its own and one for each camera, so it replaces the ports that replies name by its own.
+Shared memory goes past it. A replay answers requests as the recorded server did, in the recorded order, so a session
+with an editor becomes a test that runs anywhere.
 """
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Self, cast
+from typing import Any, Final, Self, TypeAlias, cast
 
 import msgspec
 import zmq
@@ -19,20 +22,316 @@ from msgspec import Struct
 
 from urlab_client._installation import need
 from urlab_client.aio.background import background_thread
-from urlab_client.conformance.relay import Passed, Ports, op_name, with_ports
+from urlab_client.aio.transport.connection import HEARTBEAT_MS, SILENCE_MS, ClientKeys, is_local
+from urlab_client.conformance.wire import codec_of, plain
 from urlab_client.errors import URLabError
+from urlab_client.keys import KeyPair
+from urlab_client.protocol.topics import resolve_endpoint
 
-need("mcap", extra="mcap")
+Socket: TypeAlias = zmq.Socket[bytes]
 
-from mcap.exceptions import McapError  # noqa: E402
-from mcap.reader import make_reader  # noqa: E402
-from mcap.writer import Writer  # noqa: E402
-
+_STOP: Final = "inproc://urlab-stop"
+_PORTS: Final = frozenset({"hello", "begin_pie", "set_camera_streaming"})
+"""Ops whose replies name ports."""
 _PREFIX: Final = "urlab/"
 _REQUEST, _REPLY = f"{_PREFIX}request", f"{_PREFIX}reply"
 _HEADER: Final = 40
 _VARIES: Final = frozenset({"session_id", "control_owner", "client_version"})
 """Request fields that differ from run to run."""
+
+
+class Passed(Struct):
+    """A request and its reply that passed through.
+
+    Attributes:
+        op: Name of the op; empty if the request has none.
+        request: The request's bytes.
+        reply: The reply's bytes, as the server sent it.
+        seconds: Time from the request to its reply, at the relay.
+        at: Unix time of the request, nanoseconds.
+    """
+
+    op: str
+    request: bytes
+    reply: bytes
+    seconds: float
+    at: int
+
+
+class _Head(Struct):
+    op: str = ""
+
+
+def op_name(frame: bytes) -> str:
+    """Return the op of a request or reply; empty if it has none."""
+    try:
+        return codec_of(frame).decode(frame, type=_Head).op
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return ""
+
+
+class Ports:
+    """Where a relay, or the replay of a recording, listens.
+
+    Args:
+        host: Interface to bind.
+        keys: Key pair that clients must know the public half of; required unless the interface is loopback.
+
+    Raises:
+        ValueError: The interface can be reached by others, and there are no keys.
+    """
+
+    def __init__(self, host: str, keys: KeyPair | None) -> None:
+        if keys is None and not is_local(f"tcp://{host}"):
+            raise ValueError(f"{host} can be reached by others, so it needs a key (--listen-key)")
+        self.host = host
+        self._keys = keys
+        self.context: zmq.Context[Socket] = zmq.Context()
+
+    def bind(self, kind: int, port: int = 0) -> tuple[Socket, int]:
+        """Return a bound socket and its port."""
+        socket = self.context.socket(kind)
+        socket.linger = 0
+        if self._keys is not None:
+            socket.curve_server = True
+            socket.curve_publickey = self._keys.public
+            socket.curve_secretkey = self._keys.secret
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        socket.ipv6 = ":" in self.host
+        try:
+            if port:
+                socket.bind(f"tcp://{host}:{port}")
+                return socket, port
+            return socket, socket.bind_to_random_port(f"tcp://{host}")
+        except zmq.ZMQError as error:
+            socket.close()
+            raise OSError(f"{host}:{port} cannot be bound: {error}") from error
+
+    def told(self, port: int) -> str:
+        """Return the endpoint of a port as replies name it: clients put in the host that they know."""
+        return f"tcp://0.0.0.0:{port}"
+
+
+class Service:
+    """A thread that answers at ports of its own, until it is closed or fails.
+
+    Attributes:
+        port: Port for requests.
+        failure: Why it ended; None while it runs.
+    """
+
+    def __init__(self, name: str, ports: Ports, port: int) -> None:
+        self.failure: URLabError | None = None
+        self._ports = ports
+        self._poller = zmq.Poller()
+        self._front, self.port = ports.bind(zmq.ROUTER, port)
+        self._stop = ports.context.socket(zmq.PAIR)
+        self._stop.bind(_STOP)
+        for socket in (self._front, self._stop):
+            self._poller.register(socket, zmq.POLLIN)
+        self._ended = threading.Event()
+        self._thread = background_thread(name, self._run, failed=self._fail)
+
+    def take(self, socket: Socket) -> None:
+        """Take what has come to a socket; called on the thread."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        stop = self._ports.context.socket(zmq.PAIR)
+        stop.connect(_STOP)
+        stop.send(b"")
+        self._ended.wait()  # an interrupted `Thread.join` takes the thread for ended
+        self._ports.context.destroy(linger=0)
+
+    def join(self) -> None:
+        """Wait until it fails or is closed."""
+        while not self._ended.wait(0.2):  # so that Ctrl-C is seen everywhere
+            pass
+        if self.failure is not None:
+            raise self.failure
+
+    def _fail(self, error: URLabError) -> None:
+        self.failure = error
+
+    def _run(self) -> None:
+        try:
+            while True:
+                for socket, _ in self._poller.poll():
+                    if socket is self._stop:
+                        return
+                    self.take(cast("Socket", socket))
+        finally:
+            self._ended.set()
+
+
+class Relay(Service):
+    """Relays between clients and the server at an address, in a thread of its own.
+
+    Args:
+        endpoint: RPC endpoint of the server, with its port.
+        keys: Keys of the server, if it needs any.
+        server_state_port: Port of the server's state stream, if its handshake tells none.
+        ports: Where to listen.
+        port: Port for requests; 0 for any.
+        state_port: Port for the state stream; 0 for any.
+
+    Attributes:
+        state_port: Port for the state stream.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        keys: ClientKeys | None,
+        server_state_port: int,
+        ports: Ports,
+        *,
+        port: int = 0,
+        state_port: int = 0,
+    ) -> None:
+        super().__init__("urlab-relay", ports, port)
+        self._host = endpoint.partition("://")[2].rpartition(":")[0]
+        self._keys = keys
+        self._back = self._connected(zmq.DEALER, endpoint)
+        self._poller.register(self._back, zmq.POLLIN)
+        self._pairs: dict[Socket, tuple[Socket, str]] = {}
+        self._cameras: dict[str, int] = {}
+        self._pending: dict[tuple[bytes, ...], tuple[bytes, float, int]] = {}
+        self._state, self.state_port = self._publisher(f"tcp://{self._host}:{server_state_port}", "state", state_port)
+        self._state_ports = {server_state_port}
+
+    # What a subclass does with it
+
+    def on_request(self, request: bytes) -> bytes:
+        """Return what the server gets; called on the relay's thread."""
+        return request
+
+    def on_exchange(self, passed: Passed) -> bytes:
+        """Return what the client gets; called on the relay's thread."""
+        return passed.reply
+
+    def on_message(self, source: str, topic: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
+        """Return what subscribers get; called on the relay's thread.
+
+        Args:
+            source: `state`, or `camera`.
+            topic: The topic.
+            payload: The payload.
+        """
+        return topic, payload
+
+    # Sockets
+
+    def _connected(self, kind: int, endpoint: str) -> Socket:
+        socket = self._ports.context.socket(kind)
+        socket.linger = 0
+        socket.heartbeat_ivl, socket.heartbeat_timeout = HEARTBEAT_MS, SILENCE_MS
+        if self._keys is not None:
+            self._keys.protect(socket)
+        socket.connect(endpoint)
+        return socket
+
+    def _publisher(self, endpoint: str, source: str, port: int = 0) -> tuple[Socket, int]:
+        """Relay a publisher; return the socket that it is connected with, and the port for subscribers."""
+        below = self._connected(zmq.XSUB, endpoint)
+        above, bound = self._ports.bind(zmq.XPUB, port)
+        self._pairs[below], self._pairs[above] = (above, source), (below, "")
+        for socket in (below, above):
+            self._poller.register(socket, zmq.POLLIN)
+        return below, bound
+
+    def take(self, socket: Socket) -> None:
+        """See `Service.take`."""
+        if socket is self._front:
+            self._take_requests()
+        elif socket is self._back:
+            self._take_replies()
+        else:
+            self._take_messages(socket)
+
+    def _take_requests(self) -> None:
+        with contextlib.suppress(zmq.Again):
+            while True:
+                *envelope, request = self._front.recv_multipart(zmq.NOBLOCK)
+                self._pending[tuple(envelope)] = request, time.perf_counter(), time.time_ns()
+                self._back.send_multipart([*envelope, self.on_request(request)])
+
+    def _take_replies(self) -> None:
+        with contextlib.suppress(zmq.Again):
+            while True:
+                *envelope, reply = self._back.recv_multipart(zmq.NOBLOCK)
+                request, began, at = self._pending.pop(tuple(envelope), (b"", time.perf_counter(), time.time_ns()))
+                op = op_name(request)
+                passed = Passed(op, request, reply, time.perf_counter() - began, at)
+                answer = self.on_exchange(passed)
+                if op in _PORTS:
+                    answer = with_ports(answer, self._own_ports)
+                self._front.send_multipart([*envelope, answer])
+
+    def _take_messages(self, socket: Socket) -> None:
+        other, source = self._pairs[socket]
+        with contextlib.suppress(zmq.Again):
+            while True:
+                frames = socket.recv_multipart(zmq.NOBLOCK)
+                if source and len(frames) == _MESSAGE:
+                    changed = self.on_message(source, frames[0], frames[1])
+                    if changed is None:
+                        continue
+                    frames = list(changed)
+                other.send_multipart(frames)
+
+    def _own_ports(self, place: dict[str, Any], name: str) -> None:
+        """Put the relay's own port in the place of the server's."""
+        if name == "zmq_endpoint":
+            endpoint = resolve_endpoint(str(place[name]), self._host)
+            if endpoint not in self._cameras:
+                self._cameras[endpoint] = self._publisher(endpoint, "camera")[1]
+            place[name] = self._ports.told(self._cameras[endpoint])
+        elif name == "state_port":
+            if int(place[name]) not in self._state_ports:
+                self._state_ports.add(int(place[name]))
+                self._state.connect(f"tcp://{self._host}:{int(place[name])}")
+            place[name] = float(self.state_port)
+        elif name == "step_port":
+            place[name] = float(self.port)
+
+
+_MESSAGE: Final = 2
+
+OwnPorts: TypeAlias = Callable[[dict[str, Any], str], None]
+
+
+def with_ports(reply: bytes, own: OwnPorts) -> bytes:
+    """Return a reply with other ports, and everything else as it was."""
+    try:
+        value = plain(reply)
+    except ValueError:
+        return reply
+    return codec_of(reply).encode(value) if _replace_ports(value, own) else reply
+
+
+def _replace_ports(place: Any, own: OwnPorts) -> bool:
+    """Replace the ports in a value; return whether there are any."""
+    changed = False
+    if isinstance(place, list):
+        for item in cast("list[Any]", place):
+            changed |= _replace_ports(item, own)
+    elif isinstance(place, dict):
+        fields = cast("dict[str, Any]", place)
+        for name, item in list(fields.items()):
+            if name in {"zmq_endpoint", "state_port", "step_port"}:
+                own(fields, name)
+                changed = True
+            elif name not in {"vfs_assets", "arts", "per_articulation"}:
+                changed |= _replace_ports(item, own)
+    return changed
+
+
+# Recordings
 
 
 class SessionWriter:
@@ -44,6 +343,9 @@ class SessionWriter:
     """
 
     def __init__(self, path: Path, *, images: bool = False) -> None:
+        need("mcap", extra="mcap")
+        from mcap.writer import Writer
+
         self.failure: URLabError | None = None
         self._images = images
         self._file = path.open("wb")
@@ -92,19 +394,19 @@ class SessionWriter:
 
 def without_pixels(reply: bytes) -> bytes:
     """Return a reply without the pixels of its pictures."""
-    if reply[:1] == b"{":
-        return reply
     try:
-        value = msgspec.msgpack.decode(reply)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+        value = plain(reply)
+    except ValueError:
         return reply
-    pictures = cast("dict[str, Any]", value).get("cameras") if isinstance(value, dict) else None
-    if not isinstance(pictures, dict):
-        return reply
-    for picture in cast("dict[str, Any]", pictures).values():
-        if isinstance(picture, dict) and "data" in picture:
-            picture["data"] = b""
-    return msgspec.msgpack.encode(value)
+    for picture in _pictures(value):
+        picture["data"] = b""
+    return codec_of(reply).encode(value)
+
+
+def _pictures(value: dict[str, Any]) -> list[dict[str, Any]]:
+    cameras = value.get("cameras")
+    found: list[Any] = list(cast("dict[str, Any]", cameras).values()) if isinstance(cameras, dict) else []
+    return [picture for picture in found if isinstance(picture, dict) and "data" in picture]
 
 
 class Recorded(Struct):
@@ -122,6 +424,10 @@ def read_session(path: Path) -> list[Recorded]:
     Raises:
         ValueError: The file is not one.
     """
+    need("mcap", extra="mcap")
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
     found: dict[int, Recorded] = {}
     try:
         with path.open("rb") as file:
@@ -141,7 +447,7 @@ def read_session(path: Path) -> list[Recorded]:
     return [found[number] for number in sorted(found)]
 
 
-class Replay:
+class Replay(Service):
     """Answers requests as a recorded server did, in a thread of its own.
 
     Equal requests get their replies in the recorded order, the last one again when there are no more. A request that
@@ -154,74 +460,35 @@ class Replay:
         state_port: Port for the state stream; 0 for any.
 
     Attributes:
-        port: Port for requests.
         state_port: Port for the state stream.
         unknown: Requests that the recording has no reply to, by op.
     """
 
     def __init__(self, session: list[Recorded], ports: Ports, *, port: int = 0, state_port: int = 0) -> None:
-        self.unknown: dict[str, int] = {}
-        self.failure: URLabError | None = None
-        self._ports = ports
-        self._front, self.port = ports.bind(zmq.ROUTER, port)
+        super().__init__("urlab-replay", ports, port)
+        self.unknown: Counter[str] = Counter()
         self._state, self.state_port = ports.bind(zmq.PUB, state_port)
-        self._cameras: dict[str, tuple[zmq.Socket[bytes], int]] = {}
+        self._cameras: dict[str, tuple[Socket, int]] = {}
         self._equal: dict[Any, deque[Recorded]] = defaultdict(deque)
         self._of_op: dict[str, deque[Recorded]] = defaultdict(deque)
         for row in session:
             self._equal[_key(row.request)].append(row)
             self._of_op[row.op].append(row)
-        self._stop = ports.context.socket(zmq.PAIR)
-        self._stop.bind("inproc://urlab-replay-stop")
-        self._ended = threading.Event()
-        self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        stop = self._ports.context.socket(zmq.PAIR)
-        stop.connect("inproc://urlab-replay-stop")
-        stop.send(b"")
-        self._ended.wait()  # an interrupted `Thread.join` takes the thread for ended
-        self._ports.context.destroy(linger=0)
-
-    def join(self) -> None:
-        """Wait until the replay fails or is closed."""
-        while not self._ended.wait(0.2):  # so that Ctrl-C is seen everywhere
-            pass
-        if self.failure is not None:
-            raise self.failure
-
-    def _fail(self, error: URLabError) -> None:
-        self.failure = error
-
-    def _run(self) -> None:
-        try:
-            self._serve()
-        finally:
-            self._ended.set()
-
-    def _serve(self) -> None:
-        poller = zmq.Poller()
-        poller.register(self._front, zmq.POLLIN)
-        poller.register(self._stop, zmq.POLLIN)
-        while True:
-            if self._stop in dict(poller.poll()):
-                return
-            *envelope, request = self._front.recv_multipart()
-            row = self._next(request)
-            if row is None:
-                op = op_name(request)
-                self.unknown[op] = self.unknown.get(op, 0) + 1
-                refusal = {"op": "error", "code": "unknown_op", "message": f"the recording has no reply to {op!r}"}
-                self._front.send_multipart([*envelope, msgspec.msgpack.encode(refusal)])
-                continue
-            self._front.send_multipart([*envelope, self._answer(row)])
-            for source, topic, payload in row.messages:
-                if source == "state":
-                    self._state.send_multipart([topic, payload])
+    def take(self, socket: Socket) -> None:
+        """See `Service.take`."""
+        *envelope, request = socket.recv_multipart()
+        row = self._next(request)
+        if row is None:
+            op = op_name(request)
+            self.unknown[op] += 1
+            refusal = {"op": "error", "code": "unknown_op", "message": f"the recording has no reply to {op!r}"}
+            socket.send_multipart([*envelope, msgspec.msgpack.encode(refusal)])
+            return
+        socket.send_multipart([*envelope, self._answer(row)])
+        for source, topic, payload in row.messages:
+            if source == "state":
+                self._state.send_multipart([topic, payload])
 
     def _next(self, request: bytes) -> Recorded | None:
         for rows in (self._equal.get(_key(request)), self._of_op.get(op_name(request))):
@@ -249,33 +516,28 @@ class Replay:
 
 
 def _key(request: bytes) -> Any:
-    codec = msgspec.json if request[:1] == b"{" else msgspec.msgpack
+    """Return what is equal for equal requests."""
     try:
-        value = codec.decode(request)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+        fields = plain(request)
+    except ValueError:
         return request
-    if not isinstance(value, dict):
-        return request
-    fields = {name: item for name, item in cast("dict[str, Any]", value).items() if name not in _VARIES}
-    return msgspec.json.encode(fields, order="deterministic")
+    kept = {name: item for name, item in fields.items() if name not in _VARIES}
+    return msgspec.json.encode(kept, order="deterministic")
 
 
 def _without_regions(reply: bytes) -> bytes:
     """Return a handshake that names no shared memory, which a recording has not."""
-    if reply[:1] == b"{":
-        return reply
-    value = msgspec.msgpack.decode(reply)
+    value = plain(reply)
     for place in (value, value.get("handshake_payload")):
         if isinstance(place, dict):
             for name in ("shm_session_dir", "shm_rpc"):
                 cast("dict[str, Any]", place).pop(name, None)
-    return msgspec.msgpack.encode(value)
+    return codec_of(reply).encode(value)
 
 
 def _with_black_pixels(reply: bytes) -> bytes:
     """Return a reply with black pixels in the place of those that were not kept."""
-    value = msgspec.msgpack.decode(reply)
-    pictures: dict[str, dict[str, Any]] = value.get("cameras") or {}
-    for picture in pictures.values():
+    value = plain(reply)
+    for picture in _pictures(value):
         picture["data"] = picture["data"] or bytes(4 * int(picture["width"]) * int(picture["height"]))
-    return msgspec.msgpack.encode(value)
+    return codec_of(reply).encode(value)

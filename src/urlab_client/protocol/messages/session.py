@@ -134,6 +134,10 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
         if self.arts is not None:
             self.per_articulation = self.arts
 
+    def __repr__(self) -> str:  # one line, without arrays and pixels
+        robots = ", ".join(self.per_articulation) or "no robots"
+        return f"<{type(self).__name__} step {self.step} at {self.time:.3f} s: {robots}>"
+
 
 class ReplayProgress(Serializable, Struct, kw_only=True):
     """Progress of a replay."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 from urlab_client.protocol.base import EulerDeg, Request
 from urlab_client.protocol.messages import debug, viewport
 from urlab_client.server.assets.actors import Actor
-from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.composition import actor_bounds
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
