@@ -227,12 +227,6 @@ def test_camera_with_header(name: str) -> None:
     assert vectors.encode_camera(frame.pixels, CameraMode.REAL).hex() == vector.decoded["pixels_hex"]
 
 
-def test_colours_travel_as_blue_green_red_and_opaque() -> None:
-    assert encode_camera(np.array([[[1, 2, 3], [4, 5, 6]]], np.uint8), CameraMode.REAL) == bytes(
-        [3, 2, 1, 255, 6, 5, 4, 255]
-    )
-
-
 def assert_header(header: shm.Header, decoded: dict[str, Any]) -> None:
     assert header.stride == decoded["buffer_stride"]
     assert header.n_buffers == decoded["n_buffers"]
