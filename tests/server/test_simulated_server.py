@@ -373,28 +373,6 @@ def test_names_as_the_plugin_gives_them(serve: Serve) -> None:
     assert [entry["prefix"] for entry in wire.hello()["articulations"]] == ["bot_C_0", "bot_C_1"]
 
 
-@pytest.mark.parametrize(
-    ("dialect", "given", "names"),
-    [
-        ("alpha", None, ["bot", "copy1_bot"]),
-        ("beta", None, ["bot_C_0", "bot_C_1"]),
-        ("beta", "model", ["bot", "copy1_bot"]),
-    ],
-)
-def test_the_beta_names_objects_as_the_plugin_unless_told_otherwise(
-    serve: Serve, dialect: str, given: str | None, names: list[str]
-) -> None:
-    """Beta statement 5.
-
-    Its section 4.3: `actor_name` is the engine's object name, with which compiled names begin; section 8.1 of the
-    editor's ops: names are `<stem>_C_<n>` with the smallest free n from 0.
-    """
-    wire = serve("bot", "bot", play=True, dialect=dialect, actor_names=given)
-    robots = wire.hello()["articulations"]
-    assert [robot.get("actor_name", robot["prefix"]) for robot in robots] == names
-    assert [robot["prefix"] for robot in robots] == ["bot", "copy1_bot"]
-
-
 def test_models_stand_side_by_side(serve: Serve) -> None:
     wire = serve("bot", "prop", "bot", "bot", play=True)
     boxes = [wire.ask("get_actor_bounds", target=name, components_only=True) for name in actor_rows(wire)]

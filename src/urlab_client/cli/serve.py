@@ -146,8 +146,9 @@ def add_arguments(parser: Parser) -> None:
     content.add_argument(
         "--actor-names",
         choices=("model", "plugin"),
-        help="names of robots in the compiled model: the MJCF model name, or names as the plugin assigns them, such as "
-        "robot_C_0 (default: model in the alpha, where these are also the robots' keys, and plugin in the beta)",
+        default="model",
+        help="keys of articulations: the MJCF model name, or names as the plugin assigns them, such as robot_C_0 "
+        "(default: model)",
     )
     physics = parser.add_argument_group("physics")
     physics.add_argument("--play", action="store_true", help="start a play session immediately")
