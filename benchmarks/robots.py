@@ -105,10 +105,10 @@ def recorded_of(path: Path, count: int = 1, *, mode: str = "direct", spoken: str
 
 def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
     """Return what else a server answers to whoever drives its robots, and a handshake that names no other ports."""
-    from urlab_client.protocol.messages.control import ClaimControl  # noqa: PLC0415  # older packages lack it
     from urlab_client.protocol.messages.runtime import SetPaused  # noqa: PLC0415
+    from urlab_client.protocol.registry import OPS  # noqa: PLC0415  # older packages lack this op
 
-    claim = ClaimControl(articulation=hello.articulations[0].prefix)
+    claim: Request[Any] = OPS["claim_control"].request(articulation=hello.articulations[0].prefix)
     plain = msgspec.msgpack.decode(floor.ask(encode_request(Hello(), "")))
     for elsewhere in ("instance", "shm_rpc"):
         plain.pop(elsewhere, None)

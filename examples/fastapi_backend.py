@@ -1,20 +1,20 @@
 """A robot behind FastAPI: one client serves all requests, state streams and events, and survives a server restart.
 
-Run: uvicorn fastapi_backend:app --app-dir examples --timeout-graceful-shutdown 3
+Run: uvicorn fastapi_backend:app --app-dir examples
 """
 
 import os
 from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 
-from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, Request, Response, WebSocket
 from fastapi.responses import JSONResponse
-from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
 
 from urlab_client import URLabConnectionError, URLabError
 from urlab_client.aio import URLabClient
+from urlab_client.integrations.forwarding import EventStream, forward
 from urlab_client.values.descriptions import ArticulationDescription, SceneDescription
 
 address = os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused")
@@ -57,15 +57,13 @@ async def move(robot: str, joints: dict[str, float]) -> Moved:
 @app.websocket("/states")
 async def states(browser: WebSocket) -> None:
     await browser.accept()
-    with suppress(WebSocketDisconnect):  # a slow browser gets fewer states; nothing queues up
-        async for snapshot in client.state_stream("latest", max_rate=60):
-            await browser.send_text(snapshot.to_json())
+    # A slow browser gets fewer states; nothing queues up.
+    await forward(client.state_stream("latest", max_rate=60, timeout=None), browser)
 
 
-@app.get("/events", response_class=EventSourceResponse)
-async def events() -> AsyncGenerator[ServerSentEvent]:
-    async for event in client.events():
-        yield ServerSentEvent(data=event.to_dict(), event=event.__struct_config__.tag)
+@app.get("/events")
+async def events() -> EventStream:
+    return EventStream(client.events())
 
 
 @app.exception_handler(URLabError)

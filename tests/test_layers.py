@@ -41,6 +41,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "_mujoco",
         "_platform",
         "aio",
+        "events",
         "keys",
         "protocol",
         "randomise",
@@ -51,7 +52,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync", "types"},
     "console": VALUES | {"_installation", "aio", "events", "integrations", "protocol", "types"},
     "web": VALUES | {"_installation", "aio", "console", "events", "integrations", "protocol", "types"},
-    "mcp": VALUES | {"_installation", "aio", "console", "protocol", "types", "web"},
+    "mcp": VALUES | {"_installation", "aio", "console", "integrations", "protocol", "types", "web"},
     "conformance": VALUES | {"_installation", "aio", "keys", "protocol"},
     "cli": VALUES
     | {
@@ -114,7 +115,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "transport",
         "streams",
         "faults",
-        "config",
         "core",
         "rpc",
         "handlers",

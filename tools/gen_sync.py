@@ -55,7 +55,7 @@ PLAN = Plan(
         "namespaces/[!_]*.py",
     ),
     root="URLabClient",
-    dropped=frozenset({"Namespace"}),
+    dropped=frozenset({"Namespace", "PublicDir"}),
     exposed=frozenset({"_data_lock"}),
     renames={
         "__aiter__": "__iter__",

@@ -47,6 +47,13 @@ RECORD = ".mutants"
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.toml")
 
 RECORDED = "not browser and not matrix"  # also what takes long: some of the code runs nowhere else
+DECLARED = (  # tests that read what modules declare, of which no coverage tells: for all that runs on import
+    "tests/test_declarations.py",
+    "tests/protocol/test_registry.py",
+    "tests/docs/test_docs_reference.py::test_it_is_current",
+    "tests/tools/test_gen_sync.py::test_the_checked_in_facade_is_current",
+    "tests/reference/test_reference.py",
+)
 TEST_S, RUN_S = 120, 900  # others use the machine, too
 MEMORY = 8 << 30  # a mutant may ask for more and more of it
 PASSED, FAILED = 0, 1  # exit codes of pytest
@@ -170,10 +177,9 @@ def covering(mutant: Mutant, known: Record) -> set[str]:
 
     These run its function or class, or lines with their names, or otherwise any line of its file.
     """
-    line, statements = mutant.line, (node for node in ast.walk(ast.parse(mutant.old)) if isinstance(node, ast.stmt))
-    around = [node for node in statements if node.lineno <= line <= (node.end_lineno or 0)]  # from the outside inwards
-    functions = [node for node in around if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    if functions and line >= functions[-1].body[0].lineno:
+    around = mutant.around
+    if not mutant.on_import:
+        line = mutant.line
         return known.running(mutant.file, [line]) or known.running(mutant.file, range(around[-1].lineno, line))
     named = [node for node in around if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)]
     names = {node.name for node in named}
@@ -223,6 +229,18 @@ class Mutant:
         return "".join(Path(self.file).relative_to(PACKAGE).parts[:-1][:1]) or "(top)"
 
     @property
+    def around(self) -> list[ast.stmt]:
+        """The statements that it is in, from the outside inwards."""
+        statements = (node for node in ast.walk(ast.parse(self.old)) if isinstance(node, ast.stmt))
+        return [node for node in statements if node.lineno <= self.line <= (node.end_lineno or 0)]
+
+    @property
+    def on_import(self) -> bool:
+        """Whether it runs when the module is imported: it is in the body of no function."""
+        functions = [node for node in self.around if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        return not functions or self.line < functions[-1].body[0].lineno
+
+    @property
     def diff(self) -> list[str]:
         """The lines that are changed, two around them, and their place."""
         return list(difflib.unified_diff(self.old.splitlines(), self.new.splitlines(), lineterm="", n=2))[2:]
@@ -260,7 +278,7 @@ def places(code: str) -> dict[int, list[list[Callable[[], str]]]]:
     untouched = (
         (m.Annotation() | m.Decorator() | m.Import() | m.ImportFrom())
         | m.Call(func=m.Name("len") | m.Name("isinstance") | m.Name("cast"))
-        | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger"))))
+        | m.Expr(value=m.Call(func=m.Attribute(value=m.Name("logger") | m.Name("log") | m.Name("_log"))))
         | m.If(test=m.Name("TYPE_CHECKING") | m.Comparison(left=m.Attribute(value=m.Name("sys"))))
         | m.Assign(targets=[m.AssignTarget(target=m.Name("__all__"))])
         | m.Assign(value=m.Call(func=m.Name("TypeVar") | m.Name("TypeVarTuple") | m.Name("ParamSpec")))
@@ -387,7 +405,8 @@ def main(argv: Sequence[str] | None = None, *, root: Path = ROOT, table: Path = 
             mutant.outcome = "equivalent"
         mutant.covering = len(tests := covering(mutant, known))
         chosen = in_order(tests, known.seconds, known.ways(mutant.file), arguments.seconds)
-        mutant.tests = list(arguments.tests) or chosen
+        declared = [test for test in DECLARED if mutant.on_import and (root / test.partition("::")[0]).is_file()]
+        mutant.tests = list(arguments.tests) or declared + chosen
     with tempfile.TemporaryDirectory(prefix="m") as folder, ThreadPoolExecutor(arguments.jobs) as pool:
         copies = Copies(root, Path(folder), arguments.jobs)
         for mutant in pool.map(copies.judge, drawn):

@@ -1,4 +1,4 @@
-"""All differences between the MuJoCo releases that this package supports: 3.8 and later.
+"""MuJoCo's layout of arrays, and all differences between the releases that this package supports: 3.8 and later.
 
 Each difference is detected by checking which attributes MuJoCo has; nothing compares version numbers. If an older
 release lacks a feature, this module works around it if possible; otherwise an error reports it.
@@ -33,6 +33,17 @@ Indices = NDArray[np.int32]
 MODEL_FILE = "model.xml"
 _ARCHIVE = "model.mjz"  # its stem is the name of the model inside
 _MARK_BYTES = 64  # larger than any placeholder
+
+
+QPOS_WIDTH = np.array([7, 4, 1, 1])  # by mjtJoint: free, ball, slide, hinge
+QVEL_WIDTH = np.array([6, 3, 1, 1])
+
+
+def spans(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -> NDArray[np.intp]:
+    """Concatenate the ranges [start, start + length)."""
+    lengths = lengths.astype(np.intp)
+    first = np.repeat(starts.astype(np.intp) - (np.cumsum(lengths) - lengths), lengths)
+    return first + np.arange(lengths.sum(), dtype=np.intp)
 
 
 # Since 3.11 an actuator may have several controls and forces; before, `nu` counted both actuators and controls.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeAlias, TypeVar
 
 __all__ = [
     "ActuatorType",
@@ -16,11 +16,15 @@ __all__ = [
     "CameraTiming",
     "ControlMode",
     "ControllerKind",
+    "EncodingName",
     "ObservationLevel",
+    "ObservationLevelName",
     "OutOfRange",
     "PIEState",
     "StepMode",
+    "StepModeName",
     "Transport",
+    "TransportName",
 ]
 
 E = TypeVar("E", bound=StrEnum)
@@ -45,6 +49,10 @@ LATER_MODE_NAMES: Final[Mapping[StepMode, str]] = {
     StepMode.PUPPET: "statepushed",
 }
 """Names of the modes on servers after the beta."""
+
+
+StepModeName: TypeAlias = Literal["auto", "direct", "puppet", "live"]
+"""A step mode, by name."""
 
 
 class ControlMode(StrEnum):
@@ -104,6 +112,10 @@ class ObservationLevel(StrEnum):
     FULL = "full"
 
 
+ObservationLevelName: TypeAlias = Literal["minimal", "standard", "full"]
+"""An observation level, by name."""
+
+
 class OutOfRange(StrEnum):
     """Handling of a set-point outside the range of its actuator. Client-side only."""
 
@@ -130,6 +142,13 @@ class Transport(StrEnum):
 
     ZMQ = "zmq"
     SHM = "shm"
+
+
+TransportName: TypeAlias = Literal["zmq", "shm"]
+"""A transport, by name."""
+
+EncodingName: TypeAlias = Literal["msgpack", "json"]
+"""An encoding of requests and replies, by name."""
 
 
 def known(enum: type[E], value: str) -> E | str:

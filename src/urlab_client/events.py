@@ -24,24 +24,24 @@ __all__ = [
 ]
 
 
-class ClientEvent(StreamItem, tag_field="event", kw_only=True, omit_defaults=True):
+class ClientEvent(StreamItem, tag_field="event", kw_only=True):
     """Something that happened to a client's connection, session or play world; `recv_wall_time_ns` says when."""
 
 
-class ServerConnected(ClientEvent, tag="connected", kw_only=True, omit_defaults=True):
+class ServerConnected(ClientEvent, tag="connected", kw_only=True):
     """The first connection to the server was established."""
 
     endpoint: Annotated[str, doc("Endpoint of the server.")]
 
 
-class ServerLost(ClientEvent, tag="lost", kw_only=True, omit_defaults=True):
+class ServerLost(ClientEvent, tag="lost", kw_only=True):
     """The connection broke; it is being restored."""
 
     endpoint: Annotated[str, doc("Endpoint of the server.")]
     reason: Annotated[str, doc("Reason, as far as it is known.")] = ""
 
 
-class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True, omit_defaults=True):
+class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True):
     """The connection was restored, maybe to another server: the next call shows whether the session still exists."""
 
     endpoint: Annotated[str, doc("Endpoint of the server.")]
@@ -51,7 +51,7 @@ class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True, omit_defau
     ] = False
 
 
-class ServerSilent(ClientEvent, tag="silent", kw_only=True, omit_defaults=True):
+class ServerSilent(ClientEvent, tag="silent", kw_only=True):
     """A reply is overdue although the connection is up: the server is busy, blocked by a dialog, or stuck."""
 
     endpoint: Annotated[str, doc("Endpoint of the server.")]
@@ -59,14 +59,14 @@ class ServerSilent(ClientEvent, tag="silent", kw_only=True, omit_defaults=True):
     waited_s: Annotated[float, doc("Seconds spent waiting for the reply.")]
 
 
-class ServerAnswers(ClientEvent, tag="answers", kw_only=True, omit_defaults=True):
+class ServerAnswers(ClientEvent, tag="answers", kw_only=True):
     """A server that was silent answers again."""
 
     endpoint: Annotated[str, doc("Endpoint of the server.")]
     silent_s: Annotated[float, doc("Seconds since the unanswered request.")]
 
 
-class SessionOpened(ClientEvent, tag="session_opened", kw_only=True, omit_defaults=True):
+class SessionOpened(ClientEvent, tag="session_opened", kw_only=True):
     """A handshake was answered."""
 
     session_id: Annotated[str, doc("Id of the new session.")]
@@ -74,14 +74,14 @@ class SessionOpened(ClientEvent, tag="session_opened", kw_only=True, omit_defaul
     mujoco_version: Annotated[str, doc("MuJoCo version of the server.")]
 
 
-class SessionLost(ClientEvent, tag="session_lost", kw_only=True, omit_defaults=True):
+class SessionLost(ClientEvent, tag="session_lost", kw_only=True):
     """The server no longer knows the session; call `discover()`."""
 
     session_id: Annotated[str, doc("Id of the lost session.")]
     reason: Annotated[str, doc("The server's message.")] = ""
 
 
-class PlayStarted(ClientEvent, tag="play_started", kw_only=True, omit_defaults=True):
+class PlayStarted(ClientEvent, tag="play_started", kw_only=True):
     """A play world is ready."""
 
     articulations: Annotated[
@@ -89,13 +89,13 @@ class PlayStarted(ClientEvent, tag="play_started", kw_only=True, omit_defaults=T
     ] = msgspec.field(default_factory=list[str])
 
 
-class PlayEnded(ClientEvent, tag="play_ended", kw_only=True, omit_defaults=True):
+class PlayEnded(ClientEvent, tag="play_ended", kw_only=True):
     """The play world has ended."""
 
     reason: Annotated[str, doc("What ended it, as far as this client knows.")] = ""
 
 
-class TaskFailed(ClientEvent, tag="task_failed", kw_only=True, omit_defaults=True):
+class TaskFailed(ClientEvent, tag="task_failed", kw_only=True):
     """A background task or thread of this client ended unexpectedly; the log has the details."""
 
     task: Annotated[str, doc("Its name, such as `urlab-keeper`, which keeps the session.")]

@@ -26,6 +26,7 @@ from urlab_client.protocol.messages.streams import (
     RowSample,
     StateSnapshot,
     StreamPolicy,
+    StreamPolicyName,
     StreamStats,
 )
 from urlab_client.values.descriptions import (
@@ -113,6 +114,7 @@ __all__ = [
     "SimOptions",
     "StateSnapshot",
     "StreamPolicy",
+    "StreamPolicyName",
     "StreamStats",
     "URLabAsset",
     "URLabBlueprint",

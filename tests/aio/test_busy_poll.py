@@ -75,53 +75,66 @@ def test_ops_that_take_long_are_not_looked_for_until_one_is_quick_again() -> Non
     assert looks.pays("reset")
 
 
-@pytest.mark.parametrize(("awake_s", "asleep_s", "often"), [(100e-6, 150e-6, True), (60e-6, 55e-6, False)])
-def test_the_loop_stays_awake_where_that_has_proved_quicker(awake_s: float, asleep_s: float, often: bool) -> None:
-    looks = BusyPoll(SHORTEST, LONGEST)
+class Machine:
+    """Answers steps by a clock of its own: each takes what the way of waiting takes at that time."""
 
-    def ask() -> bool:
-        awake = looks.pays("step")
-        looks.note("step", awake_s if awake else asleep_s, awake=awake)
+    def __init__(self, looks: BusyPoll, awake_s: float, asleep_s: float) -> None:
+        self.looks, self.awake_s, self.asleep_s = looks, awake_s, asleep_s
+
+    def steps(self, count: int) -> list[bool]:
+        """Return whether the loop stayed awake for each of so many steps."""
+        awake: list[bool] = []
+        for _ in range(count):
+            awake.append(self.looks.pays("step"))
+            self.looks.note("step", self.awake_s if awake[-1] else self.asleep_s, awake=awake[-1])
         return awake
 
-    for _ in range(20):
-        ask()
-    chosen = [ask() for _ in range(10_000)]
-    assert 0 < chosen.count(not often) < 50, "now and then it does the other thing, to find out"
+
+@pytest.mark.parametrize(
+    ("awake_s", "asleep_s", "often", "trials"), [(100e-6, 150e-6, True, 50), (60e-6, 55e-6, False, 500)]
+)
+def test_the_loop_stays_awake_where_that_has_proved_quicker(
+    awake_s: float, asleep_s: float, often: bool, trials: int
+) -> None:
+    machine = Machine(BusyPoll(SHORTEST, LONGEST), awake_s, asleep_s)
+    machine.steps(20)
+    assert 0 < machine.steps(10_000).count(not often) < trials, "now and then it does the other thing, to find out"
 
 
 def test_it_learns_that_waking_up_has_become_quick() -> None:
-    looks, asleep_s = BusyPoll(SHORTEST, LONGEST), 150e-6
-    for i in range(5000):
-        awake = looks.pays("step")
-        if i == 2500:
-            assert awake
-            asleep_s = 50e-6
-        looks.note("step", 100e-6 if awake else asleep_s, awake=awake)
-    assert not looks.pays("step")
+    machine = Machine(BusyPoll(SHORTEST, LONGEST), 100e-6, 150e-6)
+    assert machine.steps(2500)[-1]
+    machine.asleep_s = 50e-6
+    assert not machine.steps(2500)[-1]
 
 
 def test_it_learns_that_waking_up_has_become_slow() -> None:
-    looks, asleep_s, awake_s = BusyPoll(SHORTEST, LONGEST), 55e-6, 600e-6
-    for i in range(5000):
-        awake = looks.pays("step")
-        if i == 2500:
-            assert not awake
-            asleep_s, awake_s = 150e-6, 100e-6
-        looks.note("step", awake_s if awake else asleep_s, awake=awake)
-    assert looks.pays("step")
+    machine = Machine(BusyPoll(SHORTEST, LONGEST), 600e-6, 55e-6)
+    assert not machine.steps(2500)[-1]
+    machine.awake_s, machine.asleep_s = 100e-6, 150e-6
+    assert machine.steps(2500)[-1]
+
+
+@pytest.mark.parametrize("disturbed_steps", [1, 5, 40, 300, 5000])
+@pytest.mark.parametrize("slower", [(30, 1), (30, 30), (5, 2), (200, 1), (200, 200)])
+def test_after_a_disturbance_it_stays_awake_again_within_a_hundred_steps(
+    disturbed_steps: int, slower: tuple[float, float]
+) -> None:
+    machine = Machine(BusyPoll(SHORTEST, LONGEST), 100e-6, 150e-6)
+    machine.steps(2000)
+    machine.awake_s, machine.asleep_s = 100e-6 * slower[0], 150e-6 * slower[1]
+    machine.steps(disturbed_steps)
+    machine.awake_s, machine.asleep_s = 100e-6, 150e-6
+    machine.steps(100)
+    assert machine.steps(100).count(True) > 90
 
 
 async def test_finding_out_takes_no_longer_than_the_reply_would_take() -> None:
     looks, asleep_s = BusyPoll(30.0, 30.0), 0.001
-    for _ in range(5000):
-        if looks.pays("step"):
-            break
-        looks.note("step", asleep_s, awake=False)
-    assert looks.pays("step")
-    for _ in range(20):  # the first ones stay awake
-        looks.note("step", 20 * asleep_s, awake=True)
-        looks.note("step", asleep_s, awake=False)
+    machine = Machine(looks, 20 * asleep_s, asleep_s)
+    assert not machine.steps(20)[-1]
+    while not looks.pays("step"):
+        machine.steps(1)
     reply = asyncio.get_running_loop().create_future()
     async with asyncio.timeout(10):
         await looks.look("step", reply, lambda: None)

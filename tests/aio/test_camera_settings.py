@@ -182,11 +182,21 @@ async def test_a_camera_of_the_simulated_server_is_late(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [-0.1, math.nan, CameraDelay(jitter_s=-1), CameraDelay(clock="sun"), CameraDelay(max_fps=math.inf)]
+    ("bad", "problem"),
+    [
+        (-0.1, ": delay_s must be at least 0, got -0.1"),
+        (math.nan, " takes a finite number"),
+        (CameraDelay(jitter_s=-1), ": jitter_s must be at least 0, got -1"),
+        (CameraDelay(clock="sun"), ": clock must be 'sim' or 'wall', not 'sun'"),
+        (CameraDelay(max_fps=math.inf), ": max_fps takes a finite number"),
+        (CameraDelay(max_fps=-1), ": max_fps must be at least 0, got -1"),
+    ],
 )
-async def test_latencies_that_cannot_be(client: URLabClient, beta: ScriptedBeta, bad: float | CameraDelay) -> None:
+async def test_latencies_that_cannot_be(
+    client: URLabClient, beta: ScriptedBeta, bad: float | CameraDelay, problem: str
+) -> None:
     beta.arrived()
-    with pytest.raises(ValueError, match="arm_a/wrist"):
+    with pytest.raises(ValueError, match=f"camera 'arm_a/wrist'{problem}"):
         await client.runtime.set_camera_delay({"arm_a/wrist": bad})
     assert beta.arrived() == []
 

@@ -16,7 +16,7 @@ from urlab_client import ControlClaimed, NotControlOwner
 from urlab_client.aio import URLabClient
 from urlab_client.aio.session.control import process_owner
 from urlab_client.errors import UnknownArticulation
-from urlab_client.protocol.messages.control import ReleaseControl
+from urlab_client.protocol.messages.runtime import ReleaseControl
 
 OURS = process_owner()
 

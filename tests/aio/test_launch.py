@@ -362,7 +362,8 @@ def test_no_address_opens_a_server_to_others(flavour: Any, option: str) -> None:
 
 @pytest.mark.parametrize("address", ["sim://--host=0.0.0.0", "sim://arm?model=--until-eof", "sim://arm?model="])
 def test_what_an_address_names_as_a_model_is_no_option(address: str) -> None:
-    with pytest.raises(ValueError, match="names no model"):
+    option = address.partition("--")[2] and f" but the option '--{address.partition('--')[2]}'"
+    with pytest.raises(ValueError, match=f"names no model{option}; write for example sim://arm"):
         URLabClient(address)
 
 

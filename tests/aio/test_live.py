@@ -302,10 +302,12 @@ class TestOnRequest:
         await publisher.subscribed(STATE, TOPIC, b"arm0/", b"scene/")
         await client.close()
         for reader in readers:
-            with pytest.raises(ClientClosed):
+            with pytest.raises(StopAsyncIteration):
                 await reader
-        with pytest.raises(ClientClosed):
-            client.events()
+        camera = client.articulations["arm0"].cameras["wrist"]
+        for begin in (client.state_stream, client.row_stream, client.events, camera.frames):
+            with pytest.raises(ClientClosed):
+                begin()
 
 
 class TestBlocking:
@@ -333,25 +335,19 @@ class TestBlocking:
             assert states.stats.delivered == 500
             assert list(states) == []
 
-    def test_closing_the_client_wakes_a_reader_in_another_thread(
+    def test_closing_the_client_ends_an_iteration_in_another_thread(
         self, plugin: Plugin, options: dict[str, Any], publisher: Publisher
     ) -> None:
         client = urlab_client.URLabClient("tcp://127.0.0.1", **options)
         stream = client.state_stream()
-        ended: list[BaseException] = []
-
-        def read() -> None:
-            try:
-                next(stream)
-            except ClientClosed as error:
-                ended.append(error)
-
-        reader = threading.Thread(target=read)
-        reader.start()
-        asyncio.run(publisher.subscribed(STATE))
-        client.close()
-        reader.join(DEADLINE_S)
-        assert len(ended) == 1
+        with ThreadPoolExecutor(1) as pool:
+            reader = pool.submit(list, stream)
+            asyncio.run(publisher.subscribed(STATE))
+            client.close()
+            assert reader.result(DEADLINE_S) == []
+        assert list(stream) == []
+        with pytest.raises(ClientClosed):
+            stream.receive()
         stream.close()
 
     def test_dropping_a_stream_stops_it(self, plugin: Plugin, options: dict[str, Any], publisher: Publisher) -> None:

@@ -328,6 +328,7 @@ async def test_defaults_rebind_every_joint(plugin: Any, connect: Any) -> None:
     [
         ({"kp": {"knee": 1.0}}, "kp: no actuator 'knee'; available: elbow, wrist"),
         ({"kp": 3.0}, "kp takes a mapping"),
+        ({"kp": {"elbow": "stiff"}}, r"kp\['elbow'\] takes a number"),
         ({"default_kv": -1}, "default_kv must be at least 0"),
         ({"default_kv": float("nan")}, "default_kv must be at least 0"),
         ({"default_kv": "stiff"}, "default_kv takes a number"),
@@ -342,6 +343,8 @@ async def test_bad_parameters_are_refused_before_sending(
         with pytest.raises(ControllerSchemaViolation, match=problem) as info:
             await client.articulations["robot"].controller.configure(**params)
         assert info.value.code == "controller_schema_violation"
+        assert info.value.message.startswith("robot: ")
+        assert info.value.message.endswith("Nothing was sent.")
         assert plugin.requests == []
 
 

@@ -23,8 +23,7 @@ from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client.aio.streams.events import EventBus
 from urlab_client.aio.streams.live_state import LiveState
-from urlab_client.aio.streams.rows import RowFilter, RowSource
-from urlab_client.aio.streams.sources import Camera, CameraSource, StateSource
+from urlab_client.aio.streams.sources import Camera, CameraSource, RowFilter, RowSource, StateSource
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.errors import (
@@ -735,12 +734,13 @@ class TestEnds:
             await asyncio.sleep(0)
             subscriptions.close()
             subscriptions.close()
-            with pytest.raises(ClientClosed):
+            with pytest.raises(StopAsyncIteration):
                 await reader
-            assert [(await anext(states)).time for _ in range(2)] == [1.0, -1.0]
+            assert [state.time async for state in states] == [1.0, -1.0]
             for _ in range(2):
+                assert [state async for state in states] == []
                 with pytest.raises(ClientClosed):
-                    await anext(states)
+                    await states.receive()
         with pytest.raises(ClientClosed):
             await latest(state).receive()
 
@@ -751,6 +751,14 @@ class TestEnds:
         await publisher.subscribed(STATE)
         del states
         gc.collect()
+        await publisher.subscribed()
+
+    async def test_a_closed_stream_of_pictures_stops_receiving(
+        self, publisher: Publisher, subscriptions: Subscriptions
+    ) -> None:
+        camera = camera_at(f"tcp://127.0.0.1:{publisher.port}")
+        async with latest(CameraSource(subscriptions, camera, lambda: "127.0.0.1")):
+            await publisher.subscribed(b"arm0/camera/wrist ")
         await publisher.subscribed()
 
     async def test_a_stream_stays_with_its_loop(self, publisher: Publisher, state: StateSource) -> None:
@@ -796,9 +804,7 @@ class TestEvents:
         events = bus.stream((), 3)
         bus.publish(ServerLost(endpoint="tcp://lab"))
         bus.close()
-        assert isinstance(await anext(events), ServerLost)
-        with pytest.raises(ClientClosed):
-            await anext(events)
+        assert [type(event) async for event in events] == [ServerLost]
         with pytest.raises(ClientClosed):
             bus.stream((), 3)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from children import DEADLINE_S, in_background
 from forked import COMMAND, program
+from ports import free_port
 from relay import Relay
 from waiting import eventually, until
 
@@ -121,3 +122,12 @@ async def test_in_the_background_only_sigterm_ends_it() -> None:
         assert not stop.is_set()
         signal.raise_signal(signal.SIGTERM)
         await asyncio.wait_for(stop.wait(), DEADLINE_S)
+
+
+def test_record_says_that_it_waits_for_the_server(tmp_path: Path) -> None:
+    address = f"tcp://127.0.0.1:{free_port()}"
+    with program(COMMAND, "record", address, "run.mcap", cwd=tmp_path) as recording:
+        assert recording.stderr is not None
+        assert recording.stderr.readline() == f"waiting for the server at {address} …\n"
+        recording.send_signal(signal.SIGTERM)
+        recording.communicate(timeout=DEADLINE_S)

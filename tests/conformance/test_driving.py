@@ -527,3 +527,15 @@ async def test_gains(connect: Any, serve: Any) -> None:
         with pytest.raises(ControllerSchemaViolation, match="at least 0"):
             await controller.set_defaults(kp=-1)
         assert (await controller.refresh())["kp"][joint] == 60.0
+
+
+@pytest.mark.parametrize(("asked", "told"), [(9999, True), (0, True), (33.3, False), (50, False)])
+async def test_a_speed_that_the_engine_clamps_is_told(
+    connect: Any, serve: Any, asset: Any, caplog: pytest.LogCaptureFixture, asked: float, told: bool
+) -> None:
+    with serve(asset("ant.xml"), play=True) as server:
+        client = connect(server)
+        await client.discover()
+        in_force = await client.runtime.set_sim_speed(asked)
+    assert in_force == pytest.approx(min(max(asked, 5), 100))
+    assert ("set_sim_speed" in caplog.text) == told

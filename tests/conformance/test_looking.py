@@ -54,6 +54,7 @@ def read(thing: Any, seen: dict[int, Any]) -> None:
             read(one, seen)
         return
     repr(thing)
+    getattr(thing, "_repr_html_", str)()  # as in a notebook
     ours = type(thing).__module__.startswith(("urlab_client.aio", "urlab_client.sync"))
     for name in dir(thing) if ours and not isinstance(thing, np.ndarray) else ():
         value = None if name.startswith("_") else getattr(thing, name)
@@ -61,6 +62,25 @@ def read(thing: Any, seen: dict[int, Any]) -> None:
             read(value, seen)
         elif name in READING:
             value()
+
+
+async def test_private_attributes_are_not_offered_for_completion(connect: Any, serve: Any, pile: str) -> None:
+    with serve(pile, play=True) as server:
+        client = connect(server)
+        await client.discover()
+        robot = next(iter(client.articulations.values()))
+        handles = [
+            handle(client),
+            client.sim,
+            robot,
+            *robot.joints.values(),
+            *robot.cameras.values(),
+            client.state_stream(),
+        ]
+        for thing in handles:
+            offered = dir(thing)
+            assert [name for name in offered if name.startswith("_") and not name.startswith("__")] == []
+            assert {name for name in vars(type(thing)) if not name.startswith("_")} <= set(offered)
 
 
 def handle(client: Any) -> Any:
@@ -199,8 +219,7 @@ async def test_discovering_changes_nothing_in_the_world_of_another(connect: Any,
 
 
 async def test_a_request_of_the_caller_stays_as_it_is(connect: Any, serve: Any) -> None:
-    from urlab_client.protocol.messages.control import ClaimControl
-    from urlab_client.protocol.messages.runtime import GetContacts
+    from urlab_client.protocol.messages.runtime import ClaimControl, GetContacts
     from urlab_client.protocol.messages.session import Step
 
     with serve("arm", play=True) as server:

@@ -3,6 +3,7 @@
 A block may carry a directive, an HTML comment on the line above it, which readers do not see:
 
     <!-- test -->                        python block: a test file, run by pytest
+    <!-- file: FILE -->                  python block: a file that later commands of the page read
     <!-- needs: EXTRA -->                python block: run where the extra is installed, apart from the others
     <!-- as is: REASON -->               text block that is not an output: why it does not run
 
@@ -25,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 _FENCE = re.compile(r"^```(?P<language>\S*)\s*$")
-_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:test|use|needs:|as is:|append:|insert:|shows:).*?) -->$")
+_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:test|use|file:|needs:|as is:|append:|insert:|shows:).*?) -->$")
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ NOT_RUN = {
     r"urlab (conformance|tap)\b": "goes to an editor: tests/conformance and tests/cli run both",
     r"pytest tests/conformance --address": "goes to an editor",
     r"urlab mcp ": "tests/mcp run it",
+    r"(uvicorn service:backend|curl -s localhost:8000/)": "test_docs_tutorials.py serves and asks it",
     r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
     r"(python examples/clone_behaviour.py|urlab (evaluate|run-policy) clone/)": "takes long: "
     "tests/examples/test_clone_behaviour.py runs its short form",

@@ -46,6 +46,8 @@ LONG = {
     "docs/start.md",
     "docs/tasks.md",
     "docs/teleoperation.md",
+    "docs/tutorials/cameras.md",
+    "docs/tutorials/learning.md",
     "docs/tutorials/policy.md",
 }
 """Pages whose code takes several seconds."""
@@ -172,7 +174,7 @@ def test_no_block_is_left_out() -> None:
     for block in every_block():
         kind = block.directive.partition(":")[0]
         if block.language == "python":
-            assert kind in {"", "test", "needs", "use", "append", "insert", "shows"}, f"{block} does not run"
+            assert kind in {"", "test", "file", "needs", "use", "append", "insert", "shows"}, f"{block} does not run"
             assert kind != "needs" or block.directive in {"needs: ray", "needs: view"}, f"{block}: nothing runs it"
         elif block.language == "text":
             assert kind in {"as is", "append"}, f"{block} is nobody's output: say why, `<!-- as is: REASON -->`"

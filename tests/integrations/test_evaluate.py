@@ -171,8 +171,8 @@ def test_the_command_states_rates_and_every_episode(capsys: pytest.CaptureFixtur
     assert said["success_rate"]["value"] == 1.0
     assert said["mean_actions"]["value"] == 10
     for arguments, reason in (
-        (["--task", "urlab/Swim-v0"], "no task is called 'urlab/Swim-v0'; there are: urlab/Arm-v0"),
-        (["--task", "urlab/Reach-v0"], "quadruped.onnx has 38 inputs, but urlab/Reach-v0 has 22"),
+        (["--task", "urlab/Swim-v0"], "--task: 'urlab/Swim-v0' is not a task. Did you mean 'urlab/Arm-v0'"),
+        (["--task", "urlab/Reach-v0"], "quadruped.onnx has 38 inputs, but the task has 22"),
         (["--task", "urlab/Reach-v0", "--seconds", "3"], "--seconds cannot be combined with --task"),
         (["--randomise", "nope.toml"], "--randomise: "),
         (["--confidence", "95"], "--confidence must be between 0 and 1"),

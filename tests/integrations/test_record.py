@@ -165,6 +165,13 @@ def test_poses_joint_states_and_contacts_are_those_of_the_state(
             client.step(n_steps=5)
     found = messages(tmp_path / "run.mcap")
     kinds = {topic: schema for topic, schema, _, _ in found}
+    for topic, _, log_time, content in found:
+        (stamp,) = {
+            (at["sec"], at["nsec"])
+            for part in (content, *content.get("transforms", ()))
+            if (at := part.get("timestamp"))
+        }
+        assert stamp == divmod(log_time, 10**9), topic
     assert kinds["/tf"] == "foxglove.FrameTransforms"
     assert kinds["/joint_states"] == "foxglove.JointStates"
     poses = [content for topic, _, _, content in found if topic == "/tf"]
@@ -240,10 +247,21 @@ def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path:
     with pytest.raises(KeyError, match="arm/wrist"), record(client, path, cameras=["nose"]):
         pass
     stranger = urlab_client.URLabClient("tcp://127.0.0.1:1")
-    with pytest.raises(urlab_client.URLabError, match="discover"), record(stranger, path):
+    with pytest.raises(urlab_client.URLabError, match="discover") as early, record(stranger, path):
         pass
+    assert early.value.hint == "Call discover() first, during play."
     stranger.close()
     assert not path.exists()
+
+
+def test_a_recorder_records_once(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    recorder = record(client, tmp_path / "run.mcap")
+    with pytest.raises(urlab_client.URLabError, match="No recording is under way") as early:
+        recorder.mark("success")
+    assert early.value.hint == "Call mark() inside the block."
+    with recorder, pytest.raises(urlab_client.URLabError, match="A recorder records once") as twice, recorder:
+        pass
+    assert twice.value.hint == "Call record() again."
 
 
 # Pictures

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import sys
@@ -469,6 +470,15 @@ def test_curves_in_one_place_can_be_told_apart(tmp_path: Path) -> None:
     assert none == 0
     assert 0.3 < twin / shared < 3
     assert 0.7 < (shared + twin) / alone < 1.3
+
+
+def test_rounding_noise_is_drawn_as_one_straight_line(tmp_path: Path) -> None:
+    time = np.linspace(0, 1, 50)
+    noise = 1e-14 * np.stack([np.sin(40 * time), np.cos(40 * time)], axis=1)
+    plot_curves("", time, [Curves("q", ["a", "b"], noise)], tmp_path / "plot.svg")
+    said = re.findall("<!-- (.*) -->", (tmp_path / "plot.svg").read_text(encoding="utf-8"))
+    assert "b (like a)" in said, "the legend names the curve that covers another"
+    assert not [text for text in said if "14" in text], "no axis is scaled to the noise"
 
 
 def test_record_says_that_no_picture_came(

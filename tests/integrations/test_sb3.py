@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics, RescaleAction
 
 from urlab_client.integrations.gym import Reach, URLabBatchEnv
 
@@ -76,6 +77,32 @@ def test_episodes_end_as_the_library_expects_it(adapter: Any, batch: Callable[..
         assert info["TimeLimit.truncated"]
     again, _ = plain.reset(options={"reset_mask": truncated})
     assert np.array_equal(observations, again)
+    envs.close()
+    plain.close()
+
+
+def test_wrappers_of_gymnasium_stand_between(adapter: Any, batch: Callable[..., URLabBatchEnv]) -> None:
+    """Actions from -1 to 1 mean the whole range; the episode's statistics arrive with its end."""
+    ours, plain = (batch(autoreset_mode=mode) for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
+    wrapped = RecordEpisodeStatistics(RescaleAction(ours, np.float32(-1.0), np.float32(1.0)))
+    envs = adapter.Sb3VecEnv(wrapped)
+    assert envs.action_space.high.tolist() == [1.0] * 7
+    envs.seed(4)
+    envs.reset()
+    plain.reset(seed=4)
+    low, high = plain.single_action_space.low, plain.single_action_space.high  # type: ignore[attr-defined]
+    total = np.zeros(3)
+    for _ in range(2):
+        envs.step_async(np.full((3, 7), 0.5, dtype=np.float32))
+        _, rewards, ended, infos = envs.step_wait()
+        _, expected, *_ = plain.step(np.tile(low + 0.75 * (high - low), (3, 1)))
+        np.testing.assert_allclose(rewards, expected, rtol=1e-4)
+        total += rewards
+    assert ended.all()
+    for i, info in enumerate(infos):
+        assert info["episode"]["l"] == 2
+        assert info["episode"]["r"] == pytest.approx(total[i], rel=1e-5)
+        assert info["terminal_observation"].shape == envs.observation_space.shape
     envs.close()
     plain.close()
 

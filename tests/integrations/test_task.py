@@ -12,6 +12,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from urlab_client.integrations.gym import (
+    EpisodeEnd,
     FixedReach,
     Push,
     PushPictures,
@@ -121,7 +122,7 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(arms: 
         """Targets where the hand rests."""
 
         def __init__(self) -> None:
-            self.ends: list[tuple[bool, int]] = []
+            self.ends: list[EpisodeEnd] = []
 
         def reset(self, rng: np.random.Generator, start: Start) -> None:
             data = self.scene.data
@@ -129,8 +130,8 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(arms: 
             mujoco.mj_kinematics(self.scene.model, data)
             start.goal["target"] = data.site_xpos[self.scene.id("site", "arm/grip")] + rng.choice([0.0, 0.5])
 
-        def ended(self, success: bool, steps: int) -> None:
-            self.ends.append((success, steps))
+        def ended(self, episode: EpisodeEnd) -> None:
+            self.ends.append(episode)
 
     task = Near()
     env = URLabBatchEnv(arms[0], 4, task=task, max_episode_steps=2)
@@ -140,12 +141,17 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(arms: 
     assert 0 < near.sum() < 4
     assert told["success"].tolist() == near.tolist()
     still = np.zeros(env.action_space.shape, dtype=np.float32)
+    totals = np.zeros(4)
     for _ in range(2):
         _, rewards, _, truncated, infos = env.step(still)
+        totals += rewards
         assert infos["success"].tolist() == near.tolist()
         assert (rewards > 0).tolist() == near.tolist()
     assert truncated.all()
-    assert task.ends == [(bool(success), 2) for success in near]
+    for i, end in enumerate(task.ends):
+        assert (end.index, end.success, end.terminated, end.steps, end.total) == (i, near[i], False, 2, totals[i])
+        assert np.array_equal(end.goal["target"], observations[i, -6:-3])
+    assert len(task.ends) == 4
 
 
 def test_ended_is_told_the_length_of_its_own_episode(arms: list[str], made: list[Any]) -> None:
@@ -159,8 +165,8 @@ def test_ended_is_told_the_length_of_its_own_episode(arms: list[str], made: list
             self.acted += 1
             return self.acted == np.arange(3) + 2
 
-        def ended(self, success: bool, steps: int) -> None:
-            self.ends.append(steps)
+        def ended(self, episode: EpisodeEnd) -> None:
+            self.ends.append(episode.steps)
 
     task = Falls()
     env = URLabBatchEnv(arms[0], 3, task=task)

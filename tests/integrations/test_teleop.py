@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from children import child
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, eventually
 
 from urlab_client import URLabError
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
+from urlab_client.cli.teleop import _StatusLine, terminal_keys
 from urlab_client.integrations.gym import Reach
 from urlab_client.integrations.record import read_run, record, transitions_of
 from urlab_client.integrations.teleop import (
@@ -217,6 +220,53 @@ def test_keys_move_while_they_repeat() -> None:
     typed.append("wd\rr")
     assert operator(VIEW).verdict == "success"
     assert operator(VIEW).linear == (0.0, 0.0, 1.0)  # of the next episode
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a pseudo-terminal of Unix")
+def test_what_is_typed_is_read_without_waiting_and_the_terminal_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    import pty
+    import termios
+
+    keyboard, screen = pty.openpty()
+    try:
+        before = termios.tcgetattr(screen)
+        with open(screen, closefd=False, encoding="utf-8") as stdin:
+            monkeypatch.setattr("sys.stdin", stdin)
+            with terminal_keys() as read:
+                assert read() == ""
+                os.write(keyboard, "wä".encode())
+                assert eventually(read) == "wä"
+                assert termios.tcgetattr(screen) != before, "keys come at once, not by lines"
+        assert termios.tcgetattr(screen) == before
+    finally:
+        os.close(keyboard)
+        os.close(screen)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+async def test_a_line_on_the_terminal_says_how_it_goes(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: terminal)
+    monkeypatch.setattr("sys.stderr", screen)
+    view: Any = SimpleNamespace(
+        episode=2,
+        time=1.25,
+        position=np.array([0.1, -0.2, 0.3]),
+        goal={"target": np.array([0.5])},
+        success=True,
+        blocked=True,
+        tally=TeleopTally(success=1, failure=2, discarded=3),
+    )
+    unused, line = _StatusLine(), _StatusLine()
+    unused.end()
+    line.show(view)
+    line.show(view)  # so soon that nobody could read both
+    line.end()
+    text = (
+        "\repisode 2  1.2 s  hand +0.100 -0.200 +0.300  target +0.500  success  at the edge of reach  "
+        "[1 success, 2 failure, 3 discarded]\x1b[K\n"
+    )
+    assert screen.getvalue() == (text if terminal else "")
 
 
 @pytest.mark.long

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import io
+import json
 import math
 import time
 from collections.abc import AsyncGenerator, Iterator
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
@@ -16,7 +19,7 @@ from agents import ALL, Desk, desk, text_of
 from jsonschema import Draft202012Validator
 from mcp import Client
 from mcp.shared.exceptions import MCPError
-from mcp.types import Implementation
+from mcp.types import ElicitResult, Implementation
 from PIL import Image
 from waiting import until
 
@@ -58,7 +61,7 @@ async def direct(server: SimulatedServer) -> AsyncGenerator[Desk]:
 async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True, camera_size=(64, 48)) as server:
         async with desk(server, step_mode="live", recordings=tmp_path) as one:
-            robot = (await one.call("look"))["scene"]["articulations"][0]
+            robot = (await one.call("look"))["robots"][0]
             elbow = next(joint for joint in robot["joints"] if joint["name"] == "elbow")
             assert (elbow["unit"], elbow["kind"]) == ("rad", "hinge")
             target = round(elbow["limits"][0] / 2, 2)
@@ -72,7 +75,8 @@ async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_pat
             await one.call("play", action="resume")
             assert "settled" in (await one.call("move_to", **order))["done"]
 
-            camera = f"{robot['name']}/{robot['cameras'][0]['name']}"
+            camera = (await one.call("look"))["cameras"][0]
+            assert camera == "arm/overview"
             picture = await one.mcp.call_tool("picture", {"camera": camera, "size": 32})
             assert (picture.structured_content or {})["camera"] == camera
 
@@ -87,27 +91,25 @@ async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
     tools = {tool.name: tool for tool in (await direct.mcp.list_tools()).tools}
     for tool in tools.values():
         assert tool.description
-        assert tool.output_schema is not None
-        for schema in (tool.input_schema, tool.output_schema):
-            assert schema["type"] == "object"
-            Draft202012Validator.check_schema(schema)
-        assert {"sim_time", "step", "mode"} < set(tool.output_schema["properties"])
-        assert all(field.get("description") for field in tool.output_schema["properties"].values()), tool.name
+        assert tool.input_schema["type"] == "object"
+        Draft202012Validator.check_schema(tool.input_schema)
+    listed = json.dumps([tool.model_dump(mode="json", by_alias=True, exclude_none=True) for tool in tools.values()])
+    assert len(listed.encode()) <= 15_000, "an agent pays for this list with each of its conversations"
     hints = {name: tool.annotations for name, tool in tools.items()}
     assert all(hint is not None and hint.open_world_hint is False for hint in hints.values())
     assert {name for name, hint in hints.items() if hint and hint.read_only_hint} == {
-        "look", "state", "picture", "contacts", "explain", "log",
+        "look", "state", "picture", "contacts", "explain", "log", "hand_pose",
     }  # fmt: skip
-    assert {name for name, hint in hints.items() if hint and hint.destructive_hint} == {"reset", "play", "remove"}
-    assert {name for name, hint in hints.items() if hint and not hint.idempotent_hint} == {
-        "log", "run", "record", "import_model", "spawn",
+    assert {name for name, hint in hints.items() if hint and hint.destructive_hint} == {
+        "reset", "play", "apply_scene", "move", "remove",
     }  # fmt: skip
+    assert {name for name, hint in hints.items() if hint and not hint.idempotent_hint} == {"log", "run", "record"}
 
 
 async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> None:
     async with desk(server, Limits()) as one:
         names = {tool.name for tool in (await one.mcp.list_tools()).tools}
-        assert names == {"look", "state", "picture", "contacts", "explain", "log"}
+        assert names == {"look", "state", "picture", "contacts", "explain", "log", "hand_pose"}
         before = await one.call("state", robot="arm")
         assert "--allow-drive" in await one.refused("run", seconds=1.0)
         assert "--allow-edit" in await one.refused("remove", actor="arm")
@@ -125,9 +127,9 @@ async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> Non
             await driver.discover()
             one = await stack.enter_async_context(desk(server, Limits(), handshake=driver.handshake))
             names = {tool.name for tool in (await one.mcp.list_tools()).tools}
-            assert names == {"look", "state", "picture", "explain", "log"}
+            assert names == {"look", "state", "picture", "explain", "log", "hand_pose"}
             assert "--take-over" in await one.refused("contacts")
-            assert (await one.call("look"))["scene"]["articulations"][0]["joints"][2]["name"] == "elbow"
+            assert (await one.call("look"))["robots"][0]["joints"][2]["name"] == "elbow"
             driver.articulations["arm"].set_ctrl({"elbow": 1.0})
             await driver.step()
 
@@ -145,7 +147,7 @@ async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> Non
             await until(
                 lambda: one.client.sim_time < 1 and abs(one.client.articulations["arm"].joints["elbow"].position) < 0.1
             )
-            assert (await one.call("look"))["scene"]["playing"]
+            assert (await one.call("look"))["playing"]
             assert one.client.session_id == ""
             await driver.step()
             with pytest.raises(ValueError, match="read-only"):
@@ -172,9 +174,16 @@ async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk
         ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
         ("play", {"action": "pause"}, ["direct", "run"]),
         ("record", {"action": "stop"}, ["no recording runs"]),
-        ("import_model", {"model": "/etc/passwd"}, ["No model is called"]),
-        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["No blueprint is called"]),
-        ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
+        (
+            "apply_scene",
+            {"objects": [{"id": "b", "model": "/etc/passwd", "position": [0, 0, 0]}]},
+            ["No model is called"],
+        ),
+        ("apply_scene", {"objects": [{"id": "b", "position": [0, 0, 0]}]}, ["No model is called ''"]),
+        ("apply_scene", {"objects": [{"id": "b", "model": "arm", "position": [0, 0]}]}, ["position"]),
+        ("apply_scene", {"objects": [], "remove": ["nobody"]}, ["There are: arm"]),
+        ("move", {"actor": "arm"}, ["a position, a quaternion"]),
+        ("move", {"actor": "arm", "quaternion": [0, 0, 0, 0]}, ["four zeros"]),
         ("remove", {"actor": "nobody"}, ["There are: arm"]),
         ("picture", {"camera": "arm/nothing"}, ["nothing"]),
     ):
@@ -333,8 +342,9 @@ async def test_a_model_that_replaces_another_on_its_server_says_so(tmp_path: Pat
     (tmp_path / "elsewhere").mkdir()
     with SimulatedServer("arm", dialect="beta", model_roots=[tmp_path / "elsewhere"]) as server:
         async with desk(server, models=files) as one:
-            assert "replaced" not in (await one.call("import_model", model="box"))["done"]
-            assert "has replaced the model" in (await one.call("import_model", model="crate"))["done"]
+            objects = [{"id": name, "model": name, "position": [1, 0, 1]} for name in files]
+            assert "replaced" not in (await one.call("apply_scene", objects=objects[:1]))["done"]
+            assert "crate has replaced the model" in (await one.call("apply_scene", objects=objects[1:]))["done"]
 
 
 async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
@@ -347,17 +357,21 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             )
             assert "box" in (await one.call("look"))["models"]
             await one.call("run", steps=2)
-            await one.call("import_model", model="box")
-            placed = await one.call("spawn", blueprint="box", actor_id="b1", position=[1, 0, 2], yaw=90)
-            assert placed["robots"] == ["arm", "box"]
-            assert "it is the robot 'box'" in placed["done"]
+            box = {"id": "b1", "model": "box", "position": [1, 0, 2], "quaternion": [1, 0, 0, 1]}
+            placed = await one.call("apply_scene", objects=[box, {"id": "b2", "model": "box", "position": [2, 0, 2]}])
+            assert (placed["robots"], placed["objects"]) == (["arm"], ["b1", "b2"])
             assert (placed["sim_time"], placed["step"]) == (0, 0), "the simulation has begun anew"
-            again = await one.refused("spawn", blueprint="box", actor_id="b1", position=[0, 0, 2])
-            assert "move moves it" in again
+            objects = {one["name"]: one["pose"] for one in (await one.call("look"))["objects"]}
+            assert objects["b1"] == {"position": [1, 0, 2], "quaternion": [0.707107, 0, 0, 0.707107]}
             await one.call("move", actor="b1", position=[1, 1, 3])
-            pose = (await one.call("state", robot="box"))["pose"]
-            assert pose["position"] == [1, 1, 3]
-            assert (await one.call("remove", actor="box"))["robots"] == ["arm"]
+            await one.call("move", actor="b1", quaternion=[1, 0, 0, 0])
+            pose = (await one.call("state", robot="b1"))["pose"]
+            assert pose == {"position": [1, 1, 3], "quaternion": [1, 0, 0, 0]}
+            # What is there already is moved.
+            again = await one.call("apply_scene", objects=[{"id": "b2", "position": [2, 2, 2]}], remove=["b1"])
+            assert again["objects"] == ["b2"]
+            assert (await one.call("state", robot="b2"))["pose"]["position"] == [2, 2, 2]
+            assert (await one.call("remove", actor="b2"))["objects"] == []
             await one.call("play", action="stop")
             for tool, arguments in (("state", {"robot": "arm"}), ("run", {"steps": 1}), ("contacts", {})):
                 assert "play with action='start'" in await one.refused(tool, **arguments)
@@ -395,11 +409,78 @@ async def test_arguments_of_wrong_types_are_refused_by_their_tool(direct: Desk) 
 
 async def test_resources(direct: Desk) -> None:
     listed = (await direct.mcp.list_resources()).resources
-    assert {resource.name for resource in listed} == {"model", "log"}
+    assert {resource.name for resource in listed} == {"model", "log", "recordings"}
     model = (await direct.mcp.read_resource("urlab://model")).contents[0]
     assert '"shoulder_lift"' in str(getattr(model, "text", ""))
-    with pytest.raises(MCPError, match="urlab://model"):
-        await direct.mcp.read_resource("urlab://nothing")
+    for wrong, words in (
+        ("nothing", "urlab://model"),
+        ("recordings/no.mcap", "no.mcap"),
+        ("cameras/arm/no", "'arm/no'"),
+    ):
+        with pytest.raises(MCPError, match=words):
+            await direct.mcp.read_resource(f"urlab://{wrong}")
+
+
+@pytest.mark.opengl
+async def test_cameras_recordings_and_the_log_have_addresses(server: SimulatedServer, tmp_path: Path) -> None:
+    async with desk(server, recordings=tmp_path) as one:
+
+        async def read(uri: str) -> Any:
+            return (await one.mcp.read_resource(uri)).contents[0]
+
+        templates = (await one.mcp.list_resource_templates()).resource_templates
+        assert {template.name for template in templates} == {"cameras", "recordings", "log"}
+        shown = await read("urlab://cameras/arm/wrist")
+        assert Image.open(io.BytesIO(base64.b64decode(shown.blob))).size == (64, 48)
+        await one.call("record", action="start")
+        await one.call("run", seconds=0.1)
+        made = (await one.call("record", action="stop"))["name"]
+        assert [file["name"] for file in json.loads((await read("urlab://recordings")).text)] == [made]
+        assert json.loads((await read(f"urlab://recordings/{made}")).text)["robots"] == ["arm"]
+        last = json.loads((await read("urlab://log")).text)[-1]
+        assert json.loads((await read(f"urlab://log/{last['n'] - 1}")).text) == [last]
+
+
+async def test_prompts_name_only_tools_that_there_are(direct: Desk) -> None:
+    prompts = (await direct.mcp.list_prompts()).prompts
+    assert [prompt.name for prompt in prompts] == ["why_it_does_not_move", "pick_and_place"]
+    given = {"robot": "arm", "object": "block", "target": "(0.5, 0, 0)"}
+    for prompt in prompts:
+        takes = {argument.name: given[argument.name] for argument in prompt.arguments or []}
+        got = await direct.mcp.get_prompt(prompt.name, takes)
+        assert all(value in str(got.messages[0].content) for value in takes.values())
+        with pytest.raises(MCPError, match=next(iter(takes))):
+            await direct.mcp.get_prompt(prompt.name, {})
+
+
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+@pytest.mark.parametrize("action", ["accept", "decline"])
+async def test_a_person_is_asked_before_state_is_discarded(direct: Desk, mode: str, action: Any) -> None:
+    asked: list[str] = []
+
+    async def answer(context: Any, params: Any) -> ElicitResult:
+        asked.append(params.message)
+        return ElicitResult(action=action, content={} if action == "accept" else None)
+
+    async with Client(
+        direct.agent.server,
+        mode=mode,
+        elicitation_callback=answer,
+        client_info=Implementation(name="host", version="1"),
+    ) as host:
+        one = Desk(direct.client, direct.console, direct.agent, host)
+        direct.console.lease.use(PERSON)
+        direct.console.lease.release(PERSON)
+        await one.call("run", steps=3)
+        if action == "accept":
+            assert (await one.call("reset"))["step"] == 0
+        else:
+            assert "did not agree to reset" in await one.refused("reset")
+            assert (await one.call("state", robot="arm"))["step"] == 3
+        assert len(asked) == 1
+        assert "begins anew" in asked[0]
+        assert "time passes only while" in await one.refused("play", action="pause")
+        assert len(asked) == 1, "only stop ends the session"
 
 
 @pytest.mark.opengl
@@ -407,8 +488,6 @@ async def test_pictures_are_not_larger_than_they_may_be(direct: Desk) -> None:
     result = await direct.mcp.call_tool("picture", {"camera": "arm/overview", "size": 32})
     assert not result.is_error, text_of(result)
     data = getattr(result.content[1], "data", "")
-    import base64
-
     assert Image.open(io.BytesIO(base64.b64decode(data))).size == (32, 24)
     assert (result.structured_content or {})["step"] == 0
     assert "1024" in await direct.refused("picture", camera="arm/overview", size=4096)

@@ -22,7 +22,7 @@ from urlab_client.errors import ProtocolError
 from urlab_client.protocol import rows, shm
 from urlab_client.protocol.topics import StreamTopic, TopicKind
 from urlab_client.server.streams.commands import Actuators, CameraEndpoint, StreamedSetPoints, decode_gains
-from urlab_client.values.pictures import decode_camera, encode_camera
+from urlab_client.values.pictures import decode_camera
 
 # What the codec, not these layouts, is responsible for.
 CODEC_FAMILIES = ("rpc_", "msgpack_", "msg_state_full")
@@ -85,17 +85,17 @@ CONTROL = Golden(
 )
 REAL = Golden(
     lambda data: decode_camera(data, CameraMode.REAL, 2, 2).pixels,
-    lambda pixels: encode_camera(pixels, CameraMode.REAL),
+    lambda pixels: vectors.encode_camera(pixels, CameraMode.REAL),
     lambda pixels: {"width": 2, "height": 2, "dtype": "bgra8", "rows_top_down_rgba": pixels.tolist()},
 )
 DEPTH = Golden(
     lambda data: decode_camera(data, CameraMode.DEPTH, 2, 2).pixels,
-    lambda pixels: encode_camera(pixels, CameraMode.DEPTH),
+    lambda pixels: vectors.encode_camera(pixels, CameraMode.DEPTH),
     lambda pixels: {
         "width": 2,
         "height": 2,
         "dtype": "float32",
-        "rows_top_down_cm": np.frombuffer(encode_camera(pixels, "depth"), "<f4").reshape(2, 2).tolist(),
+        "rows_top_down_cm": np.frombuffer(vectors.encode_camera(pixels, "depth"), "<f4").reshape(2, 2).tolist(),
         "rows_top_down_m": pixels.tolist(),
     },
 )
@@ -224,7 +224,7 @@ def test_camera_with_header(name: str) -> None:
     assert frame.frame_id == vector.decoded["frame_id"]
     assert frame.sim_time == vector.decoded["sim_time"]
     assert frame.capture_time == vector.decoded.get("capture_unix_time")
-    assert encode_camera(frame.pixels, CameraMode.REAL).hex() == vector.decoded["pixels_hex"]
+    assert vectors.encode_camera(frame.pixels, CameraMode.REAL).hex() == vector.decoded["pixels_hex"]
 
 
 def assert_header(header: shm.Header, decoded: dict[str, Any]) -> None:

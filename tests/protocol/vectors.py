@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 
 class Vector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,3 +61,15 @@ def load(name: str, generation: str = "alpha") -> Vector:
 
 def all(generation: str = "alpha") -> list[Vector]:  # noqa: A001
     return list(_VECTORS[generation].values())
+
+
+def encode_camera(pixels: np.ndarray, mode: str) -> bytes:
+    """Return a picture as servers send it: depths in centimetres, colours as BGRA with alpha 255, the rest as it is."""
+    if mode == "depth":
+        with np.errstate(over="ignore"):
+            return (pixels * np.float32(100)).astype("<f4").tobytes()
+    if mode != "real":
+        return pixels.tobytes()
+    sent = pixels[..., [2, 1, 0, 3]]
+    sent[..., 3] = 255
+    return sent.tobytes()

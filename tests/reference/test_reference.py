@@ -6,7 +6,7 @@ import ast
 import inspect
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -15,6 +15,8 @@ import urlab_client
 import urlab_client.aio
 from urlab_client import enums
 from urlab_client.aio.defaults import SESSION_LEVEL
+from urlab_client.server import SimulatedServer
+from urlab_client.types import StreamPolicy, StreamPolicyName
 
 ROWS = tomllib.loads((Path(__file__).parent / "rows.toml").read_text(encoding="utf-8"))
 FLAVOURS = {"aio": urlab_client.aio, "sync": urlab_client}
@@ -71,6 +73,30 @@ def test_member(flavour: str, owner: str, row: str) -> None:
         assert default is REQUIRED or stands_for == default, parameter
     extra = [n for n in parameters if n not in {n for n, _, _ in wanted}]
     assert all(parameters[n].kind is inspect.Parameter.KEYWORD_ONLY for n in extra), extra
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_help_shows_defaults_as_values(flavour: str) -> None:
+    client = FLAVOURS[flavour].URLabClient
+    for cls in (client, FLAVOURS[flavour].URLabArticulation, type(client().runtime), SimulatedServer):
+        for name, function in inspect.getmembers(cls, inspect.isfunction):
+            for parameter in inspect.signature(function).parameters.values():
+                assert "<" not in repr(parameter.default) or parameter.default is parameter.empty, (
+                    f"{name}: {parameter}"
+                )
+
+
+NAMES = {
+    enums.StepMode: enums.StepModeName,
+    enums.ObservationLevel: enums.ObservationLevelName,
+    enums.Transport: enums.TransportName,
+    StreamPolicy: StreamPolicyName,
+}
+
+
+@pytest.mark.parametrize("enum", NAMES)
+def test_the_names_that_type_checkers_allow_are_those_of_the_enum(enum: Any) -> None:
+    assert get_args(NAMES[enum]) == tuple(enum)
 
 
 @pytest.mark.parametrize("name", ROWS["fields"])

@@ -24,8 +24,7 @@ from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
 from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.config import ServerConfig
-from urlab_client.server.core import ServerCore
+from urlab_client.server.core import ServerConfig, ServerCore
 from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS

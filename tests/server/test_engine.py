@@ -784,9 +784,10 @@ def test_a_mujoco_error_is_answered_and_pauses_until_reset(start: Start, way: In
 def test_a_mujoco_error_in_reset_forward_or_a_push_is_answered_too(start: Start) -> None:
     sim = start(mode=StepMode.PUPPET, PB=BALL.replace('pos="0 0 1"', 'pos="0 0 0.09"'))
     sim.model.opt.solver = 77
-    assert refused(sim.engine.reset) == "not_ready"
-    assert refused(sim.engine.forward) == "not_ready"
-    assert refused(sim.step) == "not_ready"
+    for failing in (sim.engine.reset, sim.engine.forward, sim.step):
+        with pytest.raises(Refusal, match=r"physics stopped: .*solver") as caught:
+            failing()
+        assert (caught.value.code, sim.engine.fault) == ("not_ready", caught.value.message)
     sim.model.opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)
     assert sim.step(time=1.0) == 1.0
 
@@ -839,6 +840,20 @@ def test_a_warning_handler_of_the_host_program_stays() -> None:
         assert mujoco.get_mju_user_warning() is not None
     finally:
         mujoco.set_mju_user_warning(None)
+
+
+def test_warnings_of_mujoco_go_to_the_log_as_long_as_anybody_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduling, "_mujoco_warnings", scheduling._WarningLog())
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(None)
+    try:
+        with Engine(make_scene(bot=BOT)):
+            with Engine(make_scene(bot=BOT)):
+                handler = mujoco.get_mju_user_warning()
+            assert mujoco.get_mju_user_warning() == handler is not None
+        assert mujoco.get_mju_user_warning() is None
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 @WAYS

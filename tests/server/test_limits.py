@@ -69,6 +69,17 @@ def test_requests_name_the_limit_they_exceed(small: Wire) -> None:
         assert name in answer[1], (op, answer)
 
 
+def test_a_frame_that_is_far_too_long_costs_its_sender_the_connection(small: Wire) -> None:
+    with small.connected(zmq.DEALER) as socket:
+        with socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:
+            socket.send_multipart([b"", bytes(2 * SMALL.request_bytes)])
+            assert b"request_bytes" in socket.recv_multipart()[-1]
+            socket.send_multipart([b"", bytes(2 * SMALL.request_bytes + 1)])
+            assert monitor.poll(10_000), "the connection stays"
+        socket.disable_monitor()
+    assert small.ask("list_actors")["actors"], "others go on"
+
+
 def test_a_level_takes_no_more_actors_than_the_limit(small: Wire) -> None:
     spawn = {"blueprint": "/Game/MuJoCoImports/bot", "spacing": [1, 1, 0], "origin": [5, 0, 0]}
     present = len(small.ask("list_actors")["actors"])

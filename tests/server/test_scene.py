@@ -298,7 +298,7 @@ def test_real_robots_twice(tmp_path: Path, file: str) -> None:
         np.testing.assert_allclose(model.jnt_range[index.joints], alone.jnt_range)
         assert index.root_body == index.bodies.min()
         assert set(index.actuator_types.values()) == {"motor"}
-        assert index.bodies.dtype == index.qpos_adr.dtype == np.int32
+        assert (index.bodies.dtype, index.qpos_adr.dtype) == (np.int32, np.intp)
     for one, count in (("bodies", model.nbody - 1), ("joints", model.njnt), ("actuators", model.nactuator)):
         parts = np.concatenate([getattr(index, one) for index in scene.articulations])
         assert len(set(parts.tolist())) == len(parts) == count

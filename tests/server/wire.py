@@ -128,7 +128,7 @@ class Wire:
         self._server = server
         self._endpoint = f"{server.address}:{server.step_port}"
         self._timeout_s = timeout_s
-        self._socket = self._connect()
+        self._socket = self.connected()
         self._encoding = encoding
         self.session_id = ""
 
@@ -144,8 +144,9 @@ class Wire:
         self._socket.close()
         self._context.term()
 
-    def _connect(self) -> zmq.Socket[bytes]:
-        socket = self._context.socket(zmq.REQ)
+    def connected(self, kind: int = zmq.REQ) -> zmq.Socket[bytes]:
+        """Return one more socket that is connected to the server."""
+        socket = self._context.socket(kind)
         socket.linger = 0
         socket.rcvtimeo = int(1000 * self._timeout_s)
         socket.connect(self._endpoint)
@@ -159,7 +160,7 @@ class Wire:
         except zmq.Again:
             # A REQ socket that was promised a reply takes no other request: what shares it would fail, too.
             self._socket.close()
-            self._socket = self._connect()
+            self._socket = self.connected()
             raise AssertionError(f"no reply within {self._timeout_s} s to {frames!r:.200}") from None
         assert len(reply) == 1
         return reply[0]

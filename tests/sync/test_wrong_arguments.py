@@ -14,6 +14,7 @@ import pytest
 
 from urlab_client import URLabClient, URLabError
 from urlab_client.integrations.gym import URLabEnv
+from urlab_client.protocol.messages.session import Step
 from urlab_client.server import SimulatedServer
 from urlab_client.sync._facade import aio_of, portal_of
 
@@ -54,6 +55,12 @@ def noting(unnamed: list[str], shown: str) -> Iterator[None]:
             unnamed.append(f"{shown}: {error}")
     except Exception as error:  # noqa: BLE001
         unnamed.append(f"{shown}: {error!r}")
+
+
+@pytest.mark.parametrize("request_", ["x", "step", Step, None])
+def test_what_is_not_a_request_is_refused_by_name(client: URLabClient, request_: Any) -> None:
+    with pytest.raises(TypeError, match=f"call takes a request .*got {re.escape(repr(request_))}"):
+        client.call(request_)
 
 
 PARTS = (

@@ -183,7 +183,7 @@ def test_a_seed_determines_the_sample_and_generated_files_are_left_alone(tree: P
 def test_what_is_no_behaviour_is_not_mutated() -> None:
     code = (
         "import logging\nfrom typing import TYPE_CHECKING\n__all__ = ['a']\nif TYPE_CHECKING:\n    x = 1\n"
-        "def a(b: int | None) -> str:\n    logger.info('%s', b)\n    return 'text'\n"
+        "def a(b: int | None) -> str:\n    logger.info('%s', b)\n    log.info('%s', b)\n    return 'text'\n"
     )
     assert tool.places(code) == {}
 

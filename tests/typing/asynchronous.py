@@ -27,6 +27,7 @@ from urlab_client.aio import (
     Actuator,
     Body,
     Joint,
+    ScalarJoint,
     Sensor,
     URLabArticulation,
     URLabCameraView,
@@ -83,7 +84,12 @@ def state(client: URLabClient) -> None:
 
 
 def articulation(robot: URLabArticulation) -> None:
-    assert_type(robot.joints["FL_hip"], Joint)
+    joint = robot.joints["FL_hip"]
+    assert_type(joint, Joint)
+    assert_type(joint.position, float | Floats)
+    if isinstance(joint, ScalarJoint):
+        assert_type(joint.position, float)
+        assert_type(joint.velocity, float)
     assert_type(robot.actuators["FL_hip"], Actuator)
     assert_type(robot.sensors["imu_gyro"], Sensor)
     assert_type(robot.bodies["trunk"], Body)
@@ -167,6 +173,15 @@ async def mistakes(client: URLabClient, robot: URLabArticulation) -> None:
     client.sim_time = 1.0  # type: ignore[misc]  # pyright: ignore[reportAttributeAccessIssue]
     robot.set_ctrl({"FL_hip": "1"})  # type: ignore[dict-item]  # pyright: ignore[reportArgumentType]
     await client.runtime.set_sim_speed("fast")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    URLabClient(step_mode="drect")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    URLabClient(transport="smh")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    URLabClient(encoding="jsn")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    await client.discover("ful")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    await client.step(observations="minmal")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    await client.runtime.set_mode("drect")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    client.state_stream("newest")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    client.row_stream(policy="newest")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+    robot.cameras["head"].frames("newest")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 
 
 def mistaken_for_the_blocking_client(client: URLabClient) -> None:

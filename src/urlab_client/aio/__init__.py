@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from urlab_client.aio.controllers import URLabController, URLabPDController
     from urlab_client.aio.defaults import DEFAULT
     from urlab_client.aio.launch import check_address
-    from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
+    from urlab_client.aio.model.elements import Actuator, Body, Joint, ScalarJoint, Sensor
     from urlab_client.aio.streams.stream import Stream
 
 _HOMES = {
@@ -25,6 +25,7 @@ _HOMES = {
     "Actuator": "urlab_client.aio.model.elements",
     "Body": "urlab_client.aio.model.elements",
     "Joint": "urlab_client.aio.model.elements",
+    "ScalarJoint": "urlab_client.aio.model.elements",
     "Sensor": "urlab_client.aio.model.elements",
     "Stream": "urlab_client.aio.streams.stream",
 }
@@ -47,6 +48,7 @@ __all__ = [
     "Actuator",
     "Body",
     "Joint",
+    "ScalarJoint",
     "Sensor",
     "Stream",
     "URLabArticulation",

@@ -20,6 +20,7 @@ from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.enums import ControlMode, OutOfRange
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.messages.runtime import ClaimControl
 from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.values.descriptions import (
     ArticulationDescription,
@@ -27,7 +28,7 @@ from urlab_client.values.descriptions import (
     EntityDescription,
     Pose,
 )
-from urlab_client.values.names import NameMap
+from urlab_client.values.names import NameMap, PublicDir
 from urlab_client.values.rotation import rotate
 
 Move: TypeAlias = Callable[["URLabArticulation", Mapping[str, float], float, float], Awaitable[float]]
@@ -37,7 +38,7 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class URLabEntity:
+class URLabEntity(PublicDir):
     """A dynamic body, or the root of an articulation.
 
     The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread
@@ -168,6 +169,9 @@ class URLabEntity:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r}>"
+
+    def _repr_html_(self) -> str | None:
+        return self.describe()._repr_html_()  # pyright: ignore[reportPrivateUsage]
 
 
 class URLabArticulation(URLabEntity):
@@ -477,7 +481,11 @@ class URLabArticulation(URLabEntity):
             ControlClaimed: Another client controls the articulation; `.owner` names that client.
             ValueError: `ttl` is negative or not a number.
         """
-        await self._session.control.claim(self.prefix, force=force, ttl=finite("claim: ttl", ttl), timeout=timeout)
+        if finite("claim: ttl", ttl) < 0:
+            raise ValueError(f"claim: ttl takes 0 seconds or more, got {ttl}.")
+        if self._session.features.claims:
+            request = ClaimControl(articulation=self.prefix, ttl_s=ttl, force=force)
+            await self._session.call(request, timeout=timeout)
         self._record.drive()
 
     async def release(self, *, timeout: Timeout = DEFAULT) -> None:

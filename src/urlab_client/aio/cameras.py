@@ -13,14 +13,16 @@ from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pictures import Pixels
+from urlab_client.values.html import fields
+from urlab_client.values.names import PublicDir
+from urlab_client.values.pictures import Pixels, thumbnail
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
 
-class URLabCameraView:
+class URLabCameraView(PublicDir):
     """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
     delivered: bool
@@ -114,7 +116,7 @@ class URLabCameraView:
 
     def frames(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -140,7 +142,9 @@ class URLabCameraView:
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.camera(self.camera, policy),
             policy=policy,
@@ -161,3 +165,10 @@ class URLabCameraView:
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"
+
+    def _repr_html_(self) -> str:
+        frame = self.latest_frame
+        shown = None if frame is None else thumbnail(frame, self.mode, self.name)
+        return fields(
+            "URLabCameraView", {**self.describe().to_dict(), "sim_time": self.sim_time, "latest_frame": shown}
+        )

@@ -11,7 +11,7 @@ from copy import copy
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
-from urlab_client.aio.arguments import integer
+from urlab_client.aio.arguments import integer, require
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
@@ -35,20 +35,36 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
-from urlab_client.aio.streams.rows import RowFilter, RowSource
+from urlab_client.aio.streams.sources import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.connection import client_keys, is_local
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.shm_regions import ServerRegions
-from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.enums import (
+    CameraTiming,
+    EncodingName,
+    ObservationLevel,
+    ObservationLevelName,
+    StepMode,
+    StepModeName,
+    Transport,
+    TransportName,
+)
 from urlab_client.errors import URLabError
 from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import (
+    CameraSample,
+    RowSample,
+    StateSnapshot,
+    StreamPolicy,
+    StreamPolicyName,
+)
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.html import fields
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -112,7 +128,7 @@ class URLabClient(ClientState):
         self,
         address: str = "tcp://localhost",
         *,
-        step_mode: str | StepMode = "auto",
+        step_mode: StepMode | StepModeName = "auto",
         step_port: int = 5559,
         state_port: int = STATE_PORT,
         ctrl_port: int = 5556,
@@ -121,9 +137,9 @@ class URLabClient(ClientState):
         local_model: bool = True,
         rcv_timeout_ms: int = 5000,
         auto_promote_step_mode: bool = True,
-        transport: str | Transport = "zmq",
+        transport: Transport | TransportName = "zmq",
         shm_dir: str | None = None,
-        encoding: str = "msgpack",
+        encoding: EncodingName = "msgpack",
         server_key: str | os.PathLike[str] | None = None,
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
@@ -271,7 +287,7 @@ class URLabClient(ClientState):
 
     async def discover(
         self,
-        observations: str | ObservationLevel = "standard",
+        observations: ObservationLevel | ObservationLevelName = "standard",
         *,
         handshake: bytes | None = None,
         timeout: Timeout = DEFAULT,
@@ -317,7 +333,7 @@ class URLabClient(ClientState):
         n_steps: int = 1,
         *,
         include_cameras: bool | Mapping[str, str | CameraTiming] = False,
-        observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
+        observations: ObservationLevel | ObservationLevelName | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
         """Advance physics according to the step mode, and update the state.
@@ -480,7 +496,7 @@ class URLabClient(ClientState):
 
     def state_stream(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -506,7 +522,9 @@ class URLabClient(ClientState):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
+        self._publishers.check_open()
         return Stream(
             self._publishers.state(policy),
             policy=policy,
@@ -523,7 +541,7 @@ class URLabClient(ClientState):
         kinds: Collection[str | TopicKind] = (),
         components: Collection[str] = (),
         *,
-        policy: str | StreamPolicy = "latest_per_key",
+        policy: StreamPolicy | StreamPolicyName = "latest_per_key",
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -549,6 +567,7 @@ class URLabClient(ClientState):
         Raises:
             KeyError: The articulation is unknown.
             ValueError: A kind or the policy is unknown, or the buffer is empty.
+            ClientClosed: The client was closed.
             URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
                 model.
         """
@@ -561,6 +580,7 @@ class URLabClient(ClientState):
             )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
         wanted = RowFilter(keys, kinds, components, entities=articulation is None)
+        self._publishers.check_open()
         source: RowSource | DerivedRowSource = self._publishers.rows(wanted)
         if not self._session.features.publishes_rows:
             # From the socket, which delivers every snapshot; a region holds only the newest.
@@ -600,9 +620,11 @@ class URLabClient(ClientState):
 
         Raises:
             URLabRPCError: The server refused the request.
+            TypeError: It is not a request, but the name of an op, for example; nothing was sent.
             ValueError: A `Step` has numbers that are not finite, or 0 steps in direct mode, where the server would take
                 one; nothing was sent.
         """
+        require("call", request, Request, "a request of urlab_client.protocol.messages, such as Step()")
         request = copy(request)  # the session stamps its id on what it sends, and the owner of the robots
         if not isinstance(request, Step):
             return await self._session.call(request, timeout=timeout)
@@ -656,6 +678,18 @@ class URLabClient(ClientState):
     def __repr__(self) -> str:
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
         return f"<URLabClient {self.address} {state}>"
+
+    def _repr_html_(self) -> str:
+        playing = "running" if self.manager_present else "not running, as far as this client knows"
+        found = {
+            "server": self.urlab_version and f"URLab {self.urlab_version}, MuJoCo {self.mujoco_version}",
+            "play": playing,
+            "step mode": str(self.step_mode),
+            "simulation time": f"{self.sim_time:.3f} s",
+            "robots": ", ".join(self.articulations),
+            "other bodies": ", ".join(name for name in self.entities if name not in self.articulations),
+        }
+        return fields(repr(self)[1:-1], found)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

@@ -20,13 +20,13 @@ from urlab_client.protocol.codec import encode_message
 from urlab_client.protocol.messages.session import NOT_SENT
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
-from urlab_client.values.names import NameMap, unknown_name
+from urlab_client.values.names import NameMap, PublicDir, unknown_name
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
 
-class ClientState:
+class ClientState(PublicDir):
     """The attributes of a client. Reading them sends nothing and does not block."""
 
     def __init__(self, config: ClientConfig, session: Session, state: SimState) -> None:

@@ -11,9 +11,10 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from urlab_client.aio.features import Features
-from urlab_client.enums import CameraTiming, StepMode, Transport
+from urlab_client.enums import CameraTiming, EncodingName, StepMode, Transport
 from urlab_client.protocol.messages.session import InstanceInfo, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.values.html import bold, table
 from urlab_client.values.plain import Serializable
 
 
@@ -23,6 +24,9 @@ class Verdict(StrEnum):
     OK = "ok"
     NOTE = "note"
     PROBLEM = "problem"
+
+
+_COLOURS: Final = {Verdict.OK: "#2e7d32", Verdict.NOTE: "#b26a00", Verdict.PROBLEM: "#c62828"}
 
 
 class Finding(Serializable, Struct, frozen=True):
@@ -58,6 +62,10 @@ class Diagnosis(Serializable, Struct, frozen=True):
         said = ", ".join(f"{counts[verdict]} {verdict}" for verdict in reversed(Verdict) if counts[verdict])
         problems = [f"{one.subject}: {one.text}" for one in self.findings if one.verdict is Verdict.PROBLEM]
         return f"<Diagnosis {said or 'empty'}{'; ' if problems else ''}{' '.join(problems)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(bold(one.verdict, _COLOURS[one.verdict]), bold(one.subject), one.text) for one in self.findings]
+        return table(rows, caption="Nothing keeps the robots from moving." if self.healthy else "Robots cannot move.")
 
     def __str__(self) -> str:
         return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
@@ -160,7 +168,7 @@ class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
     auto_promote_step_mode: bool = True
     transport: Transport = Transport.ZMQ
     shm_dir: str | None = None
-    encoding: str = "msgpack"
+    encoding: EncodingName = "msgpack"
     server_key: str | None = None
     client_key: str | None = None
     trust_server: bool = False

@@ -13,6 +13,7 @@ from urlab_client.enums import ControllerKind, known
 from urlab_client.errors import ControllerSchemaViolation, ProtocolError
 from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
+from urlab_client.values.names import PublicDir
 
 if TYPE_CHECKING:
     from urlab_client.aio.session.session import Session
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 _GAINS = ("kp", "kv", "torque_limit")
 
 
-class URLabController:
+class URLabController(PublicDir):
     """The controller attached to an articulation."""
 
     def __init__(self, session: Session, prefix: str, info: ControllerInfo) -> None:

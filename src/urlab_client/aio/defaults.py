@@ -13,6 +13,9 @@ class Default(enum.Enum):
 
     DEFAULT = "default"
 
+    def __repr__(self) -> str:  # shown by help() and inspect.signature(), where a program could write it, too
+        return self.name
+
 
 DEFAULT: Final = Default.DEFAULT
 """Use the default timeout of the op or the client."""

@@ -142,7 +142,7 @@ async def _reachability(config: ClientConfig, session: Session, state_port: int)
     if config.step_mode in (StepMode.LIVE, StepMode.AUTO) and config.address.startswith("tcp://"):
         ports |= {"state stream": state_port}
     for what, port in ports.items():
-        problem = await _connect(host, port)
+        problem = await connection_problem(host, port)
         if problem is None:
             yield Finding(Verdict.OK, what, f"{host}:{port} accepts connections.")
         else:
@@ -150,12 +150,13 @@ async def _reachability(config: ClientConfig, session: Session, state_port: int)
             yield Finding(need, what, f"{host}:{port}: {problem}")
 
 
-async def _connect(host: str, port: int) -> str | None:
+async def connection_problem(host: str, port: int, within: float = _CONNECT_S) -> str | None:
+    """Return why a port accepts no connection, or None if it does."""
     try:
-        async with asyncio.timeout(_CONNECT_S):
+        async with asyncio.timeout(within):
             _, writer = await asyncio.open_connection(host, port)
     except TimeoutError:
-        return f"no answer within {_CONNECT_S:g} s; is a firewall in between?"
+        return f"no answer within {within:g} s; is a firewall in between?"
     except OSError as error:
         return f"{_reason(error)}; is the server running, and on this port?"
     writer.close()

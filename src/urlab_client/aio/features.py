@@ -13,7 +13,7 @@ from typing import Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from urlab_client.protocol.messages.control import ClaimControlOk
+from urlab_client.protocol.messages.runtime import ClaimControlOk
 from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.values.plain import Serializable
 

@@ -14,7 +14,7 @@ from urlab_client.aio.arguments import finite, mapping
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.client_types import Diagnosis, Verdict
-from urlab_client.aio.model.elements import Joint
+from urlab_client.aio.model.elements import Joint, ScalarJoint
 from urlab_client.aio.session.session import server_restarted
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.streams.stream import Stream
@@ -187,17 +187,17 @@ class _Aim:
         driven = None if name in articulation.joints else articulation.actuators.get(name)
         if driven is not None and driven.joint is not None:
             raise KeyError(f"move_to takes joints; {name!r} is an actuator, which moves the joint {driven.joint!r}.")
-        self.joint = articulation.joints[name]
-        what = f"move_to: joint {self.joint.name!r} of {articulation.name!r}"
+        joint = articulation.joints[name]
+        what = f"move_to: joint {joint.name!r} of {articulation.name!r}"
         self.target = finite(what, target)
-        if not self.joint.unit:
-            raise ValueError(f"{what} is a {self.joint.kind} joint; its position is not one number. Nothing was set.")
-        low, high = self.joint.limits or (self.target, self.target)
+        if not isinstance(joint, ScalarJoint):
+            message = f"{what} is a {joint.kind} joint; its position is not one number. Nothing was set."
+            raise ValueError(message)  # noqa: TRY004  # a joint of the wrong kind, not an argument of the wrong type
+        self.joint = joint
+        low, high = joint.limits or (self.target, self.target)
         if not low <= self.target <= high:
-            raise ValueError(
-                f"{what} takes {low:g} to {high:g} {self.joint.unit}, got {self.target:g}. Nothing was set."
-            )
-        driving = [actuator for actuator in articulation.actuators.values() if actuator.joint == self.joint.name]
+            raise ValueError(f"{what} takes {low:g} to {high:g} {joint.unit}, got {self.target:g}. Nothing was set.")
+        driving = [actuator for actuator in articulation.actuators.values() if actuator.joint == joint.name]
         servos = [actuator for actuator in driving if actuator.describe().takes == "position"]
         if not servos:
             takes = [f"{actuator.name!r} takes {actuator.describe().takes or 'something else'}" for actuator in driving]
@@ -207,10 +207,10 @@ class _Aim:
         self.actuator.checked(self.set_point, OutOfRange.ERROR)
 
     def left(self) -> float:
-        return self.target - float(self.joint.position)
+        return self.target - self.joint.position
 
     def settled(self, tolerance: float) -> bool:
-        return abs(self.left()) <= tolerance and abs(float(self.joint.velocity)) * _AT_REST_S <= tolerance
+        return abs(self.left()) <= tolerance and abs(self.joint.velocity) * _AT_REST_S <= tolerance
 
 
 def _positive(what: str, value: float) -> float:

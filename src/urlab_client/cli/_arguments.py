@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeAlias, TypeVar, cast
 
-from urlab_client.cli._common import CommandError, joined
+from urlab_client._installation import need
+from urlab_client.cli._common import CommandError, joined, refusing
 from urlab_client.enums import StepMode
 from urlab_client.values.names import did_you_mean
+
+if TYPE_CHECKING:
+    from urlab_client.integrations.gym import Task
 
 Example = tuple[str, str]
 """A command line, and what it does."""
@@ -252,6 +257,26 @@ def add_policy(parser: Parser, robot: str) -> None:
         help="the .toml file (default: the one beside POLICY with the same name)",
     )
     parser.add_argument("--robot", metavar="ROBOT", help=robot)
+
+
+def add_task(parser: Parser) -> None:
+    """Add `--task`, which `task_named` resolves."""
+    parser.add_argument(
+        "--task",
+        metavar="TASK",
+        help="a task, such as urlab/Reach-v0, or module:Class of your own, found from the current folder",
+    )
+
+
+def task_named(name: str) -> type[Task]:
+    """Return the task that `--task` names."""
+    need("gymnasium", extra="gym")
+    from urlab_client.integrations.gym import task_named as found
+
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)  # an installed command does not look there
+    with refusing(ValueError, option="--task"):
+        return found(name)
 
 
 def add_page(parser: Parser, default_port: int) -> None:

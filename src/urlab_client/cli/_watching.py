@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+import sys
 from argparse import Namespace
 from collections.abc import AsyncGenerator, Callable, Generator
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder
 
 _LOOK_S = 0.05
+_AT_ONCE_S = 0.5
 _AWAY_S = 5.0
 """How long a server may be unreachable."""
 
@@ -36,6 +38,21 @@ def interruptible() -> Generator[asyncio.Event]:
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def announced_wait(client: URLabClient) -> Generator[None]:
+    """Say on standard error that the block waits for the server, unless that answers at once or starts with it."""
+
+    def announce() -> None:
+        if not client.connected and not client.address.startswith("sim://"):
+            print(f"waiting for the server at {client.address} …", file=sys.stderr, flush=True)
+
+    timer = asyncio.get_running_loop().call_later(_AT_ONCE_S, announce)
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 async def run_session(

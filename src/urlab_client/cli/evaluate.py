@@ -16,11 +16,11 @@ import logging
 from argparse import Namespace
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options, with_option
-from urlab_client.cli._arguments import Parser, add_policy, count, seconds
+from urlab_client.cli._arguments import Parser, add_policy, add_task, count, seconds, task_named
 from urlab_client.cli._common import CommandError, import_mujoco, json_line, output, progress_bar, refusing, table
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ EXAMPLES = (
 def add_arguments(parser: Parser) -> None:
     """Add the options."""
     add_policy(parser, "an MJCF file or the name of a bundled robot (default: as declared)")
-    parser.add_argument("--task", metavar="ID", help="a registered task, such as urlab/Reach-v0")
+    add_task(parser)
     parser.add_argument("--episodes", type=count, default=100, metavar="N", help="default: %(default)s")
     parser.add_argument(
         "--seconds", type=seconds, metavar="S", help="simulated seconds per episode, without --task (default: 10)"
@@ -115,17 +115,10 @@ def _in_task(arguments: Namespace, task: str, declared: Randomisation | None, op
             raise CommandError(f"--{name} cannot be combined with --task, which determines it")
     from gymnasium.vector import AutoresetMode
 
-    from urlab_client.integrations.gym import TASKS, URLabBatchEnv
-    from urlab_client.integrations.policy import (
-        OnnxDictNetwork,
-        OnnxNetwork,
-        PolicyFileError,
-        evaluate_in,
-    )
+    kind = task_named(task)
+    from urlab_client.integrations.gym import URLabBatchEnv
+    from urlab_client.integrations.policy import evaluate_in, task_network
 
-    if task not in TASKS:
-        raise CommandError(f"--task: no task is called {task!r}; there are: {', '.join(TASKS)}")
-    kind = TASKS[task]
     env = URLabBatchEnv(
         kind.scene_address,
         min(arguments.episodes, _MOST_COPIES),
@@ -134,17 +127,7 @@ def _in_task(arguments: Namespace, task: str, declared: Randomisation | None, op
         autoreset_mode=AutoresetMode.DISABLED,
     )
     with closing(env):
-        space = env.single_observation_space
-        if kind.cameras:
-            ((_, box),) = cast("dict[str, Any]", env.single_action_space).items()
-            return evaluate_in(env, OnnxDictNetwork(arguments.policy, space, len(box.low)), **options)
-        network = OnnxNetwork(arguments.policy)
-        wanted = {"inputs": space.shape, "outputs": env.single_action_space.shape}
-        for name, shape in wanted.items():
-            if getattr(network, name) not in (None, (shape or (0,))[0]):
-                raise PolicyFileError(
-                    f"{network.path} has {getattr(network, name)} {name}, but {task} has {(shape or (0,))[0]}."
-                )
+        network: Any = task_network(arguments.policy, env.single_observation_space, env.single_action_space)
         return evaluate_in(env, network, **options)
 
 

@@ -3,7 +3,8 @@
 Serve tools for agents over the Model Context Protocol, on standard input and output or, with --http, at an address on
 this machine. Without --allow-drive and --allow-edit, an agent can only look, and does not take a running server over
 from another client. The console shows what the agent does; a person who acts there takes the controls from the agent.
-Messages for you, such as the console's link, go to standard error. Exits with code 0 when its input ends, on SIGINT
+The agent need not wait for the server: tools say what is missing, and work once it is there. Messages for
+you, such as the console's link, go to standard error. Exits with code 0 when its input ends, on SIGINT
 (Ctrl-C) and on SIGTERM.
 """
 
@@ -16,8 +17,9 @@ import secrets
 import sys
 import webbrowser
 from argparse import Namespace
+from collections.abc import Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
@@ -149,8 +151,6 @@ async def _serve(arguments: Namespace) -> None:
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
-        if arguments.address.startswith("sim://"):  # a failure here is final, whereas a running server may start later
-            await client.discover()
         handshake = None if arguments.handshake is None else arguments.handshake.read_bytes
         session = ConsoleSession(client, recordings=arguments.recordings, handshake=handshake)
         limits = Limits(
@@ -162,11 +162,29 @@ async def _serve(arguments: Namespace) -> None:
         agent = Agent(session, limits, models=_models(arguments.models))
         async with session.open():
             if arguments.http:
-                await _serve_http(arguments, agent, session)
+                serving = _serve_http(arguments, agent, session)
             elif arguments.console:
-                await _serve_stdio_and_console(arguments, agent, session)
+                serving = _serve_stdio_and_console(arguments, agent, session)
             else:
-                await serve_stdio(agent)
+                serving = serve_stdio(agent)
+            if arguments.address.startswith("sim://"):
+                await _serve_unless_start_fails(serving, session)
+            else:
+                await serving
+
+
+async def _serve_unless_start_fails(serving: Coroutine[Any, Any, None], session: ConsoleSession) -> None:
+    """Serve while the simulated server starts. Its failure is final, whereas a running server may start later."""
+    served, opened = asyncio.create_task(serving), asyncio.create_task(session.opened())
+    try:
+        await asyncio.wait((served, opened), return_when=asyncio.FIRST_COMPLETED)
+        if not served.done():
+            opened.result()
+        await served
+    finally:
+        served.cancel()
+        opened.cancel()
+        await asyncio.wait((served, opened))
 
 
 async def _serve_stdio_and_console(arguments: Namespace, agent: Agent, session: ConsoleSession) -> None:

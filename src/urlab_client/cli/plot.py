@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _PER_PANEL = 6  # more lines in one panel cannot be told apart
 _DPI = 150
 _COVERS = 0.003  # of the axis: less than the width of a line
+_LEAST = 1e-6  # range of an axis, in the unit of its values, or as a part of large ones
 _PERIOD = 18.0  # of a dashed line, in line widths
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
@@ -142,6 +143,10 @@ def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves],
         axis.set_ylabel(panel.label)
         axis.grid(visible=True, alpha=0.3)
         axis.margins(x=0.01)
+        low, high = axis.get_ylim()
+        least = _least_range(panel.values)
+        if high - low < least:
+            axis.set_ylim((low + high - least) / 2, (low + high + least) / 2)
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
     figure.align_ylabels(axes)
     axes[-1].set_xlabel("simulation time (s)")
@@ -151,7 +156,7 @@ def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves],
 
 def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     """Return, per column, the first column that it covers, its place among those that do, and their number."""
-    near = _COVERS * np.ptp(np.nan_to_num(values)) if values.size else 0.0
+    near = _COVERS * max(np.ptp(np.nan_to_num(values)), _least_range(values)) if values.size else 0.0
     firsts = [
         next(
             other
@@ -161,6 +166,11 @@ def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
         for index in range(values.shape[1])
     ]
     return [(first, firsts[:index].count(first), firsts.count(first)) for index, first in enumerate(firsts)]
+
+
+def _least_range(values: NDArray[np.float64]) -> float:
+    """Return the least range of an axis, below which rounding noise would look like vibration."""
+    return _LEAST * max(1.0, float(np.abs(np.nan_to_num(values)).max(initial=0.0)))
 
 
 def _style(place: int, count: int) -> dict[str, Any]:

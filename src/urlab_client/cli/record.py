@@ -26,7 +26,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
-from urlab_client.cli._watching import interruptible, run_session
+from urlab_client.cli._watching import announced_wait, interruptible, run_session
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
@@ -88,7 +88,8 @@ async def _record(arguments: Namespace) -> AsyncRecorder:
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
-        await client.discover()
+        with announced_wait(client):
+            await client.discover()
         recorder = record(
             client,
             arguments.output,

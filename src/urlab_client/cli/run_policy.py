@@ -3,17 +3,20 @@
 Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network observes and what its
 outputs mean. Refuses to start if the robot, step mode, timestep or controller is not the one that the policy requires.
 Without an address it starts a simulated server; with one it opens a session, which takes the server over from the
-client that drives it. Exit code 1 if the robot fell. Needs the extra 'urlab-client[onnx]'.
+client that drives it. With --task, the network maps observations of a task to actions, as for evaluate, and one episode
+runs. Exit code 1 if the robot fell, or the episode of the task was terminated without success. Needs the extra
+'urlab-client[onnx]', and with --task also 'urlab-client[gym]'.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,11 +28,15 @@ from urlab_client.cli._arguments import (
     add_client,
     add_policy,
     add_record,
+    add_task,
+    cameras,
     make_client,
     one_of,
     seconds,
+    task_named,
 )
 from urlab_client.cli._common import (
+    CommandError,
     check_recording,
     import_mujoco,
     json_line,
@@ -40,6 +47,7 @@ from urlab_client.cli._common import (
 )
 from urlab_client.cli._watching import recorded
 from urlab_client.enums import StepMode
+from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.integrations.policy import Policy, PolicyRun
@@ -47,6 +55,7 @@ if TYPE_CHECKING:
 
 _FELL = 1
 _SEED = 0
+_ROUNDING_S = 1e-9
 
 
 EXAMPLES = (
@@ -55,6 +64,7 @@ EXAMPLES = (
         "urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare",
         "walk forward at 0.5 m/s; compare with zero and random outputs",
     ),
+    ("urlab run-policy go.onnx --task my_tasks:Go", "an episode of a task of your own, by a network trained for it"),
     (
         "urlab run-policy walk.onnx tcp://localhost --record walk.mcap",
         "drive the robot of a running server, and record it",
@@ -69,7 +79,8 @@ def add_arguments(parser: Parser) -> None:
         "an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive "
         "(default: as declared)",
     )
-    add_address(parser, default=None, otherwise="a simulated server for --robot")
+    add_address(parser, default=None, otherwise="a simulated server for --robot or --task")
+    add_task(parser)
     parser.add_argument(
         "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
@@ -104,6 +115,8 @@ def run(arguments: Namespace) -> int:
     """Run the policy; return 1 if the robot fell, else 0."""
     import_mujoco()
     check_recording(arguments.record, arguments)
+    if arguments.task is not None:
+        return _in_task(arguments)
     from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
@@ -117,6 +130,50 @@ def run(arguments: Namespace) -> int:
     else:
         _print(runs)
     return _FELL if runs["policy"].falls else 0
+
+
+def _in_task(arguments: Namespace) -> int:
+    """Run one episode of a task; return 1 if it was terminated without success, else 0."""
+    for name, given in _options_of_a_declaration(arguments).items():
+        if given:
+            raise CommandError(f"--{name} cannot be combined with --task, which determines it")
+    kind = task_named(arguments.task)
+    from urlab_client.integrations.gym import URLabEnv
+    from urlab_client.integrations.policy import task_network
+    from urlab_client.integrations.record import record
+
+    address = arguments.address or with_model_options(kind.scene_address)
+    client = make_client(BlockingClient, address, arguments, step_mode="direct")
+    with client, contextlib.ExitStack() as stack:
+        client.discover()
+        env = stack.enter_context(contextlib.closing(URLabEnv(client, task=kind(), max_episode_steps=sys.maxsize)))
+        network: Any = task_network(arguments.policy, env.observation_space, env.action_space)
+        if arguments.record is not None:
+            options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
+            with refusing(KeyError, option="--camera"):
+                stack.enter_context(record(client, arguments.record, cameras=cameras(arguments.camera), **options))
+        progress = stack.enter_context(progress_bar(arguments.task, arguments.seconds))
+        observation, info = env.reset(seed=_SEED)
+        total, actions, terminated = 0.0, 0, False
+        while not terminated and info["sim_time"] < arguments.seconds - _ROUNDING_S:
+            observation, reward, terminated, _, info = env.step(network(observation))
+            total, actions = total + reward, actions + 1
+            progress(info["sim_time"])
+    success = info.get("success")
+    found = {"actions": actions, "sim_time": info["sim_time"], "return": total, "success": success}
+    if arguments.json:
+        print(json_line({**found, "terminated": terminated}))
+    else:
+        title = f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation"
+        results = table([], ["actions", "return", "success", "terminated"], title)
+        results.add_row(str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated))
+        output().print(results)
+    return _FELL if terminated and not success else 0
+
+
+def _options_of_a_declaration(arguments: Namespace) -> dict[str, Any]:
+    named = {name: getattr(arguments, name) for name in ("declaration", "robot", "goal", "compare")}
+    return {**named, "command": arguments.twist, "step-mode": arguments.step_mode}
 
 
 async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
@@ -182,7 +239,8 @@ def _baselines(policy: Policy) -> dict[str, Policy]:
 def _print(runs: dict[str, PolicyRun]) -> None:
     last = runs["policy"]
     live = last.step_mode is StepMode.LIVE
-    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"]
+    walks = any(found.distance for found in runs.values())  # a fixed base neither walks nor falls
+    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"] if walks else []
     headings += ["goal\nerror"] if last.goal_error is not None else []
     headings += ["actions/s", "late\nactions" if live else "physics\nsteps/s"]
     title = f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation"
@@ -190,10 +248,11 @@ def _print(runs: dict[str, PolicyRun]) -> None:
     for name, found in runs.items():
         results.add_row(
             name,
-            f"{found.reward:.3f}",
-            f"{found.forward:.2f}",
-            f"{found.velocity_error:.3f}",
-            str(found.falls),
+            *(
+                (f"{found.reward:.3f}", f"{found.forward:.2f}", f"{found.velocity_error:.3f}", str(found.falls))
+                if walks
+                else ()
+            ),
             *((f"{found.goal_error:.4f}",) if found.goal_error is not None else ()),
             f"{found.actions / found.wall_time:.0f}",
             str(found.late) if live else f"{found.steps_per_second:.0f}",

@@ -227,8 +227,8 @@ def run(arguments: Namespace) -> int:
         watch_input(events)
     import_mujoco()
     _check_paths(arguments)
-    from urlab_client.server.system.allocator import limit_arenas
     from urlab_client.server.system.temporary_folder import TemporaryFolder
+    from urlab_client.server.system.threads import limit_arenas
 
     limit_arenas()
 

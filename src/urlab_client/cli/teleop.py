@@ -29,14 +29,15 @@ from urlab_client.cli._arguments import (
     add_address,
     add_client,
     add_record,
+    add_task,
     count,
     hertz,
     make_client,
     seconds,
+    task_named,
 )
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
 from urlab_client.cli._watching import interruptible, recorded
-from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
@@ -59,7 +60,7 @@ EXAMPLES = (
 def add_arguments(parser: Parser) -> None:
     """Add the options."""
     add_address(parser, default=None, otherwise="a simulated server for --task, else tcp://localhost")
-    parser.add_argument("--task", metavar="ID", help="a task of this package, such as urlab/Reach-v0")
+    add_task(parser)
     parser.add_argument("--robot", metavar="KEY", help="the articulation (default: the only one)")
     parser.add_argument("--site", metavar="NAME", help="the hand, a site of the robot (default: the only one)")
     parser.add_argument(
@@ -92,23 +93,12 @@ def run(arguments: Namespace) -> int:
         raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
     import urlab_client.integrations.teleop  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
-    task = None if arguments.task is None else _task(arguments.task)
+    task = None if arguments.task is None else task_named(arguments.task)()
     with refusing(KeyError, ValueError), terminal_keys() as keys:
         tally = asyncio.run(_teleoperate(arguments, task, keys))
     where = "" if arguments.record is None else f"{arguments.record}  "
     print(f"{where}{_counts(tally)}")
     return 0
-
-
-def _task(name: str) -> Task:
-    from urlab_client._installation import need
-
-    need("gymnasium", extra="gym")
-    from urlab_client.integrations.gym import TASKS
-
-    if name not in TASKS:
-        raise CommandError(f"{name!r} is not a task.{did_you_mean(name, TASKS)} There are: {', '.join(TASKS)}")
-    return TASKS[name]()
 
 
 async def _teleoperate(arguments: Namespace, task: Task | None, keys: Callable[[], str]) -> TeleopTally:

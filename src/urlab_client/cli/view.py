@@ -28,7 +28,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._common import CommandError, import_mujoco, refusing
-from urlab_client.cli._watching import interruptible, run_session
+from urlab_client.cli._watching import announced_wait, interruptible, run_session
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
@@ -111,7 +111,8 @@ async def _view(arguments: Namespace) -> None:
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
-        await client.discover()
+        with announced_wait(client):
+            await client.discover()
         if arguments.step_mode is StepMode.DIRECT:
             await client.reset()
         view = _make(client, arguments)

@@ -248,7 +248,7 @@ async def _perform(client: URLabClient, request: Request[Any]) -> object:
     match request:
         case SetMode(mode=mode):
             previous = client.step_mode
-            reply = SetModeOk(previous_mode=previous, current_mode=await client.runtime.set_mode(mode))
+            reply = SetModeOk(previous_mode=previous, current_mode=await client.runtime.set_mode(StepMode(mode)))
         case SetCameraStreaming(cameras=wanted):
             reply = SetCameraStreamingOk(cameras=await client.runtime.set_camera_streaming(wanted))
         case SetCameraDelay(cameras=delays):

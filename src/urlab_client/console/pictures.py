@@ -158,6 +158,14 @@ class Feed:
                 await self._changed.wait()
             return self._newest
 
+    async def frames(self) -> AsyncGenerator[bytes, None]:
+        """Yield the newest `frame` whenever the reader is ready for one."""
+        seq = 0
+        while True:
+            picture = await self.after(seq)
+            seq = picture.seq
+            yield picture.frame
+
     async def _run(self) -> None:
         while True:
             try:

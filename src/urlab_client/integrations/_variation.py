@@ -29,7 +29,7 @@ def server_variation(
     from urlab_client.randomise.variation import Variation, declared_in
 
     declared = declared_in(model)
-    return None if declared is None else Variation(declared, model, _controlled_actuators(client, layouts))
+    return None if declared is None else Variation(declared, model, controlled_actuators(client, layouts))
 
 
 def wire_variation(client: URLabClient) -> WireVariation | None:
@@ -78,7 +78,7 @@ class WireVariation(ClientObserver):
 
         self.declaration = declared
         self.draws: EpisodeDraws | None = None
-        controlled = _controlled_actuators(client, layouts)
+        controlled = controlled_actuators(client, layouts)
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
@@ -143,12 +143,11 @@ def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, 
         raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
 
 
-def _controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
+def controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
     """Return the model ids of the actuators that a controller with gains drives."""
     controlled: set[int] = set()
-    for key, articulation in client.articulations.items():
-        controller = articulation.controller
+    for key, layout in layouts.items():
+        controller = client.articulations[key].controller
         if controller is not None and controller.kind == ControllerKind.PD:
-            actuators = layouts[key].actuators
-            controlled.update(actuators[name] for name in controller.params["kp"])
+            controlled.update(layout.actuators[name] for name in controller.params["kp"])
     return frozenset(controlled)

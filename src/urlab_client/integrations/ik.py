@@ -41,6 +41,7 @@ _LARGEST_STEP: Final = 0.5  # rad or m per iteration: Jacobians are only valid l
 _DAMPING: Final = 1e-6
 _LM_DAMPING: Final = 1e-2
 _STARTS: Final = 8
+_PENETRATION: Final = 1e-3  # m: bodies that merely touch do not collide
 
 
 class IkSolution(Serializable, Struct, frozen=True, kw_only=True):
@@ -145,6 +146,13 @@ class InverseKinematics:
         self._limits: list[Any] = [mink.ConfigurationLimit(self._private, gain=1.0)]
         self._dofs = dofs
 
+    @property
+    def gripper(self) -> Actuator | None:
+        """The only actuator with a range that does not move the frame, if there is exactly one."""
+        moving = {actuator.name for _, actuator in self._held}
+        others = [one for name, one in self._robot.actuators.items() if name not in moving and one.ctrlrange]
+        return others[0] if len(others) == 1 else None
+
     def pose(self, joints: dict[str, float] | None = None) -> tuple[Floats, Floats]:
         """Return the pose of the frame.
 
@@ -164,6 +172,15 @@ class InverseKinematics:
             qpos[self._qpos[self.joints.index(name)]] = finite(f"joint {name!r}", position)
         self._configuration.update(qpos)
         return self._frame_pose()
+
+    def set_points(self, joints: dict[str, float]) -> dict[str, float]:
+        """Return the set-points that hold joint positions, within the actuators' ranges, in the format of `set_ctrl`.
+
+        Args:
+            joints: Positions of `self.joints`, rad or m.
+        """
+        held = zip(self._held, np.clip([joints[name] for name in self.joints], self._low, self._high), strict=True)
+        return {actuator.name: actuator.set_point_for(float(value)) for (_, actuator), value in held}
 
     def solve(
         self,
@@ -217,6 +234,39 @@ class InverseKinematics:
             best,
             hint="Choose a target within reach, or pass nearest=True for the nearest solution.",
         )
+
+    def collisions(self, path: Iterable[dict[str, float]]) -> tuple[int, str, str] | None:
+        """Return the first collision on a path. Nothing is sent, and nothing moves.
+
+        What is checked is the robot against itself and against what cannot move. Bodies that can move do not count,
+        because a hand may push or hold them, nor does what touches now.
+
+        Args:
+            path: Positions of `self.joints`, rad or m, one after another.
+
+        Returns:
+            Index in the path and the names of the two geoms or, if they have none, bodies; None without a collision.
+        """
+        model, data, qpos = self._private, mujoco.MjData(self._private), self._present()
+        root = model.body_rootid[model.jnt_bodyid[self._held[0][0].id]]
+        known = self._touching(data, qpos, root)
+        for i, joints in enumerate(path):
+            qpos[self._qpos] = [joints[name] for name in self.joints]
+            for pair in self._touching(data, qpos, root) - known:
+                first, second = (model.geom(g).name or model.body(model.geom_bodyid[g]).name for g in pair)
+                return i, first, second
+        return None
+
+    def _touching(self, data: mujoco.MjData, qpos: Floats, root: int) -> set[tuple[int, int]]:
+        """Return the pairs of geoms of the robot, or of the robot and what cannot move, that penetrate each other."""
+        model = self._private
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        bodies = model.geom_bodyid[data.contact.geom]
+        own = model.body_rootid[bodies] == root
+        counts = own.any(axis=1) & (own | (model.body_weldid[bodies] == 0)).all(axis=1)
+        return {(int(a), int(b)) for a, b in data.contact.geom[counts & (data.contact.dist < -_PENETRATION)]}
 
     def _present(self) -> Floats:
         if self._client.model is not self._source:
@@ -278,10 +328,10 @@ class InverseKinematics:
                 break
             configuration.integrate_inplace(move * min(1.0, _LARGEST_STEP / largest), 1.0)
         values = np.clip(configuration.data.qpos[self._qpos], self._low, self._high).tolist()
-        held = zip(self._held, values, strict=True)
+        joints = dict(zip(self.joints, values, strict=True))
         return IkSolution(
-            joints=dict(zip(self.joints, values, strict=True)),
-            set_points={actuator.name: actuator.set_point_for(value) for (_, actuator), value in held},
+            joints=joints,
+            set_points=self.set_points(joints),
             position_error=errors[0],
             rotation_error=errors[1],
             reached=reached,
@@ -313,6 +363,27 @@ def only_robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArtic
     return next(iter(robots.values()))
 
 
+def hand_frames(
+    client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation
+) -> list[dict[str, str]]:
+    """Return the frames that most position-controlled hinges of a robot move, in the form that the solver takes.
+
+    They are sites or, if the robot has none there, the first bodies with all these hinges.
+    """
+    model = client.model
+    if model is None:
+        return []
+    names = _servos(robot)
+    hinges = {joint.id for joint in robot.joints.values() if joint.kind == "hinge" and joint.name in names}
+    scores = {name: len(hinges.intersection(_chain(model, body.id))) for name, body in robot.bodies.items()}
+    most = max(scores.values(), default=0)
+    if not most:
+        return []
+    moved = {robot.bodies[name].id: name for name, score in scores.items() if score == most}
+    sites = [{"site": name} for name, i in own_sites(client, robot).items() if int(model.site_bodyid[i]) in moved]
+    return sites or [{"body": name} for i, name in moved.items() if int(model.body_parentid[i]) not in moved]
+
+
 def own_sites(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation) -> dict[str, int]:
     """Return the ids of a robot's sites by their short names; empty without a local model."""
     names = [] if client.model is None else model_names(client.model, "site")
@@ -342,12 +413,9 @@ def _held(
     robot: URLabArticulation | AsyncArticulation, chain: list[int], wanted: list[str] | None, frame: str
 ) -> dict[str, Actuator]:
     """Return the position-controlled joints of a chain, each with its actuator."""
-    by_id = {joint.id: joint for joint in robot.joints.values()}
-    found: dict[str, Actuator] = {}
-    for joint in (by_id[i] for i in chain if i in by_id):
-        for actuator in robot.actuators.values():
-            if joint.unit and actuator.joint == joint.name and actuator.describe().takes == "position":
-                found.setdefault(joint.name, actuator)
+    by_id, servos = {joint.id: joint for joint in robot.joints.values()}, _servos(robot)
+    names = (by_id[i].name for i in chain if i in by_id and by_id[i].unit)
+    found = {name: servos[name] for name in names if name in servos}
     if wanted is not None:
         names = [robot.joints[name].name for name in wanted]
         if others := [name for name in names if name not in found]:
@@ -361,6 +429,12 @@ def _held(
             "active PD controller"
         )
     return found
+
+
+def _servos(robot: URLabArticulation | AsyncArticulation) -> dict[str, Actuator]:
+    """Return the first actuator that takes positions, by the name of its joint."""
+    servos = [one for one in robot.actuators.values() if one.joint and one.describe().takes == "position"]
+    return {str(one.joint): one for one in reversed(servos)}
 
 
 def _range(joint: Joint, actuator: Actuator) -> tuple[float, float]:

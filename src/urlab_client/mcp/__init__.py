@@ -5,7 +5,7 @@ Requires the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs with thei
 
 from urlab_client._installation import need
 
-need("mcp", "mcap", "PIL", extra="mcp")
+need("mcp", "mcap", "mink", "PIL", extra="mcp")
 
 from urlab_client.mcp.agent import Agent  # noqa: E402 - its libraries may be missing
 from urlab_client.mcp.call import Limits  # noqa: E402

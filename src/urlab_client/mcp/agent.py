@@ -11,6 +11,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import unquote
 
 import msgspec
 from mcp import types
@@ -32,17 +33,48 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
 
 _INSTRUCTIONS = """\
-Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, joints, actuators, cameras,
-units and limits. Angles are in radians, lengths in metres, the z axis points up. In mode direct time passes only while
-run or move_to work; in mode live it passes by itself unless it is paused. When something does not move, call explain.
+Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, hands, objects, cameras,
+units and limits. Angles are in radians, lengths in metres, the z axis points up. move_hand and follow take a hand to
+poses, also to push and grasp. In mode direct time passes only while run or a movement works; in mode live it passes by
+itself unless it is paused. look, explain and log answer without a connection, too. When something does not move, call
+explain. apply_scene places several objects at once.
 One drives at a time: a person may take the controls at any time, and another agent may have them; then wait. One call
 may take {sim:g} s of simulation time and {wall:g} s on the wall.{missing}"""
 _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
+    "urlab://recordings": "Recordings, the newest first.",
+}
+_TEMPLATES = {
+    "urlab://cameras/{+camera}": ("A picture now; the cameras are those of `look`.", "image/jpeg"),
+    "urlab://recordings/{name}": ("Length, robots, cameras and damage of a recording.", "application/json"),
+    "urlab://log/{since}": ("Entries of the log after one, by its number.", "application/json"),
+}
+_PROMPTS = {
+    "why_it_does_not_move": (
+        "Find out why a robot does not move, and get it to move.",
+        {"robot": "Name of the robot"},
+        "Find out why {robot} does not move. Call explain first and do what its problems say: start or resume play, "
+        "choose another mode, or ask whoever has the controls. Then compare set-points with joint positions in state. "
+        "If a set-point was never set, call set_actuators or move_to. If a joint stops before its set-point, it is "
+        "obstructed (see contacts) or too weak (see the force limits in look). In mode direct nothing moves unless run "
+        "or a movement lets time pass. Take a picture if names do not tell. Report the cause, what you changed, and "
+        "the evidence that it moves now.",
+    ),
+    "pick_and_place": (
+        "Pick an object up and put it somewhere else.",
+        {"object": "Name of the object", "target": "Where to put it"},
+        "Pick {object} up and put it at {target}. Call look for the poses of object and hand, and for the gripper's "
+        "limits. Open the gripper and follow three poses: 10 cm above the object, around it with the gripper closed "
+        "there, and up again. Check in look that the object has risen with the hand; if not, look at contacts and a "
+        "picture, and try again a little lower or turned. Then follow: above the target, down, gripper open, up. "
+        "Finish with look, and report how far the object is from the target.",
+    ),
 }
 _TOOLS = declared(tools)
 _LARGE = 1e3
+_QUESTION = "confirm"
+_ASKS_BY_RESULT = "2026-07-28"
 _MOST_CALLERS = 100  # each client of the older protocol opens a session, and may not report its end
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError, RecursionError)
 _NO_PLAY = "No play session runs, so there are no robots. Call play with action='start'."
@@ -105,7 +137,10 @@ class Agent:
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,
             on_list_resources=self._list_resources,
+            on_list_resource_templates=self._list_templates,
             on_read_resource=self._read_resource,
+            on_list_prompts=self._list_prompts,
+            on_get_prompt=self._get_prompt,
         )
 
     async def _list_tools(
@@ -115,20 +150,23 @@ class Agent:
 
     async def _call_tool(
         self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
-    ) -> types.CallToolResult:
+    ) -> types.CallToolResult | types.InputRequiredResult:
         console, caller = self._console, self._caller(context)
-        call = Call(console, caller, self._limits, self._models, context.session.report_progress)
+        call = self._new_call(context, caller)
         began = time.perf_counter()
         try:
             found = self._tool(params.name)
             arguments = found.parse(params.arguments or {})
-            await call.connected()
-            if found.play and not call.client.manager_present:
+            if found.wants != "nothing":
+                await call.connected()
+            if found.wants == "play" and not call.client.manager_present:
                 raise LookupError(_NO_PLAY)
+            if (question := found.question(arguments)) and (asked := await _ask(context, params, question)):
+                return asked
             work = partial(found.function, call, **arguments)
             answer = self._answer(await (call.drive(work) if found.drives else work()))
         except _FAILURES as error:
-            text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
+            text = _message(error)
             if isinstance(error, SessionTakenOver):
                 text = RESTARTED if isinstance(error, ServerRestarted) else TAKEN_OVER
             console.view.note("error", caller.name, params.name, text)
@@ -137,6 +175,9 @@ class Agent:
             milliseconds = 1e3 * (time.perf_counter() - began)
             console.view.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
+
+    def _new_call(self, context: ServerRequestContext[Any], caller: Caller) -> Call:
+        return Call(self._console, caller, self._limits, self._models, context.session.report_progress)
 
     def _caller(self, context: ServerRequestContext[Any]) -> Caller:
         """Return the caller, identified by token, session, if any, and program.
@@ -191,17 +232,101 @@ class Agent:
             ]
         )
 
+    async def _list_templates(
+        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
+    ) -> types.ListResourceTemplatesResult:
+        return types.ListResourceTemplatesResult(
+            resource_templates=[
+                types.ResourceTemplate(uri_template=uri, name=uri.split("/")[2], description=text, mime_type=kind)
+                for uri, (text, kind) in _TEMPLATES.items()
+            ]
+        )
+
     async def _read_resource(
         self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
     ) -> types.ReadResourceResult:
-        uri = str(params.uri)
-        if uri not in _RESOURCES:
-            raise MCPError(
-                types.INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}."
-            )
-        shown = self._console.client.describe() if uri == "urlab://model" else list(self._console.view.entries)
+        uri, console = str(params.uri), self._console
+        kind, _, name = unquote(uri.removeprefix("urlab://")).partition("/")
+        try:
+            match kind, name:
+                case "cameras", str() if name:
+                    await self._new_call(context, self._caller(context)).connected()
+                    jpeg = base64.b64encode(await tools.jpeg_of(console.client, name)).decode()
+                    picture = types.BlobResourceContents(uri=uri, blob=jpeg, mime_type="image/jpeg")
+                    return types.ReadResourceResult(contents=[picture])
+                case "model", "":
+                    shown: Any = console.client.describe()
+                case "log", _:
+                    shown = console.view.entries_after(int(name or 0))
+                case "recordings", _:
+                    shown = await console.recordings.describe(name) if name else console.recordings.list()
+                case _:
+                    raise LookupError(
+                        f"No resource has the address {uri!r}, only {', '.join(_RESOURCES | _TEMPLATES)}."
+                    )
+        except _FAILURES as error:
+            raise MCPError(types.INVALID_PARAMS, _message(error)) from None
         contents = types.TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
         return types.ReadResourceResult(contents=[contents])
+
+    async def _list_prompts(
+        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
+    ) -> types.ListPromptsResult:
+        return types.ListPromptsResult(
+            prompts=[
+                types.Prompt(
+                    name=name,
+                    description=text,
+                    arguments=[
+                        types.PromptArgument(name=one, description=what, required=True) for one, what in takes.items()
+                    ],
+                )
+                for name, (text, takes, _) in _PROMPTS.items()
+            ]
+        )
+
+    async def _get_prompt(
+        self, context: ServerRequestContext[Any], params: types.GetPromptRequestParams
+    ) -> types.GetPromptResult:
+        if params.name not in _PROMPTS:
+            raise MCPError(types.INVALID_PARAMS, f"No prompt is called {params.name!r}, only {', '.join(_PROMPTS)}.")
+        text, takes, template = _PROMPTS[params.name]
+        given = params.arguments or {}
+        if given.keys() != takes.keys():
+            raise MCPError(types.INVALID_PARAMS, f"{params.name} takes {', '.join(takes)}.")
+        content = types.TextContent(text=template.format(**given))
+        return types.GetPromptResult(description=text, messages=[types.PromptMessage(role="user", content=content)])
+
+
+async def _ask(
+    context: ServerRequestContext[Any], params: types.CallToolRequestParams, question: str
+) -> types.InputRequiredResult | None:
+    """Ask the person at the agent's host, if it can ask: return the question as the result, or None to go on.
+
+    Hosts of the current protocol get the question as the result, and call again with the answer; those of an older one
+    are asked while their call waits.
+
+    Raises:
+        Stopped: The person does not want it.
+    """
+    client = context.session.client_params
+    offered = None if client is None else client.capabilities.elicitation
+    if offered is None or (offered.form is None and offered.url is not None):
+        return None
+    form = types.ElicitRequestFormParams(message=question, requested_schema={"type": "object", "properties": {}})
+    if context.protocol_version >= _ASKS_BY_RESULT:
+        answer: Any = (params.input_responses or {}).get(_QUESTION)
+        if answer is None:
+            return types.InputRequiredResult(input_requests={_QUESTION: types.ElicitRequest(params=form)})
+    else:
+        answer = await context.session.elicit_form(form.message, form.requested_schema)
+    if getattr(answer, "action", "") != "accept":
+        raise Stopped(f"A person was asked, and did not agree to {params.name}. Nothing was done.")
+    return None
+
+
+def _message(error: BaseException) -> str:
+    return _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
 
 
 def _short(value: Any) -> Any:

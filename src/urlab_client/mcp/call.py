@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import urlsplit
 
 import anyio
 from msgspec import Struct
 
 from urlab_client.aio.background import background_task
+from urlab_client.aio.explain import connection_problem
 from urlab_client.console.lease import NotDriving, Viewer
 from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
@@ -22,14 +25,17 @@ if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
 T = TypeVar("T")
-Progress = Callable[[float, float], Awaitable[None]]
-"""Progress callback: simulation time passed, and its limit."""
+Progress = Callable[[float, float | None, str | None], Awaitable[None]]
+"""Progress callback: seconds passed, their limit if there is one, and what they pass with."""
 
 TAKEN_OVER = "Another program has taken the server over. Ask a person to take it back in the console."
 
 RESTARTED = "The server was started again, and its simulation has begun anew. Call look before going on."
 
 _CONNECT_S = 10.0
+_FIRST_S = 0.5
+_PROBE_S = 0.4
+_TOLD_S = 0.5
 _REPORT_S = 0.1
 _REST_S = 5.0
 _THINKS_S = 60.0  # idle time after which an agent loses the controls; people can take them earlier
@@ -102,19 +108,62 @@ class Call:
         return seconds
 
     async def connected(self) -> None:
-        """Wait until the console's session is open."""
-        with self.console.view.watch() as changed, anyio.move_on_after(_CONNECT_S):
-            while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
+        """Wait until the console's session is open, and report what the caller waits for.
+
+        A simulated server that this program starts has as long as a call may take. One that should be running already
+        is not waited for once an attempt has failed.
+        """
+        starts = self.client.address.startswith("sim://")
+        waiting = background_task("urlab-mcp-connecting", self._report_connecting())
+        try:
+            await self._attempted(self.limits.wall_seconds if starts else _CONNECT_S)
+        finally:
+            waiting.cancel()
+        if self.console.link.state != "connected":
+            raise URLabConnectionError(await self.missing())
+
+    async def _attempted(self, seconds: float) -> None:
+        """Wait until the session is open, a first attempt has failed, or only a person can open it again."""
+        with self.console.view.watch() as changed, anyio.move_on_after(seconds):
+            while (link := self.console.link).state not in {"connected", "taken_over"}:
+                if link.state == "connecting" and link.reason:
+                    return
                 changed.clear()
                 await changed.wait()
-        link = self.console.link
+
+    async def _report_connecting(self) -> None:
+        began = time.monotonic()
+        while True:
+            await asyncio.sleep(_TOLD_S)
+            await self._progress(time.monotonic() - began, None, self._connecting())
+
+    def _connecting(self) -> str:
+        doing = "The simulated server is starting" if self.client.address.startswith("sim://") else "Connecting"
+        return f"{doing}: {self.client.address}."
+
+    async def missing(self) -> str:
+        """Return why there is no connection, as far as can be found out within a second; empty if there is one."""
+        if self.console.link.state == "connecting":
+            await self._attempted(_FIRST_S)
+        link, address = self.console.link, self.client.address
+        if link.state == "connected":
+            return ""
         if link.state == "taken_over":
-            raise URLabConnectionError(TAKEN_OVER)
-        if link.state != "connected":
-            raise URLabConnectionError(
-                f"There is no connection to {self.client.address}: {(link.reason or link.state).rstrip('.?')}.",
-                hint="The connection is retried automatically. Call again later.",
-            )
+            return TAKEN_OVER
+        if address.startswith("sim://") and not link.reason:
+            return f"{self._connecting()} Call again in a few seconds."
+        why = link.reason.rstrip(".?") or "a first attempt is under way"
+        endpoint = urlsplit(address)
+        if endpoint.scheme == "tcp":
+            port = endpoint.port or self.client.config.step_port
+            problem = await connection_problem(endpoint.hostname or "localhost", port, _PROBE_S)
+            why = problem or f"{why}. The port accepts connections, so the server may be busy or starting"
+        known = (
+            f"There is no connection to {address}: {why.rstrip('.?')}. It is retried automatically: call again later."
+        )
+        if self.client.session_id:
+            known += " If the server was started again, its simulation has begun anew: call look before going on."
+        return known
 
     async def drive(self, work: Callable[[], Awaitable[T]]) -> T:
         """Do something that changes the simulation, through the console's controls."""
@@ -156,7 +205,8 @@ class Call:
         while True:
             await asyncio.sleep(_REPORT_S)
             if self._seconds:
-                await self._progress(min(max(self.client.sim_time - start, 0.0), self._seconds), self._seconds)
+                passed = min(max(self.client.sim_time - start, 0.0), self._seconds)
+                await self._progress(passed, self._seconds, None)
 
     async def _rest(self) -> None:
         """Leave the simulation at rest: no request in doubt, and paused in live mode."""

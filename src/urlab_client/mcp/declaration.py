@@ -1,4 +1,7 @@
-"""Declaring tools: the signature of a function becomes the input schema, its docstring the description for agents."""
+"""Declaring tools: the signature of a function becomes the input schema, its docstring the description for agents.
+
+Results have no schemas in the list of tools, which each agent reads before its first call: they would be most of it.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,16 @@ from collections.abc import Awaitable, Callable
 from enum import Enum
 from functools import cached_property
 from types import ModuleType
-from typing import Any, get_type_hints
+from typing import Any, Literal, cast, get_type_hints
 
 import msgspec
 from mcp.types import Tool, ToolAnnotations
 from msgspec import Struct
 
-from urlab_client.mcp.results import Moment
 from urlab_client.values.schemas import prose, schemas
 
 _Function = Callable[..., Awaitable[Any]]
+Wants = Literal["nothing", "server", "play"]
 
 
 class Needs(Enum):
@@ -35,13 +38,19 @@ class Declared:
     Attributes:
         name: Name of the tool.
         drives: Whether it changes something, and therefore takes the controls.
+        wants: What has to be there: `nothing`, the `server`, or `play`, a session of it.
+        discards: What a call discards, or empty.
     """
 
-    def __init__(self, function: _Function, needs: Needs, hints: ToolAnnotations, *, play: bool) -> None:
+    def __init__(
+        self, function: _Function, needs: Needs, hints: ToolAnnotations, *, wants: Wants, discards: str, only: str
+    ) -> None:
         self.name: str = function.__name__
         self.function = function
         self.needs = needs
-        self.play = play
+        self.wants = wants
+        self.discards = discards
+        self._only = only
         self.drives: bool = needs in {Needs.DRIVE, Needs.EDIT}
         self._hints = hints
         self._parameters = list(inspect.signature(function).parameters.values())[1:]
@@ -62,18 +71,17 @@ class Declared:
     @cached_property
     def described(self) -> Tool:
         """The description for agents."""
-        arguments, result = self._arguments, get_type_hints(self.function)["return"]
-        output, when = _schema(result.__args__[0] if hasattr(result, "__args__") else result), _schema(Moment)
-        output["properties"] |= when["properties"]
-        output["required"] = [*output.get("required", ()), *when["required"]]
         return Tool(
             name=self.name,
-            title=self.name.replace("_", " ").capitalize(),
-            description=prose(arguments),
-            input_schema={key: part for key, part in _schema(arguments).items() if key != "description"},
-            output_schema=output,
+            description=" ".join(prose(self._arguments).split()),
+            input_schema={key: part for key, part in _schema(self._arguments).items() if key != "description"},
             annotations=self._hints,
         )
+
+    def question(self, arguments: dict[str, Any]) -> str:
+        """Return the question to a person before a call that discards something, or an empty text."""
+        asks = self.discards and (not self._only or self._only in arguments.values())
+        return f"An agent wants to call {self.name}. {self.discards} Go on?" if asks else ""
 
     def parse(self, given: dict[str, Any]) -> dict[str, Any]:
         """Return the arguments of a call."""
@@ -87,18 +95,26 @@ class Declared:
 
 
 def tool(
-    needs: Needs, *, play: bool = True, destructive: bool = False, idempotent: bool = False
+    needs: Needs, *, wants: Wants = "play", discards: str = "", only: str = "", idempotent: bool = False
 ) -> Callable[[_Function], Declared]:
-    """Declare a function as a tool."""
+    """Declare a function as a tool.
+
+    Args:
+        needs: Permission.
+        wants: What has to be there.
+        discards: What a call discards, as a sentence.
+        only: The argument with which it does; without it, always.
+        idempotent: Whether a second call changes nothing more.
+    """
 
     def declare(function: _Function) -> Declared:
         hints = ToolAnnotations(
             read_only_hint=needs in {Needs.NOTHING, Needs.SESSION},
-            destructive_hint=destructive,
+            destructive_hint=bool(discards),
             idempotent_hint=idempotent,
             open_world_hint=False,
         )
-        return Declared(function, needs, hints, play=play)
+        return Declared(function, needs, hints, wants=wants, discards=discards, only=only)
 
     return declare
 
@@ -112,7 +128,16 @@ def _schema(struct: type[Struct]) -> dict[str, Any]:
     """Return a JSON schema with an object at its root, as the protocol requires."""
     parts = schemas([struct], "#/$defs/{name}")
     root = parts.pop(struct.__name__)
-    return {**root, "$defs": parts} if parts else root
+    shown: dict[str, Any] = _shown({**root, "$defs": parts} if parts else root)
+    return shown
+
+
+def _shown(part: Any) -> Any:
+    """Return a schema without titles, which repeat the names."""
+    if isinstance(part, dict):
+        fields = cast("dict[str, Any]", part)
+        return {key: _shown(value) for key, value in fields.items() if key != "title" or isinstance(value, dict)}
+    return [_shown(one) for one in cast("list[Any]", part)] if isinstance(part, list) else part
 
 
 def _from_text(value: Any) -> Any:

@@ -1,12 +1,37 @@
-"""Return types of the tools for which the client has no type."""
+"""Return types of the tools for which the client has no type, and the names that agents see."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
 from urlab_client.console.messages import LogEntry
-from urlab_client.values.descriptions import Pose, SceneDescription
-from urlab_client.values.types import Contact
+from urlab_client.values.descriptions import ArticulationDescription, Pose
+from urlab_client.values.names import owner_of
+from urlab_client.values.rotation import Vec3
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+
+UNITS = "World frame, z up; metres, seconds, rad, N; quaternions (w, x, y, z)."
+
+
+def label(client: URLabClient, body: str, geom: str = "") -> str:
+    """Return what agents call a compiled body: `ID/BODY`, or the id alone if there is no more than one body.
+
+    Args:
+        client: The client.
+        body: Compiled name of the body.
+        geom: Compiled name of a geom of it, which tells whose it is if the body is the world.
+    """
+    prefixes = {art.compiled_prefix: art for art in client.articulations.values()}
+    name = body if body not in {"", "world"} else geom
+    owner = owner_of(name, frozenset(prefixes))
+    if owner is None:
+        return name or "world"
+    art = prefixes[owner]
+    return f"{art.actor_id or art.name}/{name[len(owner) + 1 :]}" if len(art.bodies) > 1 else art.actor_id or art.name
 
 
 class Moment(Struct):
@@ -23,19 +48,79 @@ class Moment(Struct):
     mode: str
 
 
+class HandPose(Struct):
+    """A robot's hand: the site or body that `move_hand` moves.
+
+    Attributes:
+        robot: Name of the robot.
+        hand: Name of the site or body.
+        position: Metres.
+        quaternion: Orientation (w, x, y, z).
+        gripper: Set-point of the gripper, or None if there is none.
+        gripper_limits: Range of that set-point.
+    """
+
+    robot: str
+    hand: str
+    position: list[float]
+    quaternion: list[float]
+    gripper: float | None
+    gripper_limits: tuple[float, float] | None
+
+
+class HandMoved(Struct):
+    """A hand after a movement.
+
+    Attributes:
+        pose: Its pose.
+        error: Distance from the last pose that was asked for, metres.
+        reached: Poses reached.
+        passed: Simulation time that passed, seconds.
+    """
+
+    pose: HandPose
+    error: float
+    reached: int
+    passed: float
+
+
+class Object(Struct):
+    """A body or thing that is not a robot.
+
+    Attributes:
+        name: Its id.
+        pose: Its pose.
+        fixed: Whether it cannot move.
+    """
+
+    name: str
+    pose: Pose | None
+    fixed: bool
+
+
 class World(Struct):
     """The world.
 
     Attributes:
-        scene: Robots with joints, actuators, sensors and cameras, and other bodies.
-        blueprints: What `spawn` can place.
-        models: What `import_model` can turn into a blueprint.
+        connection: `connected`, or what is missing; then the rest is what was last known.
+        units: Frame and units of all poses.
+        playing: Whether a play session is running.
+        robots: Robots with joints, actuators, sensors and cameras.
+        hands: Hands of the robots.
+        objects: Everything else that was placed or can move.
+        cameras: Names for `picture`.
+        models: What `apply_scene` can place.
         keyframes: What `reset` can start from.
         driver: Holder of the controls: `you`, another name, or None.
     """
 
-    scene: SceneDescription
-    blueprints: list[str]
+    connection: str
+    units: str
+    playing: bool
+    robots: list[ArticulationDescription]
+    hands: list[HandPose]
+    objects: list[Object]
+    cameras: list[str]
     models: list[str]
     keyframes: list[str]
     driver: str | None
@@ -85,15 +170,31 @@ class Picture(Struct):
     kind: str
 
 
+class Touch(Struct):
+    """Two bodies that touch.
+
+    Attributes:
+        between: Their names.
+        position: Metres.
+        distance: Metres; negative if they penetrate.
+        force: Normal force, N.
+    """
+
+    between: tuple[str, str]
+    position: Vec3
+    distance: float
+    force: float
+
+
 class Contacts(Struct):
     """Bodies that touch.
 
     Attributes:
-        contacts: Forces are in N and N m in the contact's frame, the first along its normal.
+        contacts: Where and how they touch.
         truncated: Whether there are more.
     """
 
-    contacts: list[Contact]
+    contacts: list[Touch]
     truncated: bool
 
 
@@ -135,9 +236,9 @@ class Edited(Struct):
     Attributes:
         done: Description of what was done.
         robots: Robots in the scene.
-        bodies: Other bodies in the scene.
+        objects: Other things in the scene.
     """
 
     done: str
     robots: list[str]
-    bodies: list[str]
+    objects: list[str]

@@ -7,44 +7,99 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import anyio.to_thread
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, Struct, structs
 
-from urlab_client.aio.client_types import Diagnosis
+from urlab_client.aio.client_types import Diagnosis, Finding, Verdict
 from urlab_client.enums import StepMode
 from urlab_client.errors import ImportFailed
+from urlab_client.mcp import hands
 from urlab_client.mcp.call import Call
 from urlab_client.mcp.declaration import Needs, tool
-from urlab_client.mcp.results import Contacts, Done, Edited, Log, Picture, Recorded, RobotState, World
+from urlab_client.mcp.hands import Position, Quaternion, Waypoint
+from urlab_client.mcp.results import (
+    UNITS,
+    Contacts,
+    Done,
+    Edited,
+    HandMoved,
+    HandPose,
+    Log,
+    Object,
+    Picture,
+    Recorded,
+    RobotState,
+    Touch,
+    World,
+    label,
+)
 from urlab_client.values.names import did_you_mean
+from urlab_client.values.rotation import normalized, xyzw
 
-Robot = Annotated[str, Meta(description="Name or actor id of a robot, as `look` lists it.")]
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabCameraView, URLabClient
+
+Robot = Annotated[str, Meta(description="Name from `look`.")]
 Positive = Annotated[float, Meta(gt=0)]
 Targets = Annotated[dict[str, float], Meta(min_length=1)]
-Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
-Position = Annotated[list[Metres], Meta(description="(x, y, z) in the world, metres.", min_length=3, max_length=3)]
-Actor = Annotated[str, Meta(description="Name or actor id of a robot or body, as `look` lists it.", min_length=1)]
+Actor = Annotated[str, Meta(description="Name from `look`.", min_length=1)]
 NewId = Annotated[str, Meta(pattern=r"^[A-Za-z]\w{0,63}$")]
-Degrees = Annotated[float, Meta(ge=-360, le=360)]
+HandName = Annotated[str, Meta(description="Site or body; default: the one that `look` lists.")]
+Speed = Annotated[float, Meta(description="m/s.", gt=0, le=2)]
+
+_RESTARTS = "Play restarts: the simulation begins anew, and all that has moved is back at its initial state."
+
+
+class Placed(Struct, frozen=True, forbid_unknown_fields=True):
+    """One robot or object and where it is.
+
+    Attributes:
+        id: Id of your choice: letters, digits and `_`. What has this id already is moved.
+        model: One of `models` in `look`; not needed for what is there already.
+        position: Of its model's origin.
+    """
+
+    id: NewId
+    position: Position
+    model: str = ""
+    quaternion: Quaternion | None = None
+
 
 _RECORDED_S = 0.02
 
 
-@tool(Needs.NOTHING, play=False, idempotent=True)
+@tool(Needs.NOTHING, wants="nothing", idempotent=True)
 async def look(call: Call) -> World:
-    """Describe the world: robots with joints, actuators, sensors, cameras, units and limits; other bodies.
+    """Describe the world, in one frame: robots with joints, actuators, sensors and limits; poses of hands and objects;
+    cameras.
 
-    Call this first. Angles are in radians, lengths in metres, the z axis points up.
+    Call this first. Angles are in radians, lengths in metres, the z axis points up. Without a connection it says what
+    is missing.
     """
-    client, holder, edits = call.client, call.console.lease.holder, call.limits.edit
-    model = client.model
+    client, holder, missing = call.client, call.console.lease.holder, await call.missing()
+    model, known = client.model, client.describe()
+    arts = {one.name: one for one in known.articulations}
+    ids = {key: one.actor_id or key for key, one in arts.items()}
+    robots = [structs.replace(one, name=ids[key]) for key, one in arts.items() if one.actuators]
+    things = [one for one in arts.values() if not one.actuators]
+    objects = [Object(ids[one.name], one.pose, fixed=not (one.free_base or one.joints)) for one in things]
+    objects += [Object(one.name, one.pose, fixed=not one.free_base) for one in known.entities]
+    models = set(call.models)
+    if call.limits.edit and not missing:
+        models |= {one.short_name for one in await client.outliner.list_blueprints()}
     return World(
-        scene=client.describe(),
-        blueprints=[one.short_name for one in await client.outliner.list_blueprints()] if edits else [],
-        models=sorted(call.models) if edits else [],
+        connection=missing or "connected",
+        units=UNITS,
+        playing=known.playing,
+        robots=robots,
+        hands=[] if missing or not known.playing else await anyio.to_thread.run_sync(hands.hands, client),
+        objects=objects,
+        cameras=[f"{ids[key]}/{camera.name}" for key, one in arts.items() for camera in one.cameras]
+        + [camera.name for camera in known.cameras],
+        models=sorted(models) if call.limits.edit else [],
         keyframes=[] if model is None else [model.key(number).name for number in range(model.nkey)],
         driver=None if holder is None else "you" if holder is call.caller else holder.name,
     )
@@ -55,7 +110,7 @@ async def state(call: Call, robot: Robot) -> RobotState:
     """Read a robot: joint positions and velocities, set-points and sensor readings."""
     described = call.robot(robot).describe()
     return RobotState(
-        robot=described.name,
+        robot=described.actor_id or described.name,
         pose=described.pose,
         joints={joint.name: joint.position for joint in described.joints if isinstance(joint.position, float)},
         velocities={joint.name: joint.velocity for joint in described.joints if isinstance(joint.velocity, float)},
@@ -69,12 +124,24 @@ async def picture(call: Call, camera: str, size: Annotated[int, Meta(ge=16, le=1
     """Take a picture of the current world with a camera. No time passes. Depth is grey, with near pixels bright.
 
     Args:
-        camera: `ROBOT/CAMERA`, or the name of a camera of the scene; see `look`.
+        camera: One of `cameras` in `look`.
         size: Maximum length of the longer side, pixels.
     """
-    sample = await call.client.camera(camera).capture()
+    sample = await _camera(call.client, camera).capture()
     jpeg = await anyio.to_thread.run_sync(partial(sample.jpeg, max_size=size))
     return Picture(camera=camera, kind=str(sample.mode)), jpeg
+
+
+async def jpeg_of(client: URLabClient, camera: str) -> bytes:
+    """Take a picture and return it as a JPEG file."""
+    sample = await _camera(client, camera).capture()
+    return await anyio.to_thread.run_sync(sample.jpeg)
+
+
+def _camera(client: URLabClient, name: str) -> URLabCameraView:
+    owner, _, short = name.rpartition("/")
+    robot = client.articulations.get(owner)
+    return client.camera(name if robot is None else f"{robot.prefix}/{short}")
 
 
 @tool(Needs.SESSION, idempotent=True)
@@ -85,19 +152,30 @@ async def contacts(call: Call, most: Annotated[int, Meta(ge=1, le=200)] = 30) ->
         most: Maximum number of contacts to return.
     """
     found = await call.client.runtime.get_contacts(max_contacts=most)
-    return Contacts(contacts=found.contacts, truncated=found.truncated)
+    touching = [
+        Touch(
+            (label(call.client, one.body1, one.geom1), label(call.client, one.body2, one.geom2)),
+            one.pos,
+            one.dist,
+            one.force[0],
+        )
+        for one in found.contacts
+    ]
+    return Contacts(contacts=touching, truncated=found.truncated)
 
 
-@tool(Needs.NOTHING, play=False, idempotent=True)
+@tool(Needs.NOTHING, wants="nothing", idempotent=True)
 async def explain(call: Call) -> Diagnosis:
     """Find out why a robot does not move: connection, play, pause, modes, controllers, set-points.
 
     Call this when something did not move as expected. Findings with verdict `problem` say what to do.
     """
+    if missing := await call.missing():
+        return Diagnosis([Finding(Verdict.PROBLEM, "server", missing)])
     return await call.client.explain()
 
 
-@tool(Needs.NOTHING, play=False)
+@tool(Needs.NOTHING, wants="nothing")
 async def log(call: Call, since: int | None = None) -> Log:
     """Read the log: calls, errors and events, including those of people.
 
@@ -154,6 +232,52 @@ async def move_to(
     return Done(done=f"{found.name} has settled: {reached}.", passed=passed)
 
 
+@tool(Needs.NOTHING, idempotent=True)
+async def hand_pose(call: Call, robot: Robot, hand: HandName | None = None) -> HandPose:
+    """Read the pose of a robot's hand, and its gripper."""
+    found = call.robot(robot)
+    ik = await anyio.to_thread.run_sync(hands.solver, call.client, found, hand)
+    return hands.pose_of(found, ik)
+
+
+@tool(Needs.DRIVE, idempotent=True)
+async def move_hand(
+    call: Call,
+    robot: Robot,
+    *,
+    position: Position | None = None,
+    quaternion: Quaternion | None = None,
+    gripper: float | None = None,
+    speed: Speed = 0.25,
+    hand: HandName | None = None,
+) -> HandMoved:
+    """Move a hand to a pose, in a straight line where possible, then set its gripper; wait until it is there, within
+    1 cm.
+
+    Refuses what is out of reach, and ways on which the robot would run into itself or something fixed, and says how far
+    it gets; then nothing has moved. It may push what can move. Without `quaternion`, the hand keeps its orientation if
+    it can.
+
+    Args:
+        gripper: Set-point of the gripper, within the limits of `look`.
+    """
+    if (position, quaternion, gripper) == (None, None, None):
+        raise ValueError("move_hand takes at least one of position, quaternion and gripper.")
+    return await hands.follow(call, robot, [Waypoint(position, quaternion, gripper)], hand, speed)
+
+
+@tool(Needs.DRIVE, idempotent=True)
+async def follow(
+    call: Call,
+    robot: Robot,
+    poses: Annotated[list[Waypoint], Meta(min_length=1, max_length=20)],
+    speed: Speed = 0.25,
+    hand: HandName | None = None,
+) -> HandMoved:
+    """Move a hand through several poses, like `move_hand` for each. The whole way is checked before anything moves."""
+    return await hands.follow(call, robot, poses, hand, speed)
+
+
 @tool(Needs.DRIVE, idempotent=True)
 async def set_actuators(call: Call, robot: Robot, set_points: Targets) -> Done:
     """Set set-points of actuators; the others keep theirs. They take effect as time passes, so call `run` afterwards.
@@ -168,7 +292,7 @@ async def set_actuators(call: Call, robot: Robot, set_points: Targets) -> Done:
     return Done(done=f"{found.name} has new set-points: {', '.join(set_points)}.")
 
 
-@tool(Needs.DRIVE, destructive=True, idempotent=True)
+@tool(Needs.DRIVE, discards="The simulation begins anew.", idempotent=True)
 async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[str, float]] | None = None) -> Done:
     """Reset the simulation to its initial state. Set-points are kept. Also use it when the simulation has diverged.
 
@@ -187,7 +311,7 @@ async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[
     return Done(done="The simulation was reset.")
 
 
-@tool(Needs.DRIVE, play=False, destructive=True, idempotent=True)
+@tool(Needs.DRIVE, wants="server", discards="The play session ends, with its state.", only="stop", idempotent=True)
 async def play(call: Call, action: Literal["start", "stop", "pause", "resume"]) -> Done:
     """Start or stop the play session, without which there are no robots; pause or resume time in mode `live`.
 
@@ -221,72 +345,83 @@ async def record(call: Call, action: Literal["start", "stop"], cameras: bool = F
     return msgspec.convert(await call.console.recordings.stop(), Recorded, from_attributes=True)
 
 
-@tool(Needs.EDIT, play=False)
-async def import_model(call: Call, model: str) -> Edited:
-    """Turn a model into a blueprint, which `spawn` then places. Takes a name, never a path.
+@tool(Needs.EDIT, wants="server", discards=_RESTARTS, idempotent=True)
+async def apply_scene(
+    call: Call,
+    objects: Annotated[list[Placed], Meta(max_length=50)],
+    remove: Annotated[list[Actor], Meta(description="Robots and objects to remove.", max_length=50)] = [],  # noqa: B006
+) -> Edited:
+    """Place, move and remove several robots and objects at once. Restarts play, once: the simulation begins anew, with
+    all robots at their initial state."""
+    blueprints = {one.short_name: one.class_path for one in await call.client.outliner.list_blueprints()}
+    actors = {row.actor_id for row in await call.client.outliner.list_actors() if row.actor_id}
+    doomed = [await _target(call, name) for name in remove]
+    gone = {one["target"] for one in doomed}
+    for one in objects:  # before anything changes
+        if one.id in actors - gone or one.model in blueprints or one.model in call.models:
+            continue
+        known = {*blueprints, *call.models}
+        raise LookupError(f"No model is called {one.model!r}.{did_you_mean(one.model, known)} See `models` in look.")
+    notes = ""
+    async with call.client.scene.edit():
+        for target in doomed:
+            await call.client.scene.destroy_actor(**target)
+        for one in objects:
+            turn = _turn(one.quaternion)
+            if one.id in actors - gone:
+                await call.client.scene.set_actor_transform(one.id, location=one.position, rotation_quat=turn)
+                continue
+            if one.model not in blueprints:
+                blueprints[one.model], note = await _imported(call, one.model)
+                notes += note
+            await call.client.scene.spawn_actor(
+                blueprints[one.model], one.id, location=one.position, rotation_quat=turn
+            )
+    placed = ", ".join(one.id for one in objects)
+    said = [f"Placed: {placed}."] if placed else []
+    said += [f"Removed: {', '.join(remove)}."] if remove else []
+    return _edited(call, " ".join(said) + notes)
 
-    Args:
-        model: One of `models`, as `look` lists them.
-    """
-    if model not in call.models:
-        raise LookupError(f"No model is called {model!r}.{did_you_mean(model, call.models)} See `models` in look.")
+
+async def _imported(call: Call, model: str) -> tuple[str, str]:
+    """Turn a model into a blueprint; return its class and what an agent should know of it."""
     scene, file = call.client.scene, call.models[model]
-    done = "The blueprint {!r} is there; spawn places it."
     try:
-        blueprint = await scene.import_xml(str(file))
+        return (await scene.import_xml(str(file))).class_path, ""
     except ImportFailed:
         if not call.client.server.features.uploads:
             raise
-        before = [one.short_name for one in await call.client.outliner.list_blueprints()]
-        blueprint = await scene.upload_model(file)  # the server does not have the file, or may not read it
-        if blueprint.short_name in before:
-            done += " It has replaced the model that was sent before: this server keeps one."
-    return _edited(call, done.format(blueprint.short_name))
+        before = [one.class_path for one in await call.client.outliner.list_blueprints()]
+        made = (await scene.upload_model(file)).class_path  # the server does not have the file, or may not read it
+        replaced = f" {model} has replaced the model that was sent before: this server keeps one."
+        return made, replaced if made in before else ""
 
 
-@tool(Needs.EDIT, play=False)
-async def spawn(call: Call, blueprint: str, actor_id: NewId, position: Position, yaw: Degrees = 0.0) -> Edited:
-    """Place a robot or body. Restarts play: the simulation starts from the beginning, with all robots at their initial
-    state.
-
-    Args:
-        blueprint: One of `blueprints`, as `look` lists them; `import_model` makes more.
-        actor_id: Id of your choice for the new actor: letters, digits and `_`.
-        position: Position of its origin: (x, y, z) in the world, metres.
-        yaw: Rotation about the vertical axis, degrees.
-    """
-    known = {one.short_name: one.class_path for one in await call.client.outliner.list_blueprints()}
-    if blueprint not in known:
-        advice = "import_model makes one of it." if blueprint in call.models else "See `blueprints` in look."
-        raise LookupError(f"No blueprint is called {blueprint!r}.{did_you_mean(blueprint, known)} {advice}")
-    if any(row.actor_id == actor_id for row in await call.client.outliner.list_actors()):
-        raise ValueError(f"There is already an actor {actor_id!r}: move moves it, remove removes it.")
-    async with call.client.scene.edit():
-        await call.client.scene.spawn_actor(
-            known[blueprint], actor_id, location=position, rotation_euler=(0.0, 0.0, yaw)
-        )
-    placed = _edited(call, f"{actor_id} is placed.")
-    if (robot := call.client.articulations.get(actor_id)) is not None:
-        placed.done = f"{actor_id} is placed: it is the robot {robot.name!r}."
-    return placed
-
-
-@tool(Needs.EDIT, play=False, idempotent=True)
-async def move(call: Call, actor: Actor, position: Position) -> Edited:
-    """Move a robot or body in the level. Restarts play: the simulation starts from the beginning."""
+@tool(Needs.EDIT, wants="server", discards=_RESTARTS, idempotent=True)
+async def move(
+    call: Call, actor: Actor, position: Position | None = None, quaternion: Quaternion | None = None
+) -> Edited:
+    """Move or turn a robot or object in the level. Restarts play: the simulation begins anew."""
+    if position is None and quaternion is None:
+        raise ValueError("move takes a position, a quaternion, or both.")
     target = await _target(call, actor)
     async with call.client.scene.edit():
-        await call.client.scene.set_actor_transform(**target, location=position)
+        await call.client.scene.set_actor_transform(**target, location=position, rotation_quat=_turn(quaternion))
     return _edited(call, f"{actor} is moved.")
 
 
-@tool(Needs.EDIT, play=False, destructive=True, idempotent=True)
+@tool(Needs.EDIT, wants="server", discards=_RESTARTS, idempotent=True)
 async def remove(call: Call, actor: Actor) -> Edited:
-    """Remove a robot or body from the level. Restarts play: the simulation starts from the beginning."""
-    target = await _target(call, actor)
-    async with call.client.scene.edit():
-        await call.client.scene.destroy_actor(**target)
-    return _edited(call, f"{actor} is removed.")
+    """Remove a robot or object from the level. Restarts play: the simulation begins anew."""
+    return await apply_scene.function(call, [], [actor])
+
+
+def _turn(quaternion: list[float] | None) -> list[float] | None:
+    """Return an orientation in the order of the wire."""
+    if quaternion is None:
+        return None
+    w, x, y, z = quaternion
+    return [*xyzw(normalized((w, x, y, z)))]
 
 
 async def _target(call: Call, named: str) -> dict[str, Any]:
@@ -306,5 +441,8 @@ async def _target(call: Call, named: str) -> dict[str, Any]:
 
 
 def _edited(call: Call, done: str) -> Edited:
-    robots = call.client.articulations
-    return Edited(done, list(robots), [name for name in call.client.entities if name not in robots])
+    robots = [art for art in call.client.articulations.values() if art.actuators]
+    named = {art.prefix: art.actor_id or art.name for art in call.client.articulations.values()}
+    own = {art.prefix for art in robots}
+    objects = [named.get(key, key) for key in call.client.entities if key not in own]
+    return Edited(done, [named[art.prefix] for art in robots], objects)

@@ -67,7 +67,7 @@ class Request(Struct, Generic[R_co], tag_field="op", kw_only=True, omit_defaults
     session_id: Annotated[str, doc("Session id from the latest `hello_ok`.")] = ""
 
 
-class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=True):
+class ControlRequest(Request[R_co], Generic[R_co], kw_only=True):
     """A request that writes to a robot. Some servers accept it only from the robot's owner."""
 
     control_owner: Annotated[

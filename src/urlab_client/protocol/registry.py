@@ -10,7 +10,6 @@ from urlab_client import errors
 from urlab_client.protocol.base import DialectName, Op
 from urlab_client.protocol.messages import (
     cameras,
-    control,
     debug,
     farm,
     jobs,
@@ -74,7 +73,6 @@ OPS: Mapping[str, Op] = registry(
     *outliner.OPS,
     *debug.OPS,
     *viewport.OPS,
-    *control.OPS,
     *cameras.OPS,
     *jobs.OPS,
     *uploads.OPS,

@@ -23,7 +23,7 @@ Range = tuple[Bound, Bound]
 """Lowest and highest value: numbers, or three numbers each for vectors, whose components are drawn separately."""
 
 Steps = int | tuple[int, int]
-"""A number of actions, or a range from which one is drawn for each episode."""
+"""A number of actions or physics steps, or a range from which one is drawn for each episode."""
 
 Field = Literal["qpos", "qvel", "ctrl", "act", "sensors", "task"]
 
@@ -219,19 +219,22 @@ class Delay(_Declared, frozen=True, kw_only=True):
 
     Attributes:
         observation: Age of observations in actions; cameras have a separate latency.
-        action: Number of actions after which an action takes effect; set-points are zero until then.
+        action: Number of actions after which an action takes effect. Until then the set-points hold the keyframe.
+        action_substeps: Physics steps of further delay of an action.
         drop: Probability that an observation is lost, so that the previous one is repeated.
     """
 
     observation: Steps = 0
     action: Steps = 0
+    action_substeps: Steps = 0
     drop: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("observation", "action"):
+        for name in ("observation", "action", "action_substeps"):
             low, high = steps_range(getattr(self, name))
             if not 0 <= low <= high:
-                raise ValueError(f"delay: {name} must be 0 or more actions, lowest first, not {low} to {high}")
+                unit = "physics steps" if name == "action_substeps" else "actions"
+                raise ValueError(f"delay: {name} must be 0 or more {unit}, lowest first, not {low} to {high}")
         if not 0 <= self.drop < 1:
             raise ValueError(f"delay: drop must be a probability below 1, not {self.drop}")
 
@@ -280,7 +283,7 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
     @property
     def delays_actions(self) -> bool:
         """Whether actions are delayed."""
-        return steps_range(self.delay.action)[1] > 0
+        return any(steps_range(steps)[1] for steps in (self.delay.action, self.delay.action_substeps))
 
     def latencies(self, cameras: Iterable[str]) -> dict[str, CameraLatency]:
         """Return the latencies of the cameras that have one; the last entry that names a camera applies."""

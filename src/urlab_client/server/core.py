@@ -1,4 +1,4 @@
-"""The state that the op handlers of a server share: its world, its session and its play.
+"""The configuration of a server, and the state that its op handlers share: its world, its session and its play.
 
 Handlers get it as their first argument; `open_server` creates it.
 """
@@ -13,7 +13,7 @@ import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import mujoco
 
@@ -22,29 +22,79 @@ from urlab_client.enums import CameraMode, ObservationLevel, PIEState, StepMode
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
-from urlab_client.randomise.declaration import MODEL_TEXT
+from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
-from urlab_client.server.config import ServerConfig
-from urlab_client.server.dialects import Dialect
+from urlab_client.server.compile.scene_index import ArticulationIndex
+from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
+from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
-from urlab_client.server.physics.channels import UserChannels
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.observe import Observer
+from urlab_client.server.physics.observe import Observer, UserChannels
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.system.allocator import trim
-from urlab_client.server.system.threads import Health
-from urlab_client.simulation.appearance import Appearance
+from urlab_client.server.system.threads import Health, trim
+from urlab_client.server.transport.curve_authentication import CurveServer
+from urlab_client.simulation.appearance import Appearance, RenderQuality
+from urlab_client.simulation.controller_config import ControllerConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerConfig:
+    """Configuration of a server; `SimulatedServer` describes and checks it."""
+
+    models: tuple[str, ...] = ()
+    play: bool = False
+    unpaused: bool = False
+    step_mode: StepMode = StepMode.AUTO
+    host: str = "127.0.0.1"
+    curve: CurveServer | None = None
+    insecure_no_auth: bool = False
+    limits: Limits = field(default_factory=Limits)
+    step_port: int = 0
+    state_port: int = 0
+    ctrl_port: int = 0
+    info_port: int = 0
+    camera_port: int = 0
+    saved_dir: Path | None = None
+    model_roots: tuple[Path, ...] | None = None
+    controllers: Mapping[str, ControllerConfig] = field(default_factory=dict[str, ControllerConfig])
+    camera_modes: Mapping[str, CameraMode] = field(default_factory=dict[str, CameraMode])
+    camera_size: tuple[int, int] | None = None
+    render_quality: RenderQuality = "auto"
+    mjcf_options: bool = False
+    actor_names: Literal["model", "plugin"] = "model"
+    faults: Faults | None = None
+    shm_dir: Path | None = None
+    dialect: Dialect = ALPHA
+    user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    randomise: Randomisation | None = None
+    instance_id: str = "live"
+    index: int = -1
+
+    def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
+        """Return the controller of an articulation: the configured one, otherwise that of the level or its MJCF."""
+        for name in (index.actor_id, index.key, "*"):
+            if name and name in self.controllers:
+                return self.controllers[name]
+        return None if index.controller is None else index.controller
+
+    def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
+        """Return the mode of an articulation's camera."""
+        for name in (index.actor_id, index.key):
+            if name and f"{name}/{camera}" in self.camera_modes:
+                return self.camera_modes[f"{name}/{camera}"]
+        return CameraMode.REAL
+
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import datetime as dt
 import logging
 import os
 import socket
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,16 +19,16 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._platform.files import write_whole
 from urlab_client._sandbox.confinement import is_available
 from urlab_client.enums import PIEState, Transport
 from urlab_client.errors import URLabError
-from urlab_client.protocol.instances import registry_directory
+from urlab_client.protocol import instances
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import CompiledScene
-from urlab_client.server.config import ServerConfig
-from urlab_client.server.core import DriverLease, ServerCore, ServerSession
+from urlab_client.server.core import DriverLease, ServerConfig, ServerCore, ServerSession
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
@@ -38,15 +41,58 @@ from urlab_client.server.rpc.dispatch import Dispatcher, Watchdog
 from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.commands import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
-from urlab_client.server.streams.registration import Registration
 from urlab_client.server.system.temporary_folder import TemporaryFolder
-from urlab_client.server.system.threads import Health
+from urlab_client.server.system.threads import Health, ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
 from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+
+class Registration:
+    """Keeps the file of one server in the registry for as long as the server is open."""
+
+    def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
+        self._directory = directory
+        self._describe = describe
+        self._path: Path | None = None
+        self._stopping = threading.Event()
+        self._thread = health.thread("urlab-registry", self._run)
+
+    def start(self) -> None:
+        """Write the file, and renew it before it would be considered stale."""
+        self._write()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread to end and remove the file; return False if the thread is still busy."""
+        if self._thread.ident is not None:
+            ended(self._thread, timeout)
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(instances.REWRITE_S):
+            self._write()
+
+    def _write(self) -> None:
+        instance = self._describe()
+        path = self._directory / f"{instance.instance_id}_{instance.pid}.json"
+        try:
+            write_whole(path, instances.encode(instance, dt.datetime.now(dt.UTC)), durable=False)
+        except OSError as error:
+            logger.warning("the server is not in the registry: %s", error)
+        else:
+            self._path = path
+
 
 CLOSE_S: Final = 1.0
 """Longest time for closing the server."""
@@ -199,7 +245,7 @@ def _open(config: ServerConfig, host: str, curve_keys: CurveKeys | None, resourc
     watchdog.start()
     endpoint.start()
     if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
-        registration = Registration(registry_directory(), describe, health)
+        registration = Registration(instances.registry_directory(), describe, health)
         parts.append(registration)
         registration.start()
     if memory is not None:

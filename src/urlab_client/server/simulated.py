@@ -17,15 +17,15 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode, StepMode, StepModeName
 from urlab_client.protocol.base import DialectName
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.server.config import ServerConfig
+from urlab_client.server.core import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
 from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, open_server, take_snapshot
-from urlab_client.server.physics.channels import channel_problem
+from urlab_client.server.physics.observe import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
@@ -63,7 +63,7 @@ class SimulatedServer:
         *models: str | os.PathLike[str],
         play: bool = False,
         unpaused: bool = False,
-        step_mode: StepMode | str = StepMode.AUTO,
+        step_mode: StepMode | StepModeName = "auto",
         host: str = "127.0.0.1",
         curve: CurveServer | None = None,
         insecure_no_auth: bool = False,

@@ -2,7 +2,7 @@
 
 from urlab_client.aio.defaults import DEFAULT
 from urlab_client.aio.launch import check_address
-from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
+from urlab_client.aio.model.elements import Actuator, Body, Joint, ScalarJoint, Sensor
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.client import URLabClient
@@ -14,6 +14,7 @@ __all__ = [
     "Actuator",
     "Body",
     "Joint",
+    "ScalarJoint",
     "Sensor",
     "Stream",
     "URLabArticulation",

@@ -11,7 +11,7 @@ import warnings
 from typing import Any, Protocol, TypeVar, cast, overload
 
 from urlab_client.sync._portal import Portal
-from urlab_client.values.names import NameMap
+from urlab_client.values.names import NameMap, PublicDir
 
 A_co = TypeVar("A_co", covariant=True)
 F = TypeVar("F", bound="Facade")
@@ -19,7 +19,7 @@ F = TypeVar("F", bound="Facade")
 _FACADES: dict[type, type[Facade]] = {}
 
 
-class Facade:
+class Facade(PublicDir):
     """Base of the generated classes: the blocking twin of one asynchronous object.
 
     A subclass names the class that it wraps: `class Scene(Facade, twin=aio.Scene)`. Only `wrap` creates instances.
@@ -66,6 +66,10 @@ class Facade:
         if type(self._aio).__repr__ is object.__repr__:
             return super().__repr__()
         return repr(self._aio)
+
+    def _repr_html_(self) -> str | None:
+        shown = getattr(self._aio, "_repr_html_", None)
+        return None if shown is None else shown()
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise TypeError(

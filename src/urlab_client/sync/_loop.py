@@ -14,15 +14,18 @@ streams and heartbeats. The rules:
 5. Signals are deferred while the main thread is in this module. An arriving signal makes the call leave the loop; then
    its handler runs, and if the handler raises, the call is cancelled.
 
-A thread with its own running loop, as in a notebook, cannot run a second one: its calls are always queued.
+A thread with its own running loop, as in a notebook, cannot run a second one: its calls are always queued. The loop
+relies on asyncio's public interface only.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import logging
 import os
+import selectors
 import sys
 import threading
 import time
@@ -30,8 +33,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from urlab_client.aio.background import background_thread
-from urlab_client.errors import ClientClosed, URLabError
-from urlab_client.sync._caller_loop import CallerLoop
+from urlab_client.errors import ClientClosed
 from urlab_client.sync._signals import DeferredSignals
 
 T = TypeVar("T")
@@ -52,6 +54,9 @@ _IDLE = 0.005
 # lock. Until it gets the lock, up to five milliseconds later, every release of it costs the caller a system call.
 _LONGEST_PAUSE = 0.08
 
+# Rounds of callbacks between two looks at the sockets.
+_ROUNDS = 3
+
 # Seconds after which the thread is asked again for the turn.
 _CLAIM_SLICE = 0.05
 
@@ -67,6 +72,23 @@ def client_closed(when: str = "before this call") -> ClientClosed:
     return ClientClosed(f"The client was closed {when}.", hint="Create a new one.")
 
 
+class _Selector(selectors.DefaultSelector):
+    """Does not ask the system for sockets at each round of callbacks.
+
+    A call is one round that sends, one wait, and one round that takes the reply. asyncio polls before each of them, for
+    longer than the call's own code takes, and finds nothing.
+    """
+
+    _left_out = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is not None and timeout <= 0 and self._left_out < _ROUNDS:  # callbacks are ready
+            self._left_out += 1
+            return []
+        self._left_out = 0
+        return super().select(timeout)
+
+
 class Job(Generic[T]):
     """A coroutine to run on the loop, created by the calling thread and finished by the thread that runs the loop.
 
@@ -74,10 +96,9 @@ class Job(Generic[T]):
         error: The exception that it raised; otherwise `value` is its result.
         finished: Whether it has ended.
         leave: Whether its caller should stop waiting for it.
-        started: Whether the coroutine has started. One that has not must be closed, because cancelling has no effect.
     """
 
-    __slots__ = ("_waiter", "coro", "error", "finished", "leave", "started", "task", "value")
+    __slots__ = ("_waiter", "coro", "error", "finished", "leave", "task", "value")
 
     value: T
 
@@ -87,8 +108,12 @@ class Job(Generic[T]):
         self.error: BaseException | None = None
         self.finished = False
         self.leave = False
-        self.started = False
         self._waiter: threading.Lock | None = None
+
+    @property
+    def started(self) -> bool:
+        """Whether the coroutine has started. One that has not must be closed, because cancelling has no effect."""
+        return inspect.getcoroutinestate(self.coro) != inspect.CORO_CREATED
 
     def wait(self, timeout: float = threading.TIMEOUT_MAX) -> None:
         """Block until the job is finished or its caller has to leave, at most `timeout` seconds."""
@@ -121,8 +146,8 @@ class CallerDrivenLoop:
     ) -> None:
         self._owner = owner
         # Not new_event_loop(): the user's loop policy is for the user's loop, and pyzmq needs a selector on Windows.
-        self._loop = CallerLoop()
-        self._thread = background_thread("urlab-io", self._run, failed=self._die)
+        self._loop = asyncio.SelectorEventLoop(_Selector())
+        self._thread = background_thread("urlab-io", self._run)
         self._failure: BaseException | None = None
         self._pid = os.getpid()
         self._at_stop = at_stop
@@ -172,9 +197,7 @@ class CallerDrivenLoop:
             BaseException: A signal handler raised it. The job was cancelled and had `GRACE` seconds to clean up.
         """
         try:
-            drives = self._may_drive() and self._enlist(job)
-            if not drives:
-                self._submit(job)
+            drives = self._begin(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
                 # First, because a signal that arrives between this line and the next ones sets it again. The other way
@@ -184,7 +207,7 @@ class CallerDrivenLoop:
                     # Here and not in the loop: what a handler raises there would hit whatever task is running.
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
-                elif drives:
+                elif drives and not self._ended:
                     self._drive(job)
                 else:
                     job.wait()
@@ -206,28 +229,21 @@ class CallerDrivenLoop:
 
     # Calls
 
-    def _may_drive(self) -> bool:
-        if asyncio._get_running_loop() is not None:  # noqa: SLF001  # unlike get_running_loop, never raises
-            return False
-        return _MAIN_THREAD_DRIVES or threading.current_thread() is not threading.main_thread()
-
-    def _enlist(self, job: Job[Any]) -> bool:
-        """Register `job` unless others are in progress; return whether it was registered."""
+    def _begin(self, job: Job[Any]) -> bool:
+        """Register `job`, and queue it unless its caller is to run the loop; return whether it is."""
+        drives = asyncio._get_running_loop() is None  # noqa: SLF001  # unlike get_running_loop, never raises
+        if not _MAIN_THREAD_DRIVES:
+            drives = drives and threading.current_thread() is not threading.main_thread()
         with self._lock:
             if self._stopping:
                 raise self._closed()
-            if self._jobs:
-                return False
+            drives = drives and not self._jobs
             self._jobs.add(job)
-            return True
-
-    def _submit(self, job: Job[Any]) -> None:
-        with self._lock:
-            if self._stopping:
-                raise self._closed()
-            self._jobs.add(job)
-            self._loop.call_soon_threadsafe(self._start_job, job)
-        self._ensure_driver()
+            if not drives:
+                self._loop.call_soon_threadsafe(self._start_job, job)
+        if not drives:
+            self._ensure_driver()
+        return drives
 
     def _call_away(self, job: Job[Any]) -> None:
         """Make the caller of `job` check whether it should continue waiting."""
@@ -245,68 +261,46 @@ class CallerDrivenLoop:
                 job.coro.close()  # never handed over; Python would warn that it was never awaited
                 return
             self._loop.call_soon_threadsafe(self._cancel_job, job)
-        drives = self._may_drive()
-        if not drives:
-            self._ensure_driver()
+        self._ensure_driver()
         deadline = time.monotonic() + GRACE
         while not job.finished and (left := deadline - time.monotonic()) > 0:
             job.leave = False
-            if drives:
-                self._drive(job, deadline)
-            else:
-                job.wait(left)
+            job.wait(left)
         if not job.finished:
             _log.warning(
                 "%s is still running %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE
             )
 
-    def _drive(self, job: Job[Any], deadline: float | None = None) -> None:
-        """Run the loop on this thread until `job` is finished, its caller must leave or the deadline has passed."""
-        if self._ended:
-            job.wait(_CLAIM_SLICE)
-            return
-        if not self._turn.acquire(blocking=False) and not self._claim(job, deadline):
-            return
-        try:
-            if self._ended:
+    def _drive(self, job: Job[Any]) -> None:
+        """Run the loop on this thread until `job` is finished or its caller must leave."""
+        while not self._turn.acquire(blocking=False):
+            if job.leave:
                 return
-            if job.task is None:  # otherwise this caller was called away, and comes back for the rest of it
-                job.task = asyncio.Task(self._perform(job), loop=self._loop, name="urlab-call")
-            timer = None if deadline is None else self._loop.call_at(deadline, self._call_away, job)
+            # Again in each slice: the thread may have taken the turn only after it was asked.
+            self._poke(self._yield)
+            if self._turn.acquire(timeout=_CLAIM_SLICE):
+                break
+        try:
+            if job.task is None and not self._ended:  # otherwise this caller was called away, and comes back
+                self._start_job(job)
             self._driven = job
             # In a loop, because anything may stop the loop: another caller that wants the turn, or code of a task.
             while not (job.finished or job.leave or self._ended):
                 self._run_loop()
             self._driven = None
-            if timer is not None:
-                timer.cancel()
         finally:
-            self._give_back()
-
-    def _claim(self, job: Job[Any], deadline: float | None) -> bool:
-        """Get the turn; return False if first `job` is finished, its caller must leave or the deadline has passed."""
-        while not self._turn.acquire(blocking=False):
-            if job.finished or job.leave or (deadline is not None and time.monotonic() >= deadline):
-                return False
-            # Again in each slice: the thread may have taken the turn only after it was asked.
-            self._poke(self._yield)
-            if self._turn.acquire(timeout=_CLAIM_SLICE):
-                break
-        return True
+            self._left = time.monotonic()
+            self._turn.release()
+            # Only now: a job that was queued before the release saw the turn held and woke nobody (rule 3).
+            if self._jobs or self._stopping:
+                self._ensure_driver()
 
     def _run_loop(self) -> None:
         # These exceptions leave the loop when a task raises them. If the task is a job, its caller gets them from it.
         try:
-            self._loop.run_until_stopped()
+            self._loop.run_forever()
         except (KeyboardInterrupt, SystemExit) as error:
             _log.debug("a task on the loop raised %r", error)
-
-    def _give_back(self) -> None:
-        self._left = time.monotonic()
-        self._turn.release()
-        # Only now: a job that was queued before the release saw the turn held and woke nobody (rule 3).
-        if self._jobs or self._stopping:
-            self._ensure_driver()
 
     def _ensure_driver(self) -> None:
         """Wake the thread if no thread runs the loop."""
@@ -348,13 +342,12 @@ class CallerDrivenLoop:
         # Not a callback of the task, which would take one more iteration of the loop.
         if job.finished:
             return
-        job.started = True
         try:
             job.value = await job.coro
         except GeneratorExit:
             raise  # The loop ended before the job.
         except asyncio.CancelledError as error:
-            job.error = client_closed("during this call") if self._stopping else error.with_traceback(None)
+            job.error = self._closed("during this call") if self._stopping else error.with_traceback(None)
         except BaseException as error:  # noqa: BLE001  # raised by the caller
             trace = error.__traceback__
             job.error = error.with_traceback(None if trace is None else trace.tb_next)  # without this frame
@@ -379,6 +372,15 @@ class CallerDrivenLoop:
     # The thread
 
     def _run(self) -> None:
+        try:
+            self._run_between_calls()
+        except BaseException as error:
+            self._failure = error
+            raise
+        finally:
+            self._finish()
+
+    def _run_between_calls(self) -> None:
         main = self._loop.create_task(self._main())
         main.add_done_callback(self._note_end)
         while not self._ended:
@@ -388,13 +390,25 @@ class CallerDrivenLoop:
                 self._turn.release()
                 self._await_turn()
                 self._thread_drives = True
-        main.result()  # raises what ended it, before calls are cancelled: they fail with the cause
-        self._cancel_all()
+        main.result()  # raises what ended it
+
+    def _finish(self) -> None:
+        """Cancel all tasks and fail all calls, because nobody runs the loop any more."""
         with self._lock:
-            for job in tuple(self._jobs):
-                self._break_off(job)
-            self._loop.close()
-        self._turn.release()
+            self._stopping = self._ended = True
+        self._poke(self._loop.stop)  # a caller that runs it leaves
+        drives = self._thread_drives or self._turn.acquire(timeout=GRACE)
+        try:
+            if drives:
+                self._cancel_all()
+        finally:
+            with self._lock:
+                for job in tuple(self._jobs):
+                    self._break_off(job)
+                if drives:
+                    self._loop.close()
+            if drives:
+                self._turn.release()
 
     def _cancel_all(self) -> None:
         # Between two runs of the loop: while it runs, Python 3.14 lists only the tasks that this thread has created.
@@ -403,22 +417,6 @@ class CallerDrivenLoop:
         while not end.done():
             self._run_loop()
         end.result()  # raises what ended it
-
-    def _die(self, error: URLabError) -> None:
-        """Fail all calls, because nobody runs the loop between them any more."""
-        with self._lock:
-            self._failure = error.__cause__
-            self._stopping = self._ended = True
-            for job in tuple(self._jobs):
-                self._break_off(job)
-        self._poke(self._loop.stop)  # a caller that runs it leaves
-        if self._thread_drives or self._turn.acquire(timeout=GRACE):
-            try:
-                self._cancel_all()
-            except BaseException as again:  # noqa: BLE001  # the cause has been logged
-                _log.debug("the tasks of the loop could not be cancelled", exc_info=again)
-            self._loop.close()
-            self._turn.release()
 
     def _closed(self, when: str = "before this call") -> ClientClosed:
         if self._failure is None:

@@ -92,9 +92,14 @@ class Portal:
 
     def next_of(self, stream: Stream[Item]) -> Item:
         """`next` for a stream. Buffered items are returned without entering the loop."""
-        with DeferredSignals():
-            item = stream.receive_nowait()
-        return self.next(stream.__anext__) if item is None else item
+        try:
+            with DeferredSignals():
+                item = stream.receive_nowait()
+            return self.next(stream.__anext__) if item is None else item
+        except ClientClosed as error:
+            if error.__cause__ is not None:  # the loop died
+                raise
+            raise StopIteration from None
 
     def release(self, function: Callable[P, Coroutine[Any, Any, object]], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """`call` for releasing resources; does nothing after the client was closed, or in a forked child."""

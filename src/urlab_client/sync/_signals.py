@@ -47,10 +47,11 @@ class DeferredSignals:
 
     def __enter__(self) -> Self:
         if threading.get_ident() == threading.main_thread().ident:
+            # All of some sixty signals are looked at in each call: a handler may have been installed since the last
+            # one, and nothing tells. For the same reason none stays replaced between two calls.
+            handled = [number for number in _SIGNALS if callable(_get_handler(number))]
             self._numbers = numbers = [
-                number
-                for number in _SIGNALS
-                if callable(handler := _get_handler(number)) and getattr(handler, "__module__", "") not in _OF_LOOPS
+                number for number in handled if getattr(_get_handler(number), "__module__", "") not in _OF_LOOPS
             ]
             try:
                 # One C call replaces all of them, and after an exception the list contains exactly those that were

@@ -14,7 +14,7 @@ from urlab_client.aio.streams.publishers import SharedFrame
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
 from urlab_client.values.descriptions import CameraDescription
@@ -113,7 +113,7 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
 
     def frames(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -139,6 +139,7 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
         return self._wrap(
             Stream[CameraSample],

@@ -13,11 +13,26 @@ from urlab_client.aio import client as aio
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, Diagnosis, Resync
 from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
-from urlab_client.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.enums import (
+    CameraTiming,
+    EncodingName,
+    ObservationLevel,
+    ObservationLevelName,
+    StepMode,
+    StepModeName,
+    Transport,
+    TransportName,
+)
 from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import (
+    CameraSample,
+    RowSample,
+    StateSnapshot,
+    StreamPolicy,
+    StreamPolicyName,
+)
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
@@ -94,7 +109,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         self,
         address: str = "tcp://localhost",
         *,
-        step_mode: str | StepMode = "auto",
+        step_mode: StepMode | StepModeName = "auto",
         step_port: int = 5559,
         state_port: int = STATE_PORT,
         ctrl_port: int = 5556,
@@ -103,9 +118,9 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         local_model: bool = True,
         rcv_timeout_ms: int = 5000,
         auto_promote_step_mode: bool = True,
-        transport: str | Transport = "zmq",
+        transport: Transport | TransportName = "zmq",
         shm_dir: str | None = None,
-        encoding: str = "msgpack",
+        encoding: EncodingName = "msgpack",
         server_key: str | os.PathLike[str] | None = None,
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
@@ -188,7 +203,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
     def discover(
         self,
-        observations: str | ObservationLevel = "standard",
+        observations: ObservationLevel | ObservationLevelName = "standard",
         *,
         handshake: bytes | None = None,
         timeout: Timeout = DEFAULT,
@@ -224,7 +239,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         n_steps: int = 1,
         *,
         include_cameras: bool | Mapping[str, str | CameraTiming] = False,
-        observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
+        observations: ObservationLevel | ObservationLevelName | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
         """Advance physics according to the step mode, and update the state.
@@ -366,7 +381,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
     def state_stream(
         self,
-        policy: str | StreamPolicy = "latest",
+        policy: StreamPolicy | StreamPolicyName = "latest",
         *,
         max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
@@ -392,6 +407,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Raises:
             ValueError: The policy is unknown, the buffer is empty, or `max_rate` is not above 0 or used with another
                 policy than `latest`.
+            ClientClosed: The client was closed.
         """
         return self._wrap(
             Stream[StateSnapshot],
@@ -406,7 +422,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         kinds: Collection[str | TopicKind] = (),
         components: Collection[str] = (),
         *,
-        policy: str | StreamPolicy = "latest_per_key",
+        policy: StreamPolicy | StreamPolicyName = "latest_per_key",
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -432,6 +448,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Raises:
             KeyError: The articulation is unknown.
             ValueError: A kind or the policy is unknown, or the buffer is empty.
+            ClientClosed: The client was closed.
             URLabError: `discover()` was not called yet; or rows must be derived from snapshots, which requires a local
                 model.
         """
@@ -473,6 +490,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Raises:
             URLabRPCError: The server refused the request.
+            TypeError: It is not a request, but the name of an op, for example; nothing was sent.
             ValueError: A `Step` has numbers that are not finite, or 0 steps in direct mode, where the server would take
                 one; nothing was sent.
         """

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces import _ops as aio_ops
-from urlab_client.aio.namespaces import contexts as aio_contexts
 from urlab_client.aio.namespaces import outliner as aio_outliner
 from urlab_client.aio.namespaces import recording as aio_recording
 from urlab_client.aio.namespaces import runtime as aio_runtime
 from urlab_client.aio.namespaces import scene as aio_scene
 from urlab_client.aio.namespaces import sim as aio_sim
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.enums import StepMode
+from urlab_client.enums import StepMode, StepModeName
 from urlab_client.protocol.messages.cameras import (
     CameraDelay,
     CameraDelayInForce,
@@ -66,19 +65,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
     __slots__ = ()
     _aio: aio_ops.RuntimeOps
-
-    def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
-        """Set the pacing of live mode, and return the value in force.
-
-        Args:
-            percent: Percent of real time; the engine clamps to 5..100.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return self._portal.call(self._aio.set_sim_speed, percent, timeout=timeout)
 
     def set_control_source(self, source: str, *, articulation: str | None = None, timeout: Timeout = DEFAULT) -> None:
         """Choose the source of the set-points for the actuators: this protocol or the editor's panel.
@@ -783,36 +769,6 @@ class FarmNamespace(Facade, twin=aio_ops.FarmNamespace):
         self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)
 
 
-class Playing(Facade, twin=aio_contexts.Playing):
-    """Play for the duration of a block; see `client.sim.playing()`."""
-
-    __slots__ = ()
-    _aio: aio_contexts.Playing
-
-    def __enter__(self) -> PIEStartResult:
-        return self._portal.call(self._aio.__aenter__)
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
-
-
-class SceneEdit(Facade, twin=aio_contexts.SceneEdit):
-    """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
-
-    __slots__ = ()
-    _aio: aio_contexts.SceneEdit
-
-    def __enter__(self) -> None:
-        self._portal.call(self._aio.__aenter__)
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
-
-
 class OutlinerNamespace(OutlinerOps, twin=aio_outliner.OutlinerNamespace):
     """Inspecting the world, and preparing plain meshes for physics."""
 
@@ -1136,7 +1092,16 @@ class RuntimeNamespace(RuntimeOps, twin=aio_runtime.RuntimeNamespace):
         """
         return self._portal.call(self._aio.set_camera_delay, cameras, timeout=timeout)
 
-    def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
+    def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
+        """Set the pacing of live mode, and return the value in force, which the log mentions if the engine clamped it.
+
+        Args:
+            percent: Percent of real time; the engine clamps to 5..100.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        return self._portal.call(self._aio.set_sim_speed, percent, timeout=timeout)
+
+    def set_mode(self, mode: StepMode | StepModeName, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the mode in force. Every mode except live resumes paused physics.
 
         Args:
@@ -1158,6 +1123,21 @@ class RuntimeNamespace(RuntimeOps, twin=aio_runtime.RuntimeNamespace):
             The state; time and step counter are unchanged.
         """
         return self._portal.call(self._aio.forward, timeout=timeout)
+
+
+class SceneEdit(Facade, twin=aio_scene.SceneEdit):
+    """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
+
+    __slots__ = ()
+    _aio: aio_scene.SceneEdit
+
+    def __enter__(self) -> None:
+        self._portal.call(self._aio.__aenter__)
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
 
 
 class SceneNamespace(SceneOps, twin=aio_scene.SceneNamespace):
@@ -1433,6 +1413,21 @@ class SceneNamespace(SceneOps, twin=aio_scene.SceneNamespace):
             URLabRPCError: An op failed; actors placed before it stay.
         """
         return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)
+
+
+class Playing(Facade, twin=aio_sim.Playing):
+    """Play for the duration of a block; see `client.sim.playing()`."""
+
+    __slots__ = ()
+    _aio: aio_sim.Playing
+
+    def __enter__(self) -> PIEStartResult:
+        return self._portal.call(self._aio.__aenter__)
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
 
 
 class SimNamespace(Facade, twin=aio_sim.SimNamespace):

@@ -19,7 +19,7 @@ class Stream(Facade, Generic[T], twin=aio_stream.Stream):
     """Items that the server publishes, as they arrive.
 
     The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
-    stream is closed. When the client is closed, iteration raises `ClientClosed` after the items that had arrived.
+    stream is closed, and, after the items that had arrived, when the client is closed.
 
     The policy decides which items are kept for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps
     the newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next
@@ -101,5 +101,5 @@ class Stream(Facade, Generic[T], twin=aio_stream.Stream):
         return self
 
     def __next__(self) -> T:
-        """Return the next item; see `receive` for the errors."""
+        """Return the next item; see `receive` for the errors. A closed client ends the iteration."""
         return self._portal.next_of(self._aio)

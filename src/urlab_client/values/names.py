@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
+from urlab_client.values.html import fields
+
 T = TypeVar("T")
 D = TypeVar("D")
 
@@ -117,7 +119,16 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
     return f" {conjunction} ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
 
 
-class NameMap(dict[str, T]):
+class PublicDir:
+    """Keeps private attributes out of `dir()`, from which consoles and editors complete."""
+
+    __slots__ = ()
+
+    def __dir__(self) -> list[str]:
+        return [name for name in super().__dir__() if not name.startswith("_") or name.startswith("__")]
+
+
+class NameMap(PublicDir, dict[str, T]):
     """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
 
     `map[name]`, `map.get(name)` and `name in map` agree: an exact key first, else an alias. Length, iteration, `keys`,
@@ -205,6 +216,9 @@ class NameMap(dict[str, T]):
     def _ipython_key_completions_(self) -> list[str]:
         """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""
         return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
+
+    def _repr_html_(self) -> str:
+        return fields(self.kind, {name: repr(one) for name, one in self.items()})
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")

@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from urlab_client._installation import need
+from urlab_client._installation import MissingExtra, need
 from urlab_client.enums import CameraMode
+from urlab_client.values.html import picture
 from urlab_client.values.layouts import BytesLike, damaged
 from urlab_client.values.plain import Serializable
 
@@ -28,6 +29,7 @@ Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
+_THUMBNAIL = 240  # pixels
 _MAX_SIDE = 16_384  # maximum of graphics cards
 _CACHED = 65_536  # pixels that stay in a core's cache between two passes
 _CENTIMETRES = np.float32(100)
@@ -229,35 +231,6 @@ def to_rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[np.uint8]:
     return without_alpha(pixels if mode == CameraMode.REAL else pixels[..., 2::-1])
 
 
-def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:
-    """Return the bare pixels of a picture, the inverse of `decode_camera`.
-
-    Args:
-        pixels: As in `CameraImage`, top row first; mode `real` also takes RGB, shape (H, W, 3). Alpha is sent as 255.
-        mode: Mode of the camera.
-
-    Raises:
-        ValueError: The array does not have the shape and type of the mode.
-    """
-    if mode == CameraMode.DEPTH:
-        if pixels.ndim != 2 or pixels.dtype != np.float32:
-            raise ValueError(f"depth pixels are {pixels.dtype} {pixels.shape}, expected float32 (H, W)")
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.multiply(pixels, _CENTIMETRES, dtype="<f4").tobytes()
-    channels = (3, 4) if mode == CameraMode.REAL else (4,)
-    if pixels.ndim != 3 or pixels.shape[2] not in channels or pixels.dtype != np.uint8:
-        expected = "(H, W, 3) or (H, W, 4)" if len(channels) == 2 else "(H, W, 4)"
-        raise ValueError(f"{mode} pixels are {pixels.dtype} {pixels.shape}, expected uint8 {expected}")
-    if mode != CameraMode.REAL:
-        return pixels.tobytes()
-    bgra = np.empty((*pixels.shape[:2], 4), np.uint8)
-    bgra[..., 0] = pixels[..., 2]
-    bgra[..., 1] = pixels[..., 1]
-    bgra[..., 2] = pixels[..., 0]
-    bgra[..., 3] = 255
-    return bgra.tobytes()
-
-
 # For a stream's reader: one picture in use, the stream's latest, and one being converted.
 _KEPT = 2
 
@@ -345,6 +318,35 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
     if max_size is not None:
         image.thumbnail((max_size, max_size))
     return encoded(image, "JPEG", quality=quality)
+
+
+def shown_png(pixels: Pixels, mode: CameraMode | str) -> bytes | None:
+    """Return a picture as PNG for display, depths in grey; None without Pillow.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: Meaning of the pixels.
+    """
+    try:
+        return encoded(_image(to_rgb(pixels, mode)), "PNG")
+    except MissingExtra:
+        return None
+
+
+def thumbnail(pixels: Pixels, mode: CameraMode | str, description: str) -> str:
+    """Return a small picture for a table; without Pillow a sentence that says so.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: Meaning of the pixels.
+        description: Text for those who cannot see it.
+    """
+    try:
+        image = _image(to_rgb(pixels, mode))
+        image.thumbnail((_THUMBNAIL, _THUMBNAIL))
+        return picture(encoded(image, "PNG"), "png", description)
+    except MissingExtra as missing:
+        return str(missing)
 
 
 def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:

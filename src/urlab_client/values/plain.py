@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client.values import html
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -85,16 +86,21 @@ class Serializable:
         """
         return cast("Self", msgspec.structs.replace(cast("Struct", self), **changes))
 
+    def _repr_html_(self) -> str | None:
+        struct = cast("Struct", self)
+        values = {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
+        return html.fields(type(self).__name__, values)
+
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
         # Only pydantic calls this. The code below builds plain dictionaries and does not import pydantic.
-        from urlab_client.values.pydantic_schema import core_schema
+        from urlab_client.values.schemas import core_schema
 
         return core_schema(cast("type[Struct]", cls), handler)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> dict[str, Any]:
-        from urlab_client.values.pydantic_schema import json_schema
+        from urlab_client.values.schemas import json_schema
 
         return json_schema(cast("type[Struct]", cls), schema, handler)
 

@@ -21,6 +21,8 @@ from urlab_client.web.endpoints import BYTES, JSON, Endpoint
 from urlab_client.web.live import SOCKETS, Socket
 
 _SCHEMA = "#/components/schemas/{name}"
+_TEXT: dict[str, Any] = {"type": "string"}
+_FILE = _TEXT | {"format": "binary"}
 _KEY_REQUIRED: list[dict[str, list[str]]] = [{"key": []}]
 _SECURITY: dict[str, Any] = {"securitySchemes": {"key": {"type": "http", "scheme": "bearer"}}}
 
@@ -95,7 +97,10 @@ def _plain_path(path: str) -> str:
 
 def _described_endpoint(endpoint: Endpoint) -> dict[str, Any]:
     doc = inspect.cleandoc(endpoint.function.__doc__ or "")
-    reply = _schema(endpoint.result) if endpoint.media == JSON else {"type": "string"}
+    if endpoint.media == JSON:
+        reply = _schema(endpoint.result)
+    else:
+        reply = _TEXT if endpoint.media.startswith("text/") else _FILE
     found: dict[str, Any] = {
         "operationId": endpoint.function.__name__,
         "tags": ["console"],
@@ -112,7 +117,7 @@ def _described_endpoint(endpoint: Endpoint) -> dict[str, Any]:
     if parameters:
         found["parameters"] = parameters
     if endpoint.upload:
-        found["requestBody"] = {"required": True, "content": {BYTES: {}}}
+        found["requestBody"] = {"required": True, "content": {BYTES: {"schema": _FILE}}}
     elif "body" in endpoint.parameters:
         kind, default = endpoint.parameters["body"]
         found["requestBody"] = {

@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, get_args
 
-import anyio
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -30,60 +29,11 @@ from urlab_client.console.messages import (
     tag_of,
 )
 from urlab_client.console.session import ConsoleSession
+from urlab_client.integrations.forwarding import Flow, converse, forward, receive_text
 from urlab_client.web.endpoints import explain_error
 
 _AHEAD = 2  # states or pictures sent to a browser that it has not acknowledged
 _NAME_CHARACTERS = 24
-
-
-class _Flow:
-    """Counts what a browser has not acknowledged, and waits while it is too much."""
-
-    def __init__(self) -> None:
-        self._on_the_way = 0
-        self._acknowledged = anyio.Event()
-
-    @property
-    def free(self) -> bool:
-        return self._on_the_way < _AHEAD
-
-    def sent(self) -> None:
-        self._on_the_way += 1
-
-    def acknowledge(self) -> None:
-        self._on_the_way -= 1
-        self._acknowledged.set()
-
-    async def until_free(self) -> None:
-        while not self.free:
-            self._acknowledged = anyio.Event()
-            await self._acknowledged.wait()
-
-
-async def _converse(send: Callable[[], Awaitable[None]], listen: Callable[[], Awaitable[None]]) -> None:
-    """Send and listen until the browser is gone; each end of a connection may find that out first."""
-
-    async def sending() -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            await send()
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(sending)
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, perhaps during a reply
-            await listen()
-        tasks.cancel_scope.cancel()
-
-
-async def _receive_text(socket: WebSocket) -> str:
-    """Return the next text that a browser sends."""
-    message = await socket.receive()
-    if message["type"] == "websocket.disconnect":
-        raise WebSocketDisconnect(message["code"], message.get("reason"))
-    text: str | None = message.get("text")
-    if text is None:
-        await socket.close(1003, "this socket takes text")
-        raise WebSocketDisconnect(1003)
-    return text
 
 
 async def _send(socket: WebSocket, message: ToViewer) -> None:
@@ -93,7 +43,7 @@ async def _send(socket: WebSocket, message: ToViewer) -> None:
 async def live(console: ConsoleSession, socket: WebSocket) -> None:
     """Send the world, states, the status and the log to a viewer, and do what it says."""
     await socket.accept()
-    view, flow = console.view, _Flow()
+    view, flow = console.view, Flow(_AHEAD)
     with console.new_viewer() as viewer, view.watch() as changed:
         await _send(socket, You(viewer.key, viewer.name))
 
@@ -119,7 +69,7 @@ async def live(console: ConsoleSession, socket: WebSocket) -> None:
 
         async def listen() -> None:
             while True:
-                text = await _receive_text(socket)
+                text = await receive_text(socket)
                 try:
                     message: FromViewer = msgspec.json.decode(text, type=FromViewer)
                     if isinstance(message, Ack):
@@ -132,7 +82,7 @@ async def live(console: ConsoleSession, socket: WebSocket) -> None:
                 except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                     await _send(socket, Refused(explain_error(error)[1]))
 
-        await _converse(send, listen)
+        await converse(send, listen)
 
 
 def _obey(console: ConsoleSession, viewer: Viewer, message: Name | Ctrl | Hand) -> None:
@@ -153,31 +103,15 @@ async def pictures(console: ConsoleSession, socket: WebSocket) -> None:
     if feed is None:
         await socket.close(4404, "no such camera")
         return
-    flow = _Flow()
-
-    async def send() -> None:
-        seq = 0
-        while True:
-            await flow.until_free()
-            picture = await feed.after(seq)
-            seq = picture.seq
-            flow.sent()
-            await socket.send_bytes(picture.frame)
-
-    async def listen() -> None:
-        while True:
-            await _receive_text(socket)
-            flow.acknowledge()
-
     async with feed.watch():
-        await _converse(send, listen)
+        await forward(feed.frames(), socket, ahead=_AHEAD)
 
 
 async def poses(console: ConsoleSession, socket: WebSocket) -> None:
     """Send states to the page of the 3-D view, and where values lie in them."""
     await socket.accept()
     await socket.send_text(mujoco_viewer.SPECTATOR)
-    view, viewer, flow = console.view, console.mujoco_viewer, _Flow()
+    view, viewer, flow = console.view, console.mujoco_viewer, Flow(_AHEAD)
 
     with view.watch() as changed:
 
@@ -203,7 +137,7 @@ async def poses(console: ConsoleSession, socket: WebSocket) -> None:
                     flow.acknowledge()
                     changed.set()
 
-        await _converse(send, listen)
+        await converse(send, listen)
 
 
 async def refuse_panels(_: ConsoleSession, socket: WebSocket) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import anyio
 import anyio.to_thread
 from msgspec import Meta, Struct
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import Response
 
 from urlab_client.aio.client_types import Diagnosis
 from urlab_client.console.body_pushing import BodyList, BodyView, Pick, Picked, Push
@@ -18,6 +18,7 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.messages import LogEntry, State, Status, encode
 from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
+from urlab_client.integrations.forwarding import EventStream
 from urlab_client.web import documents
 from urlab_client.web.endpoints import BYTES, JSON, Call, endpoint, json_response, read_body, refusal
 
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
 _FLOWING_S = 5.0
-_ALIVE_S = 15.0
-"""How long an event stream may be silent, seconds: proxies close connections that are silent for longer."""
 
 
 class RunRequest(Struct):
@@ -109,11 +108,10 @@ async def explain(call: Call) -> Diagnosis:
 async def events(call: Call) -> Response:
     """Server-sent events `log`, `world` and `status`; `Last-Event-ID` resumes the log."""
     last = call.request.headers.get("last-event-id", "")
-    stream = _events(call.console, call.viewer, int(last) if last.isdecimal() else -1)
-    return StreamingResponse(stream, media_type="text/event-stream", headers={"x-accel-buffering": "no"})
+    return EventStream(_events(call.console, call.viewer, int(last) if last.isdecimal() else -1))
 
 
-async def _events(console: ConsoleSession, viewer: Viewer, line: int) -> AsyncGenerator[bytes]:
+async def _events(console: ConsoleSession, viewer: Viewer, line: int) -> AsyncGenerator[bytes, None]:
     view = console.view
     version, sent = -1, ""
     with view.watch() as changed:
@@ -132,10 +130,7 @@ async def _events(console: ConsoleSession, viewer: Viewer, line: int) -> AsyncGe
                 news.append(_event("log", encode(entry), line))
             if news:
                 yield b"".join(news)
-            with anyio.move_on_after(_ALIVE_S) as waiting:
-                await changed.wait()
-            if waiting.cancelled_caught:
-                yield b": nothing new\n\n"
+            await changed.wait()
 
 
 def _event(kind: str, data: bytes, number: int | None = None) -> bytes:

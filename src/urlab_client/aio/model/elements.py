@@ -8,14 +8,20 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from urlab_client._mujoco import acting_kind, control_counts, control_starts, force_counts, servo_damping
+from urlab_client._mujoco import (
+    QPOS_WIDTH,
+    QVEL_WIDTH,
+    acting_kind,
+    control_counts,
+    control_starts,
+    force_counts,
+    servo_damping,
+)
 from urlab_client.aio.arguments import finite, finite_array, is_array
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import (
     JOINT_KINDS,
     JOINT_TRANSMISSIONS,
-    QPOS_WIDTH,
-    QVEL_WIDTH,
     joint_unit,
     sensor_kind,
     sensor_unit,
@@ -31,7 +37,7 @@ from urlab_client.values.descriptions import (
     SensorDescription,
     SetPointMeaning,
 )
-from urlab_client.values.names import NameMap
+from urlab_client.values.names import NameMap, PublicDir
 
 if TYPE_CHECKING:
     import mujoco
@@ -40,7 +46,7 @@ _UNSPECIFIC = {"motor", "general"}  # what servers report for a `<general>`
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Actuator:
+class Actuator(PublicDir):
     """One actuator of an articulation.
 
     Attributes:
@@ -171,7 +177,7 @@ class Actuator:
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Joint:
+class Joint(PublicDir):
     """One joint of an articulation.
 
     Attributes:
@@ -212,21 +218,23 @@ class Joint:
 
     @property
     def position(self) -> float | Floats:
-        """Position in the joint's unit, from the last reply.
+        """Position in the joint's unit, from the last reply; a number for a `ScalarJoint`.
 
         A ball joint has a quaternion (w, x, y, z), shape (4,). A free joint has (x, y, z) in metres followed by the
         quaternion, shape (7,). Arrays are fresh copies.
         """
-        return _value(self._record.qpos, self.qpos_local_offset, int(QPOS_WIDTH[self.jnt_type]))
+        start = self.qpos_local_offset
+        return self._record.qpos[start : start + int(QPOS_WIDTH[self.jnt_type])].copy()
 
     @property
     def velocity(self) -> float | Floats:
-        """Velocity in the joint's unit per second, from the last reply.
+        """Velocity in the joint's unit per second, from the last reply; a number for a `ScalarJoint`.
 
         A ball joint has an angular velocity in the body frame, shape (3,). A free joint has a linear velocity in the
         world frame followed by an angular velocity in the body frame, shape (6,). Arrays are fresh copies.
         """
-        return _value(self._record.qvel, self.qvel_local_offset, int(QVEL_WIDTH[self.jnt_type]))
+        start = self.qvel_local_offset
+        return self._record.qvel[start : start + int(QVEL_WIDTH[self.jnt_type])].copy()
 
     def describe(self) -> JointDescription:
         """Return a description of the joint with its position and velocity."""
@@ -243,8 +251,27 @@ class Joint:
         return f"<Joint {self.name!r} id={self.id}>"
 
 
+class ScalarJoint(Joint):
+    """A hinge or slide joint, whose position and velocity are single numbers.
+
+    Type checkers know that after `isinstance(joint, ScalarJoint)`.
+    """
+
+    __slots__ = ()
+
+    @property
+    def position(self) -> float:
+        """Position in the joint's unit, from the last reply."""
+        return float(self._record.qpos[self.qpos_local_offset])
+
+    @property
+    def velocity(self) -> float:
+        """Velocity in the joint's unit per second, from the last reply."""
+        return float(self._record.qvel[self.qvel_local_offset])
+
+
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Sensor:
+class Sensor(PublicDir):
     """One sensor of an articulation.
 
     Attributes:
@@ -292,7 +319,7 @@ class Sensor:
 
 
 @dataclass(slots=True, eq=False, repr=False, kw_only=True)
-class Body:
+class Body(PublicDir):
     """One body of an articulation.
 
     Attributes:
@@ -362,7 +389,7 @@ def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[
     for name, i in record.layout.joints.items():
         kind = int(model.jnt_type[i])
         joints.append(
-            Joint(
+            (ScalarJoint if QPOS_WIDTH[kind] == 1 else Joint)(
                 record,
                 name=name,
                 id=i,
@@ -424,10 +451,6 @@ def _sensors(record: MirroredArticulation, model: mujoco.MjModel | None) -> list
 
 def _unit_of(record: MirroredArticulation, model: mujoco.MjModel, joint: str) -> str:
     return joint_unit(JOINT_KINDS[int(model.jnt_type[record.layout.joints[joint]])])
-
-
-def _value(values: Floats, start: int, width: int) -> float | Floats:
-    return float(values[start]) if width == 1 else values[start : start + width].copy()
 
 
 def _interval(bounds: Floats) -> tuple[float, float]:

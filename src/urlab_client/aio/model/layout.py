@@ -5,22 +5,16 @@ MuJoCo has no units; those here apply to models in SI units.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from urlab_client.values.descriptions import JointKind, SetPointMeaning
-
-if TYPE_CHECKING:
-    import mujoco
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import control_counts, control_starts, force_counts
+from urlab_client._mujoco import QPOS_WIDTH, QVEL_WIDTH, control_counts, control_starts, force_counts, spans
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.values.descriptions import JointKind, SetPointMeaning
 from urlab_client.values.names import split_prefix
 
 if TYPE_CHECKING:
@@ -28,8 +22,6 @@ if TYPE_CHECKING:
 
 FREE = 0  # mjJNT_FREE
 JOINT_TRANSMISSIONS = (0, 1)  # mjTRN_JOINT, mjTRN_JOINTINPARENT
-QPOS_WIDTH = np.array([7, 4, 1, 1])  # by mjtJoint: free, ball, slide, hinge
-QVEL_WIDTH = np.array([6, 3, 1, 1])
 
 Ints = NDArray[np.intp]
 _EMPTY: Ints = np.zeros(0, dtype=np.intp)
@@ -100,7 +92,7 @@ def _layout(
     kinds = model.jnt_type[joint_ids]
     actuator_ids = np.fromiter(actuators.values(), dtype=np.intp)
     counts = control_counts(model)[actuator_ids]
-    ctrl_adr = _ranges(control_starts(model)[actuator_ids], counts)
+    ctrl_adr = spans(control_starts(model)[actuator_ids], counts)
     act_adr = np.repeat(model.actuator_actadr[actuator_ids], counts).astype(np.intp)
     act_from = np.flatnonzero(act_adr >= 0)
     root = min(bodies.values(), default=-1)
@@ -115,8 +107,8 @@ def _layout(
         sensors=sensors,
         bodies=bodies,
         sensor_dims={name: int(model.sensor_dim[i]) for name, i in sensors.items()},
-        qpos_adr=_ranges(model.jnt_qposadr[joint_ids], QPOS_WIDTH[kinds]),
-        qvel_adr=_ranges(model.jnt_dofadr[joint_ids], QVEL_WIDTH[kinds]),
+        qpos_adr=spans(model.jnt_qposadr[joint_ids], QPOS_WIDTH[kinds]),
+        qvel_adr=spans(model.jnt_dofadr[joint_ids], QVEL_WIDTH[kinds]),
         ctrl_adr=ctrl_adr,
         act_from=act_from,
         act_adr=act_adr[act_from],
@@ -124,13 +116,6 @@ def _layout(
         root_body=root,
         free_joint=free,
     )
-
-
-def _ranges(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -> Ints:
-    """Concatenate the ranges [start, start + length)."""
-    lengths = lengths.astype(np.intp)
-    first = np.repeat(starts.astype(np.intp) - (np.cumsum(lengths) - lengths), lengths)
-    return first + np.arange(lengths.sum(), dtype=np.intp)
 
 
 JOINT_KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # by mjtJoint

@@ -12,6 +12,7 @@ from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.session.jobs import OnProgress
 from urlab_client.aio.session.session import Session
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.values.names import PublicDir
 from urlab_client.values.rotation import Quat, Vec3
 
 R = TypeVar("R", bound=Reply)
@@ -21,7 +22,7 @@ Vector = Iterable[float]
 """A tuple, list or array of numbers."""
 
 
-class Namespace:
+class Namespace(PublicDir):
     """A group of ops on a client."""
 
     def __init__(self, session: Session) -> None:

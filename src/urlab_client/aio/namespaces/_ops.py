@@ -29,7 +29,6 @@ from urlab_client.protocol.messages.runtime import (
     ReadMocapPose,
     SetControlSource,
     SetMocapPose,
-    SetSimSpeed,
     SetTwist,
 )
 from urlab_client.protocol.messages.scene import (
@@ -58,19 +57,6 @@ __all__ = ["DebugNamespace", "FarmNamespace", "OutlinerOps", "ReplayOps", "Runti
 
 class RuntimeOps(Namespace):
     """Generated part of `client.runtime`."""
-
-    async def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
-        """Set the pacing of live mode, and return the value in force.
-
-        Args:
-            percent: Percent of real time; the engine clamps to 5..100.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return (await self._call(SetSimSpeed(percent=percent), timeout)).percent
 
     async def set_control_source(
         self, source: str, *, articulation: str | None = None, timeout: Timeout = DEFAULT

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -37,7 +39,7 @@ from urlab_client.aio.session.jobs import OnProgress
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.enums import StepMode
+from urlab_client.enums import StepMode, StepModeName
 from urlab_client.errors import UnknownOp
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
@@ -54,11 +56,14 @@ from urlab_client.protocol.messages.runtime import (
     SetPaused,
     SetQpos,
     SetSimOptions,
+    SetSimSpeed,
     SetUserChannels,
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.sim_options import check_sim_options, in_small_letters
 from urlab_client.values.types import ContactsResult, SimOptions
+
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 R = TypeVar("R", bound=Reply)
 Q = TypeVar("Q", bound=Request[Any])
@@ -310,7 +315,21 @@ class RuntimeNamespace(RuntimeOps):
             streaming=True, zmq=True, shm=True, zmq_endpoint=info.zmq_endpoint, zmq_topic=info.zmq_topic
         )
 
-    async def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
+    async def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
+        """Set the pacing of live mode, and return the value in force, which the log mentions if the engine clamped it.
+
+        Args:
+            percent: Percent of real time; the engine clamps to 5..100.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        in_force = (await self._call(SetSimSpeed(percent=percent), timeout)).percent
+        if not math.isclose(in_force, percent, rel_tol=1e-6):  # the engine answers in single precision
+            log.warning(
+                "set_sim_speed: %g %% was asked, %g %% is in force: the engine clamps to 5..100 %%", percent, in_force
+            )
+        return in_force
+
+    async def set_mode(self, mode: StepMode | StepModeName, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the mode in force. Every mode except live resumes paused physics.
 
         Args:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 import anyio
@@ -15,7 +16,6 @@ from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
-from urlab_client.aio.namespaces.contexts import SceneEdit
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
 from urlab_client.enums import PIEState
@@ -49,6 +49,30 @@ if TYPE_CHECKING:
     import mujoco
 
 R = TypeVar("R", bound=Reply)
+
+
+class SceneEdit:
+    """Edits of the level, after which play is restarted once; see `client.scene.edit()`."""
+
+    def __init__(self, begin: Callable[[], None], end: Callable[[bool], Awaitable[None]]) -> None:
+        """Create the context manager. Nothing is sent before its end.
+
+        Args:
+            begin: Callback invoked when the block is entered.
+            end: Callback invoked when the block is left, with True unless it raised.
+        """
+        self._begin = begin
+        self._end = end
+
+    async def __aenter__(self) -> None:
+        self._begin()
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if isinstance(exc, Exception):
+            exc.add_note("scene.edit(): the edits made before this error stay in the level; play was not restarted.")
+        await self._end(exc is None)
 
 
 class SceneNamespace(SceneOps):

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import logging
+from collections.abc import Awaitable, Callable
+from types import TracebackType
 
+import anyio
 import msgspec
 
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace
-from urlab_client.aio.namespaces.contexts import Playing
 from urlab_client.aio.session.session import STOP, Session, leaves_open
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import PIEState
-from urlab_client.errors import URLabPIEError, URLabTimeoutError
+from urlab_client.errors import URLabError, URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie
 from urlab_client.values.types import PIEStartResult, PIEStatus
 
@@ -25,6 +27,55 @@ _SLICE_S = 2.0
 _STOP_POLL_S = 0.05
 _WIND_DOWN_S = 10.0
 _SLACK_S = 15.0  # the server may need 10 s to reach its game thread before its own timeout starts
+
+
+log: logging.Logger = logging.getLogger("urlab_client.client")
+
+
+class Playing:
+    """Play for the duration of a block; see `client.sim.playing()`."""
+
+    def __init__(
+        self,
+        start: Callable[[], Awaitable[PIEStartResult]],
+        stop: Callable[[], Awaitable[None]],
+        status: Callable[[], Awaitable[PIEStatus]],
+    ) -> None:
+        """Create the context manager. Nothing is sent before it is entered.
+
+        Args:
+            start: Starts play.
+            stop: Stops play.
+            status: Returns the state of play.
+        """
+        self._start = start
+        self._stop = stop
+        self._status = status
+        self._ours = False
+
+    async def __aenter__(self) -> PIEStartResult:
+        self._ours = (await self._status()).state is PIEState.OFF
+        try:
+            return await self._start()
+        except BaseException as error:
+            await self._end(error)
+            raise
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self._end(exc)
+
+    async def _end(self, error: BaseException | None) -> None:
+        if not self._ours:
+            return
+        try:
+            with anyio.CancelScope(shield=True):  # bounded, because its requests have deadlines
+                await self._stop()
+        except URLabError as failed:
+            if error is None:
+                raise
+            log.warning("play could not be stopped after %r: %s", error, failed)  # the first error is raised
 
 
 class SimNamespace(Namespace):

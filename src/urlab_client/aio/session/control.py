@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 from urlab_client.aio.background import background_task
 from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.session.turn import Deadlines
-from urlab_client.errors import ControlClaimed, NotControlOwner, URLabError
+from urlab_client.errors import UNCLAIMED, ControlClaimed, NotControlOwner, URLabError
 from urlab_client.protocol.base import ControlRequest, Reply
-from urlab_client.protocol.messages.control import (
-    UNCLAIMED,
+from urlab_client.protocol.messages.runtime import (
     ClaimControl,
     ClaimControlOk,
     ReleaseControl,
     ReleaseControlOk,
+    SetControlSource,
+    SetQpos,
+    SetTwist,
 )
-from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
 from urlab_client.protocol.messages.session import Step
 
 if TYPE_CHECKING:
@@ -122,18 +123,6 @@ class Control:
                 raise self._refused(robots, second) from None
         self._note_write(robots)
         return reply
-
-    async def claim(self, key: str, *, force: bool, ttl: float, timeout: Timeout) -> None:
-        """Claim a robot.
-
-        Raises:
-            ControlClaimed: Another client owns it.
-            ValueError: `ttl` is negative, NaN or infinite.
-        """
-        if not 0 <= ttl < math.inf:
-            raise ValueError(f"ttl must be at least 0 seconds and finite, got {ttl}")
-        if self._session.features.claims:
-            await self._session.call(ClaimControl(articulation=key, ttl_s=ttl, force=force), timeout=timeout)
 
     async def release(self, key: str, *, timeout: Timeout) -> None:
         held = self._held.pop(key, None) is not None or _control_of(key) in self._session.unsettled

@@ -152,11 +152,13 @@ class Session:
             raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
         self.check_offered(op)
         deadlines = self.deadlines(op, timeout, self.bound_loop().time())
-        if op.ns != "scene" or op.effect is Effect.READ or _COMPOSING.get() is self:
-            return await self._call(request, op, deadlines, on_progress)
+        if op.needs is not Needs.EDITOR and op.ns != "scene":
+            return await self._exchange_alone(request, op, deadlines)
+        if op.effect is Effect.READ or op.ns != "scene" or _COMPOSING.get() is self:
+            return await self._edit(request, op, deadlines, on_progress)
         await self.acquire(self.scene_lock, op, deadlines.reply)
         try:
-            return await self._call(request, op, deadlines, on_progress)
+            return await self._edit(request, op, deadlines, on_progress)
         finally:
             self.scene_lock.release()
 
@@ -176,7 +178,7 @@ class Session:
             _COMPOSING.reset(outer)
             self.scene_lock.release()
 
-    async def _call(self, request: Request[R], op: Op, deadlines: Deadlines, on_progress: OnProgress | None) -> R:
+    async def _edit(self, request: Request[R], op: Op, deadlines: Deadlines, on_progress: OnProgress | None) -> R:
         if op.needs is not Needs.EDITOR:
             return await self._exchange_alone(request, op, deadlines)
         # One job at a time: the next editor op would wait for it anyway, and block the server in the meantime.

@@ -10,8 +10,7 @@ import numpy as np
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.model.layout import FREE
 from urlab_client.aio.streams.handler import Source
-from urlab_client.aio.streams.rows import RowFilter, sample
-from urlab_client.aio.streams.sources import StateSource
+from urlab_client.aio.streams.sources import RowFilter, StateSource, sample
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import ArticulationState, EntityState

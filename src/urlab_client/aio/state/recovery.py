@@ -10,7 +10,7 @@ from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.session.session import STOP
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.discovery import Discovery, read_state
-from urlab_client.aio.state.pending_outcomes import PendingOutcomes
+from urlab_client.aio.state.progress import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import StepMode
 from urlab_client.errors import NoSession, SessionTakenOver, URLabRPCError

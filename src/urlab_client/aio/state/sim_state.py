@@ -18,8 +18,7 @@ from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.session.session import Session
-from urlab_client.aio.state.clocks import Clocks
-from urlab_client.aio.state.pending_outcomes import PendingOutcomes
+from urlab_client.aio.state.progress import Clocks, PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
 from urlab_client.aio.state.step_mode import ModeState
 from urlab_client.aio.streams.live_state import LiveState

@@ -17,6 +17,7 @@ from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams.buffer import BufferedMessage, StreamBuffer
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.errors import (
+    ClientClosed,
     ConcurrentReadError,
     ProtocolError,
     StreamOverflow,
@@ -147,7 +148,10 @@ class StreamHandler(MessageHandler, Generic[T]):
             self._attached = True
 
     async def next(self) -> T:
-        return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
+        try:
+            return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
+        except ClientClosed:
+            raise StopAsyncIteration from None
 
     async def receive(self, timeout: Timeout) -> T:
         """Return the next item within `timeout` seconds."""

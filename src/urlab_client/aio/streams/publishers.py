@@ -10,8 +10,7 @@ from urlab_client.aio.defaults import Timeout
 from urlab_client.aio.features import Features
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.events import EventBus
-from urlab_client.aio.streams.rows import RowFilter, RowSource
-from urlab_client.aio.streams.sources import Camera, CameraSource, OwnSteps, StateSource
+from urlab_client.aio.streams.sources import Camera, CameraSource, OwnSteps, RowFilter, RowSource, StateSource
 from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.shm_streams import Regions

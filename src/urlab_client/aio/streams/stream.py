@@ -10,10 +10,9 @@ from urlab_client.aio.arguments import require
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams.buffer import StreamBuffer
 from urlab_client.aio.streams.handler import Source, StreamHandler
-from urlab_client.errors import (
-    URLabError,
-)
-from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
+from urlab_client.errors import URLabError
+from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamPolicyName, StreamStats
+from urlab_client.values.names import PublicDir
 
 T = TypeVar("T", bound=StreamItem)
 
@@ -24,11 +23,11 @@ BUFFER_BYTES = 64 * 1024 * 1024
 """Default limit of a stream's buffer, bytes."""
 
 
-class Stream(Generic[T]):
+class Stream(PublicDir, Generic[T]):
     """Items that the server publishes, as they arrive.
 
     The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
-    stream is closed. When the client is closed, iteration raises `ClientClosed` after the items that had arrived.
+    stream is closed, and, after the items that had arrived, when the client is closed.
 
     The policy decides which items are kept for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps
     the newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next
@@ -50,7 +49,7 @@ class Stream(Generic[T]):
         self,
         source: Source[T],
         *,
-        policy: str | StreamPolicy,
+        policy: StreamPolicy | StreamPolicyName,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -164,7 +163,7 @@ class Stream(Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        """Return the next item; see `receive` for the errors."""
+        """Return the next item; see `receive` for the errors. A closed client ends the iteration."""
         return await self._handler.next()
 
     def __del__(self) -> None:

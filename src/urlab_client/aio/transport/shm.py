@@ -304,8 +304,7 @@ class ShmTransport:
             return error
         self._regions.connect_doorbell()
         self._used_at = now
-        with_doorbell = "without" if self._regions.doorbell is None else "with"
-        log.info("shared memory in %s, %s a doorbell", paths[0].parent, with_doorbell)
+        log.info("shared memory in %s; doorbell: %s", paths[0].parent, self._regions.doorbell)
         return None
 
     def _put_off(self, error: Exception, now: float) -> None:

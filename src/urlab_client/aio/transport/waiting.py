@@ -112,9 +112,14 @@ class Watch:
             with contextlib.suppress(NotImplementedError):
                 loop.add_reader(fd, on_news)
                 return
-        self._watcher = _Watcher.of(loop)
+        self._watcher = _Watcher.of(loop, self)
         if not on_demand:
             self.expect()
+
+    @property
+    def by_loop(self) -> bool:
+        """Whether the loop itself watches, always."""
+        return self._watcher is None
 
     def expect(self) -> None:
         """Watch until the next news, if that was left to this call."""
@@ -169,7 +174,7 @@ class _Watcher:
         self._lock = threading.Lock()
         # Weak: an unclosed client is collected with its loop before this thread sees that the loop is closed.
         self._armed = WeakSet[Watch]()
-        self._users = 0
+        self._users = WeakSet[Watch]()
         self._ended = False
         self._woken = False
         self._lingers_until = 0.0
@@ -178,12 +183,12 @@ class _Watcher:
         self._start()
 
     @classmethod
-    def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
-        """Return the watcher of `loop` and count the caller as a user."""
+    def of(cls, loop: asyncio.AbstractEventLoop, user: Watch) -> _Watcher:
+        """Return the watcher of `loop` for a new user."""
         watcher = cls._of_loops.get(loop)
         if watcher is None:
             watcher = cls._of_loops[loop] = cls(loop)
-        watcher._users += 1
+        watcher._users.add(user)
         return watcher
 
     def arm(self, watch: Watch) -> None:
@@ -201,7 +206,7 @@ class _Watcher:
         """Stop watching: `has_news` is not running and is not called again. The last user ends the thread."""
         with self._lock:
             self._armed.discard(watch)
-            self._users -= 1
+            self._users.discard(watch)
             last = not self._users
             self._ended = self._ended or last
             if last or watch.fd is not None:  # its socket is about to be closed
@@ -226,7 +231,7 @@ class _Watcher:
         self._thread.start()
 
     def _on_death(self, event: ClientEvent) -> None:
-        for watch in tuple(self._armed):
+        for watch in tuple(self._users):
             if watch.tell is not None:
                 watch.tell(event)
         self._loop.call_later(_AGAIN_S, self._begin_again)
@@ -328,30 +333,56 @@ def _poll(fds: Collection[int], seconds: float) -> list[int]:
 
 
 _MISSES: Final = 4
-_FIRST: Final = 8  # requests of an op before the first one that sleeps
-_TRIAL: Final = 256  # of so many requests, one tries what has proved slower: too few to show in the 99th percentile
+_FIRST: Final = 8  # requests of an op before the first trial
+_TRIAL: Final = 4  # requests of a trial: the first ones may find the processor in the state that the other way left
+_UNTIL_POLLED: Final = 80  # requests that sleep between two trials of polling, which cost little
+_UNTIL_SLEPT: Final = 1024  # requests that poll between two trials of sleeping: too few to show in a 99th percentile
 _MARGIN: Final = 0.85  # polling occupies a processor, so it must be faster by this factor
 _WEIGHT: Final = 0.2  # of a new time in the average
-_TRIAL_WEIGHT: Final = 0.5  # of a rare one
 # One poller keeps the loop awake for all requests; several would only delay each other.
 _polling = False
 
 
 class _ReplyTimes:
-    """Reply times of one op in seconds, with a polling loop and with a sleeping loop."""
+    """Reply times of one op in seconds, in the way of waiting that is in use and in the other one."""
 
-    __slots__ = ("asked", "asleep", "awake", "missed")
+    __slots__ = ("missed", "other", "polls", "tried", "until_trial", "usual")
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.polls = True  # the way in use
+        self.usual = 0.0
+        self.other = 0.0  # as the last trial found it; 0 before the first
+        self.tried: list[float] = []
+        self.until_trial = _FIRST
         self.missed = 0
-        self.awake = 0.0
-        self.asleep = 0.0
 
     @property
-    def awake_is_better(self) -> bool:
-        """Whether polling has proved faster."""
-        return self.awake < _MARGIN * self.asleep
+    def awake(self) -> bool:
+        """Whether to poll for the next reply."""
+        return self.missed < _MISSES and self.polls is (self.until_trial > 0)
+
+    def note(self, seconds: float, *, awake: bool) -> None:
+        """Record the time of a reply, and decide at the end of a trial."""
+        if awake is self.polls:
+            before = self.usual
+            # An unusually long time reflects the machine's other load rather than the way of waiting.
+            self.usual = before + _WEIGHT * (min(seconds, 2 * before) - before) if before else seconds
+            self.until_trial -= 1
+            if self.polls and self.other and not self._better(self.usual, self.other):
+                self.until_trial = 0
+        elif self.until_trial <= 0:  # otherwise there was no choice
+            self.tried.append(seconds)
+            if len(self.tried) == _TRIAL:
+                self.other = sorted(self.tried)[_TRIAL // 2 - 1]
+                self.tried.clear()
+                if self._better(self.other, self.usual) if awake else not self._better(self.usual, self.other):
+                    self.polls = awake
+                    self.usual, self.other = self.other, self.usual
+                self.until_trial = _UNTIL_SLEPT if self.polls else _UNTIL_POLLED
+
+    @staticmethod
+    def _better(awake: float, asleep: float) -> bool:
+        return awake < _MARGIN * asleep
 
 
 class BusyPoll:
@@ -377,12 +408,7 @@ class BusyPoll:
         times = self._ops.get(op)
         if times is None:
             times = self._ops[op] = _ReplyTimes()
-        times.asked += 1
-        if times.missed >= _MISSES:
-            return False
-        if times.asleep == 0.0:
-            return times.asked <= _FIRST
-        return times.awake_is_better != (times.asked % _TRIAL == 0)
+        return times.awake
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or the time limit is reached. Other tasks run between two calls."""
@@ -406,8 +432,7 @@ class BusyPoll:
         times = self._ops.get(op)
         if times is None:
             return self._shortest
-        usual = min(max(2 * times.awake, self._shortest), self._longest)
-        return usual if times.awake_is_better or times.asleep == 0.0 else min(usual, times.asleep)
+        return min(max(2 * times.usual, self._shortest) if times.polls else times.usual, self._longest)
 
     def note(self, op: str, seconds: float, *, awake: bool) -> None:
         """Record the time of a reply, with a polling or a sleeping loop."""
@@ -418,11 +443,4 @@ class BusyPoll:
             times.missed += 1
             return
         times.missed = 0
-        before = times.awake if awake else times.asleep
-        weight = _WEIGHT if awake == times.awake_is_better else _TRIAL_WEIGHT
-        # An unusually long time reflects the machine's other load rather than the way of waiting.
-        after = before + weight * (min(seconds, 2 * before) - before) if before else seconds
-        if awake:
-            times.awake = after
-        else:
-            times.asleep = after
+        times.note(seconds, awake=awake)

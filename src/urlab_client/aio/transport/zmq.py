@@ -293,9 +293,11 @@ class ZmqTransport:
 
     def _on_readable(self) -> None:
         self._take()
+        if self._open is None or self._open.replies.by_loop:
+            return
         # A reply may be expected to an abandoned request, too.
         unanswered = self._abandoned or self._silent_since is not None
-        if self._open is not None and (unanswered or not all(sent.reply.done() for sent in self._sent.values())):
+        if unanswered or not all(sent.reply.done() for sent in self._sent.values()):
             self._open.replies.expect()
 
     def _take(self) -> None:

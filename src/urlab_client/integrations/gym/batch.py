@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Unpack
 
 import mujoco
 import numpy as np
@@ -17,21 +18,20 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import ControllerKind
-from urlab_client.errors import UnknownKeyframe, URLabError
+from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
-from urlab_client.integrations.gym.episode import compiled_prefixes, rendered_camera
+from urlab_client.integrations.gym.episode import rendered_camera, space_mapping
 from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
-from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
-from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode, with_cameras
-from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task, TaskScene, add_observed, with_task
-from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized, put
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
+from urlab_client.integrations.gym.spaces import Field, Observation, with_cameras
+from urlab_client.integrations.gym.task import States, add_observed, with_task
+from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
 from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.names import compiled_names
 from urlab_client.values.pictures import to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
@@ -54,42 +54,19 @@ class URLabBatchEnv(Vectorized):
         address: str,
         num_envs: int,
         *,
-        space_mode: SpaceMode | None = None,
-        observations: str | Sequence[str] | None = None,
-        reward_fn: RewardFn | None = None,
-        termination_fn: TerminationFn | None = None,
-        max_episode_steps: int | None = None,
-        cameras: Sequence[str] | None = None,
-        n_substeps: int | None = None,
-        reset_noise: float | ResetNoise | None = None,
-        keyframe: str | None = None,
-        render_mode: Literal["rgb_array"] | None = None,
-        render_camera: str | None = None,
-        task: Task | None = None,
         randomise: Randomisation | str | os.PathLike[str] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         engine: Literal["mujoco", "warp"] = "mujoco",
         engine_options: Mapping[str, int] = MappingProxyType({}),
         client_options: Mapping[str, Any] = MappingProxyType({}),
+        **options: Unpack[EpisodeOptions],
     ) -> None:
         """Fetch the scene and make the batch.
 
         Args:
             address: Source of the scene: `sim://MODEL`, with the options of the model, or a server during play.
             num_envs: Number of copies.
-            space_mode: See `URLabEnv`.
-            observations: See `URLabEnv`.
-            reward_fn: See `URLabVectorEnv`.
-            termination_fn: See `URLabVectorEnv`.
-            max_episode_steps: See `URLabEnv`.
-            cameras: See `URLabEnv`. This process draws them in every step.
-            n_substeps: See `URLabEnv`.
-            reset_noise: See `URLabEnv`.
-            keyframe: See `URLabEnv`.
-            render_mode: None or `rgb_array`. With `rgb_array`, only `render` draws; steps cost the same.
-            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
-            task: See `URLabEnv`. One instance serves all environments.
             randomise: See `URLabEnv`. Cameras have the same latency as a server's, but the jitter is drawn differently.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, including the calling thread; 0 for one per processor. No effect with `warp`.
@@ -98,6 +75,8 @@ class URLabBatchEnv(Vectorized):
             engine_options: Options of `warp`: `contacts` and `constraints`, the largest number in one copy at any time,
                 for which its arrays are sized.
             client_options: Further options of the client that fetches the scene.
+            options: See `EpisodeOptions`. This process draws observed cameras in every step; with
+                `render_mode="rgb_array"`, only `render` draws.
 
         Raises:
             URLabError: The scene cannot be fetched, or uses a feature that MuJoCo Warp lacks.
@@ -113,31 +92,17 @@ class URLabBatchEnv(Vectorized):
             raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
             raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
-        settings = EpisodeSettings.of(
-            task,
-            observations=observations,
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            n_substeps=n_substeps,
-            max_episode_steps=max_episode_steps,
-            keyframe=keyframe,
-            reset_noise=reset_noise,
-            space_mode=space_mode,
-            cameras=cameras,
-            render_mode=render_mode,
-            render_camera=render_camera,
-        )
+        settings = EpisodeSettings.of(**options)
         address = with_model_options(address)
         with URLabClient(address, **client_defaults(client_options)) as client:
             client.discover()
             model = client.model
             if model is None or not client.articulations:
                 raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
-            self._prefixes = compiled_prefixes(client)
             self._rendered = rendered_camera(aio_of(client), settings)
             drawn = [*settings.cameras, *([self._rendered] if self._rendered else [])]
             self._scene = PictureScene.of(aio_of(client), model, drawn)
-            mapping = SpaceMapping(model, self._prefixes, settings.fields, settings.space_mode, settings.articulations)
+            mapping = space_mapping(aio_of(client), model, settings)
             self._controllers = {
                 key: _controller(model, mapping.layout(key), str(found.kind), found.params)
                 for key, articulation in client.articulations.items()
@@ -150,15 +115,14 @@ class URLabBatchEnv(Vectorized):
             settings=settings,
             mapping=mapping,
             observation_space=with_task(
-                with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}), task
+                with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}), settings.task
             ),
             autoreset_mode=autoreset_mode,
             randomise=declared,
         )
         self.model = model
-        self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
-        if task is not None:
-            task.setup(TaskScene(model, mapping))
+        self._memory = settings.memory(model, mapping, range(num_envs))
+        self._recent: tuple[Indices, States] | None = None
         self._pictures = BatchPictures(
             self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
         )
@@ -170,7 +134,6 @@ class URLabBatchEnv(Vectorized):
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
-        self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
         self._varied = None
         if declared is not None and declared.vary:
@@ -198,7 +161,8 @@ class URLabBatchEnv(Vectorized):
         return None if found is None else found.to_dict()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the drawing context."""
+        """Free the drawing context, and let the task serve another environment."""
+        self._settings.release()
         self._pictures.close()
 
     def _copies(self, indices: Indices) -> list[Visible]:
@@ -212,18 +176,21 @@ class URLabBatchEnv(Vectorized):
         ]
 
     def _advance(
-        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
     ) -> Mapping[int, Exception]:
+        self._recent = None
         if len(fresh):
-            self._start(fresh, self._settings.keyframe if keyframe is None else keyframe)
+            self._start(fresh, keyframe)
         if len(acting):
-            self._act(acting, set_points)
+            self._act(acting, applied)
+            if self._memory is not None:
+                self._recent = acting, self._memory.updated(acting, applied.actions[acting], *self._state(acting))
         moved = np.sort(np.concatenate([fresh, acting]))
         put(self._observations, moved, self._observe(moved))
         return {}
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
-        key = -1 if keyframe is None else self._keyframe_id(keyframe)
+        key = -1 if keyframe is None else self.mapping.keyframe_id(keyframe)
         qpos, seeds, noise = self._arrays["qpos"], self.episode_seeds(), self._settings.reset_noise
         if self._varied is not None:
             self._varied.begin(indices, seeds)
@@ -238,38 +205,47 @@ class URLabBatchEnv(Vectorized):
                 for joints in noisy:
                     noise.add(self._rngs[i], self.model, joints, qpos[i])
             self._batch.forward(indices)
-        if self.task is not None:
+        if self._memory is not None:
             for i in map(int, indices):
-                start = Start(self.task.scene, qpos[i].copy())
-                self.task.reset(self._rngs[i], start)
-                qpos[i], self._goals[i] = start.qpos, start.goal
+                qpos[i] = self._memory.begin(i, self._rngs[i], qpos[i])
             self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
             for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):
                 self._pictures.begin(i, int(seeds[i]), visible)
 
-    def _act(self, indices: Indices, set_points: Mapping[str, Floats]) -> None:
-        ctrl = self._arrays["ctrl"]
-        targets: dict[str, NDArray[Any]] = {}
-        for key, values in set_points.items():
-            controller = self._controllers.get(key)
-            if controller is None or not controller.active:
-                ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
-            else:
-                targets[key] = values[indices].astype(self._target_type)
-        forces, pushes = self._forces(indices), self._arrays["xfrc_applied"]
+    def _act(self, indices: Indices, applied: Applied) -> None:
+        forces, pushes, n_substeps = self._forces(indices), self._arrays["xfrc_applied"], self._settings.n_substeps
         for i, pushed in forces.items():
             for body, force in pushed.items():
                 pushes[i, self._body(body), :3] = force
-        if targets:
-            for _ in range(self._settings.n_substeps):
-                self._control(indices, targets)
-                self._batch.step(indices, nstep=1)
-        else:
-            self._batch.step(indices, nstep=self._settings.n_substeps)
+        late = applied.late[indices]
+        for begin, end in itertools.pairwise(np.unique([0, *late, n_substeps]).tolist()):
+            waiting = (late > begin)[:, None]
+            now = {
+                key: np.where(waiting, applied.before[key][indices], values[indices])
+                for key, values in applied.set_points.items()
+            }
+            self._step(indices, now, end - begin)
         pushes[list(forces)] = 0.0
-        self._step_count[indices] += self._settings.n_substeps
+        self._step_count[indices] += n_substeps
+
+    def _step(self, indices: Indices, set_points: Mapping[str, Floats], n_steps: int) -> None:
+        """Step some copies with these set-points, shape (n, n_ctrl) for each articulation."""
+        ctrl = self._arrays["ctrl"]
+        targets: dict[str, NDArray[Any]] = {}
+        for key, exact in set_points.items():
+            values, controller = exact.astype(self._target_type), self._controllers.get(key)
+            if controller is None or not controller.active:
+                ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values
+            else:
+                targets[key] = values
+        if not targets:
+            self._batch.step(indices, nstep=n_steps)
+            return
+        for _ in range(n_steps):
+            self._control(indices, targets)
+            self._batch.step(indices, nstep=1)
 
     def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
         """Compute the controls from the controllers' targets and the current state."""
@@ -296,11 +272,16 @@ class URLabBatchEnv(Vectorized):
         return observation
 
     def _states(self, indices: Indices) -> States:
-        if self.task is None:
+        if self._memory is None:
             raise URLabError("This environment has no task.")
-        arrays = self._arrays
-        qpos, qvel, time = (arrays[name][indices] for name in ("qpos", "qvel", "time"))
-        return States(self.task.scene, qpos, qvel, time, [self._goals[i] for i in map(int, indices)])
+        if self._recent is None or not np.array_equal(self._recent[0], indices):
+            self._recent = indices, self._memory.states(indices, *self._state(indices))
+        return self._recent[1]
+
+    def _state(self, indices: Indices) -> tuple[Floats, Floats, Floats]:
+        """Return positions, velocities and times of some copies."""
+        qpos, qvel, time = (self._arrays[name][indices] for name in ("qpos", "qvel", "time"))
+        return qpos, qvel, time
 
     def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
         match field:
@@ -322,15 +303,6 @@ class URLabBatchEnv(Vectorized):
         if found is None:
             raise ValueError(f"push: unknown body {name!r}; the bodies are: {', '.join(self._bodies)}")
         return found
-
-    def _keyframe_id(self, name: str) -> int:
-        wanted = {name, *compiled_names(name, self._prefixes)}
-        found = [full for full in self._keyframes if full in wanted]
-        if len(found) != 1:
-            raise UnknownKeyframe(
-                "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
-            )
-        return self._keyframes[found[0]]
 
 
 class _CopyVariation:

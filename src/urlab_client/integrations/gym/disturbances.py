@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
 from urlab_client.randomise.variation import (
@@ -36,10 +36,17 @@ class Disturbances:
         declaration: The declaration.
         mapping: The articulations as spaces.
         n_task: Length of what a task adds to an observation.
+        n_substeps: Physics steps per action.
+
+    Attributes:
+        seed: Seed of the episode.
+        late_steps: Physics steps of each action during which the set-points before it are still in force.
     """
 
-    def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
+    def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int, n_substeps: int) -> None:
         self.seed = -1
+        self.late_steps = 0
+        self._n_substeps = n_substeps
         self._declaration = declaration
         self._mapping = mapping
         self._n_task = n_task
@@ -49,11 +56,13 @@ class Disturbances:
         self._drops = stream(0, DROP_STREAM)
         self._samples: deque[Observation] = deque(maxlen=1)
         self._shown: Observation = None
-        self._actions: deque[Any] = deque()
-        self._late_actions = 0
+        self._chosen: deque[Mapping[str, Floats]] = deque()
 
-    def begin(self, rng: np.random.Generator) -> int:
-        """Draw the disturbances of an episode and return its seed, which the environment's generator draws."""
+    def begin(self, rng: np.random.Generator, keyframe: str | None) -> int:
+        """Draw the disturbances of an episode and return its seed, which the environment's generator draws.
+
+        The set-points of the keyframe are in force until the first delayed action is.
+        """
         self.seed: int = int(rng.integers(_SEED_END))
         seed = self.seed
         declared = self._declaration
@@ -63,23 +72,24 @@ class Disturbances:
             generator = stream(seed, NOISE_STREAM, i)
             self._noises.append((generator, [generator.uniform(-noise.bias, noise.bias, n) for n in widths]))
         late = stream(seed, DELAY_STREAM)
-        observation, action = (
+        delay = declared.delay
+        observation, action, substeps = (
             int(late.integers(low, high, endpoint=True))
-            for low, high in (steps_range(declared.delay.observation), steps_range(declared.delay.action))
+            for low, high in map(steps_range, (delay.observation, delay.action, delay.action_substeps))
         )
         self._samples = deque(maxlen=observation + 1)
         self._shown = None
-        self._late_actions = action
-        self._actions.clear()
+        if declared.delays_actions:
+            more, self.late_steps = divmod(substeps, self._n_substeps)
+            length = action + more + 2
+            self._chosen = deque([self._mapping.held(keyframe)] * length, maxlen=length)
         self._drops = stream(seed, DROP_STREAM)
         return seed
 
-    def delayed(self, action: Any) -> Any:
-        """Return the action that takes effect now: an earlier action, or zero set-points."""
-        if not self._late_actions:
-            return action
-        self._actions.append(_copied(action))
-        return self._actions.popleft() if len(self._actions) > self._late_actions else mapped(np.zeros_like, action)
+    def delayed(self, set_points: Mapping[str, Floats]) -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+        """Return the set-points in force during the first `late_steps` physics steps, and those after them."""
+        self._chosen.append({key: values.copy() for key, values in set_points.items()})
+        return self._chosen[0], self._chosen[1]
 
     def forces(self) -> dict[str, Floats]:
         """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Self, Unpack
 
 import gymnasium
 import numpy as np
@@ -16,15 +16,9 @@ from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
-from urlab_client.integrations.gym.settings import (
-    EpisodeSettings,
-    RewardFn,
-    TerminationFn,
-    client_defaults,
-    keyframe_option,
-)
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
-from urlab_client.integrations.gym.task import ResetNoise, States, Task
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, keyframe_option
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.task import EpisodeEnd, Task, judged, succeeded
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
@@ -38,10 +32,10 @@ _FALLBACK_FPS: Final = 50.0
 class URLabEnv(gymnasium.Env[Observation, Any]):
     """A Gymnasium environment over a discovered client in `direct` or `puppet` mode.
 
-    An action holds the set-points of all actuators for `n_substeps` physics steps. An observation holds the fields
-    that `observations` names (see `SpaceMapping`). `info` contains `step_count` (physics steps since the reset) and
-    `sim_time` (seconds), plain numbers that can be copied and pickled. Live objects are attributes of the environment,
-    for example `env.unwrapped.articulations`.
+    An action determines the set-points of all actuators for `n_substeps` physics steps (see `Actions`). An observation
+    holds the fields that `observations` names (see `SpaceMapping`). `info` contains `step_count` (physics steps since
+    the reset) and `sim_time` (seconds), plain numbers that can be copied and pickled. Live objects are attributes of
+    the environment, for example `env.unwrapped.articulations`.
 
     A reset returns the simulation to its initial state, or to the keyframe named by `options={"keyframe": NAME}`, and
     clears the set-points. `reset_noise` then adds uniform noise to the joint positions, within the joint ranges. The
@@ -65,79 +59,41 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self,
         client: URLabClient,
         *,
-        space_mode: SpaceMode | None = None,
-        observations: str | Sequence[str] | None = None,
-        reward_fn: RewardFn | None = None,
-        termination_fn: TerminationFn | None = None,
-        max_episode_steps: int | None = None,
-        cameras: Sequence[str] | None = None,
-        n_substeps: int | None = None,
-        render_mode: Literal["rgb_array"] | None = None,
-        render_camera: str | None = None,
-        reset_noise: float | ResetNoise | None = None,
-        keyframe: str | None = None,
-        task: Task | None = None,
         randomise: Randomisation | str | os.PathLike[str] | None = None,
         owns_client: bool = False,
+        **options: Unpack[EpisodeOptions],
     ) -> None:
         """Make an environment.
 
         Args:
             client: A client after `discover()`, during play.
-            space_mode: `flat` for one array (the default), or `dict` for dictionaries by articulation and field.
-            observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
-                sequence of those fields. If this or a later argument is None, the value of the task applies. Without
-                a task the default here is `standard`.
-            reward_fn: Function called with the observation before the action, the action, the observation after it,
-                and `info`. Without one, rewards are 0.
-            termination_fn: Function called with the observation after the action and `info`. Without one, episodes
-                never terminate.
-            max_episode_steps: Actions after which an episode is truncated. None without a task means no limit.
-            cameras: Cameras whose frames are part of the observation, under `cameras`, as `ARTICULATION/CAMERA` or as
-                the name of a scene-level camera. Requires `space_mode="dict"`.
-            n_substeps: Physics steps per action; 1 by default without a task.
-            render_mode: None or `rgb_array`.
-            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
-            reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints only. A
-                joint stays within its range. None without a task means no noise.
-            keyframe: Keyframe in which episodes start unless `reset` names another; the initial state by default.
-            task: What the robot is to do. It sets rewards and episode ends, and may change the start that `keyframe`
-                and `reset_noise` give.
             randomise: What varies from episode to episode, and what disturbs sensors and actuators: a
                 `Randomisation`, or the path of its TOML file. Most model quantities need a server that varies them;
                 see `connect`. On other servers, ops vary gravity, the start and the gains of PD controllers until
                 `close()`. If None, the server's own declaration applies.
             owns_client: Whether `close` also closes the client.
+            options: See `EpisodeOptions`.
 
         Raises:
             URLabError: The client has no model or no articulation, the client is in live mode, or the server varies
                 its scene differently from `randomise`.
             UnsupportedRandomisation: The server varies nothing itself and has no op for what `randomise` varies.
             KeyError: A camera or a body to push is unknown.
-            ValueError: An option is out of range, or the scene has no camera to render.
+            ValueError: An option is out of range, the scene has no camera to render, the task serves another
+                environment, or one of its hooks or attributes is misspelt.
         """
-        settings = EpisodeSettings.of(
-            task,
-            observations=observations,
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            n_substeps=n_substeps,
-            max_episode_steps=max_episode_steps,
-            keyframe=keyframe,
-            reset_noise=reset_noise,
-            space_mode=space_mode,
-            cameras=cameras,
-            render_mode=render_mode,
-            render_camera=render_camera,
-        )
+        settings = self._settings = EpisodeSettings.of(**options)
         self.client = client
-        self.render_mode = render_mode
+        self.render_mode = settings.render_mode
         self._episode = EnvEpisode(
             aio_of(client), settings=settings, randomise=None if randomise is None else Randomisation.of(randomise)
         )
         self.randomise: Randomisation | None = self._episode.randomise
+        self.task = task = settings.task
         n_task = 0 if task is None else task.n_observed
-        self._disturbances = None if self.randomise is None else Disturbances(self.randomise, self.mapping, n_task)
+        self._disturbances = None
+        if self.randomise is not None:
+            self._disturbances = Disturbances(self.randomise, self.mapping, n_task, settings.n_substeps)
         self.action_space: gymnasium.Space[Any] = self.mapping.action_space
         self.observation_space: gymnasium.Space[Any] = self._episode.observation_space
         model = client.model
@@ -145,13 +101,13 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             **self.metadata,
             "render_fps": 1.0 / (model.opt.timestep * settings.n_substeps) if model else _FALLBACK_FPS,
         }
-        self.task = task
-        self.reward_fn = reward_fn
-        self.termination_fn = termination_fn
+        self.reward_fn = settings.reward_fn
+        self.termination_fn = settings.termination_fn
         self._max_episode_steps = settings.max_episode_steps
         self._owns_client = owns_client
         self._observation: Observation = None
         self._elapsed = 0
+        self._total = 0.0
 
     @classmethod
     def connect(cls, address: str, *, client_options: Mapping[str, Any] = MappingProxyType({}), **options: Any) -> Self:
@@ -208,12 +164,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         super().reset(seed=seed)
         keyframe = keyframe_option(options)
         disturbances = self._disturbances
-        episode_seed = None if disturbances is None else disturbances.begin(self.np_random)
+        episode_seed = None
+        if disturbances is not None:
+            episode_seed = disturbances.begin(self.np_random, keyframe or self._settings.keyframe)
         self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe, episode_seed)
-        self._elapsed = 0
+        self._elapsed, self._total = 0, 0.0
         info = self._info()
-        if self.task is not None:
-            self._add_success(self.task, self._episode.states(), info)
+        success = None if self.task is None else succeeded(self.task, self._episode.states())
+        if success is not None:
+            info["success"] = bool(success[0])
         return self._seen(), info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -226,12 +185,16 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         before = self._observation
-        set_points = self.mapping.set_points(action)  # validates before anything is drawn
+        set_points = before_late = self.mapping.set_points(action)  # validates before anything is drawn
         forces: dict[str, Floats] = {}
-        disturbances = self._disturbances
+        disturbances, late_steps = self._disturbances, 0
         if disturbances is not None:
-            set_points, forces = self.mapping.set_points(disturbances.delayed(action)), disturbances.forces()
-        after = self._observation = portal_of(self.client).call(self._episode.step, set_points, forces)
+            forces, late_steps = disturbances.forces(), disturbances.late_steps
+            if self.randomise is not None and self.randomise.delays_actions:
+                before_late, set_points = disturbances.delayed(set_points)
+        after = self._observation = portal_of(self.client).call(
+            self._episode.step, set_points, forces, self.mapping.flat(action), before_late, late_steps
+        )
         self._elapsed += 1
         info = self._info()
         if self.task is not None:
@@ -263,7 +226,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         return picture
 
     def close(self) -> None:
-        """Undo what this environment varied on the server, and close the client if the environment owns it."""
+        """Undo what this environment varied on the server, and close the client if the environment owns it.
+
+        The task may then serve another environment.
+        """
+        self._settings.release()
         with contextlib.suppress(URLabError):  # the client may be closed already
             portal_of(self.client).call(self._episode.close)
         if self._owns_client:
@@ -277,17 +244,16 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         actions: Any = np.asarray(action)[None]
         if self.mapping.mode == "dict":
             actions = {key: np.asarray(action[key])[None] for key in action}
-        reward, terminated = float(task.reward(states, actions)[0]), bool(task.terminated(states)[0])
+        rewards, ends, success = judged(task, states, actions)
+        reward, terminated = float(rewards[0]), bool(ends[0])
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        self._add_success(task, states, info)
-        if terminated or truncated:
-            task.ended(info.get("success", False), self._elapsed)
-        return self._seen(), reward, terminated, truncated, info
-
-    def _add_success(self, task: Task, states: States, info: dict[str, Any]) -> None:
-        success = task.success(states)
+        self._total += reward
         if success is not None:
             info["success"] = bool(success[0])
+        if terminated or truncated:
+            done = info.get("success", False)
+            task.ended(EpisodeEnd(0, done, terminated, self._elapsed, self._total, states.goal_of(0)))
+        return self._seen(), reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
         client = self.client

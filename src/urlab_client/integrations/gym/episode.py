@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -14,9 +15,10 @@ from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.enums import CameraMode, ObservationLevel, StepMode
+from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._variation import WireVariation, server_variation
+from urlab_client.integrations._variation import WireVariation, controlled_actuators, server_variation
 from urlab_client.integrations.gym.settings import EpisodeSettings
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
@@ -27,14 +29,15 @@ from urlab_client.integrations.gym.spaces import (
     camera_space,
     with_cameras,
 )
-from urlab_client.integrations.gym.task import Start, States, TaskScene, add_observed, with_task
+from urlab_client.integrations.gym.task import States, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
-from urlab_client.sync.client import URLabClient as BlockingClient
 from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
+
+_ROW: Final = np.zeros(1, dtype=np.intp)
 
 
 class EnvEpisode:
@@ -53,6 +56,7 @@ class EnvEpisode:
         settings: EpisodeSettings,
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
+        index: int = 0,
     ) -> None:
         """Set up the episodes of a client, and the task unless it already is.
 
@@ -61,6 +65,7 @@ class EnvEpisode:
             settings: Settings of the episodes.
             randomise: What varies from episode to episode. If None, the server's own declaration applies.
             earlier: Episodes of the earlier client that this client replaces.
+            index: Index of the environment in a vector environment.
 
         Raises:
             URLabError: The client cannot serve an environment, or its server varies the scene differently.
@@ -83,9 +88,7 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         self._settings = settings
-        self.mapping: SpaceMapping = SpaceMapping(
-            model, compiled_prefixes(client), settings.fields, settings.space_mode, settings.articulations
-        )
+        self.mapping: SpaceMapping = space_mapping(client, model, settings)
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(settings.fields) <= set(LEVELS["minimal"])
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
@@ -97,7 +100,6 @@ class EnvEpisode:
             name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
         }
         self.observation_space: Space = with_cameras(self.mapping, images)
-        self._goal: dict[str, Floats] = {}
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._variation = server_variation(client, model, layouts)
@@ -110,18 +112,21 @@ class EnvEpisode:
         self._draws: EpisodeDraws | None = None
         for push in () if self.randomise is None else self.randomise.push:
             self._pushed(push.body)
-        if settings.task is not None:
-            if not hasattr(settings.task, "scene"):
-                settings.task.setup(TaskScene(model, self.mapping))
-            self.observation_space = with_task(self.observation_space, settings.task)
+        self._memory = settings.memory(model, self.mapping, [index])
+        self.observation_space = with_task(self.observation_space, settings.task)
 
     def states(self) -> States:
         """Return the current state in the form passed to tasks, with n = 1."""
-        data = self.client.data
-        if self._settings.task is None or data is None:
+        if self._memory is None:
             raise URLabError("This environment has no task.")
-        qpos, qvel = np.array(data.qpos)[None], np.array(data.qvel)[None]
-        return States(self._settings.task.scene, qpos, qvel, np.array([data.time]), [self._goal])
+        return self._memory.states(_ROW, *self._state())
+
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        """Return positions, velocities and time, each with a leading axis of 1."""
+        data = self.client.data
+        if data is None:
+            raise URLabError("The client has no model.", hint="Call discover() with local_model=True.")
+        return np.array(data.qpos)[None], np.array(data.qvel)[None], np.array([data.time])
 
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""
@@ -165,24 +170,45 @@ class EnvEpisode:
             with contextlib.suppress(URLabError):
                 await self.over_wire.undo()
 
-    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+    async def step(
+        self,
+        set_points: Mapping[str, Floats],
+        forces: Mapping[str, Floats],
+        action: Floats,
+        before: Mapping[str, Floats] = MappingProxyType({}),
+        late_steps: int = 0,
+    ) -> Observation:
         """Apply set-points for `n_substeps` and return the observation after them.
 
         Args:
             set_points: Set-points of each articulation, shape (n_ctrl,).
             forces: Forces on bodies meanwhile, N, world frame, shape (3,).
+            action: The action for the task, shape (n_actions,).
+            before: Set-points that are in force during the first `late_steps` physics steps.
+            late_steps: Number of these steps, less than `n_substeps`.
         """
+        if late_steps:
+            await self._apply(before, forces, late_steps)
+        cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
+        reply = await self._apply(set_points, forces, self._settings.n_substeps - late_steps, cameras)
+        self._take_frames()
+        if self._memory is not None:
+            self._memory.updated(_ROW, action[None], *self._state())
+        return self._observe(reply)
+
+    async def _apply(
+        self,
+        set_points: Mapping[str, Floats],
+        forces: Mapping[str, Floats],
+        n_steps: int,
+        cameras: Mapping[str, str] = MappingProxyType({}),
+    ) -> StepOk:
         for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)
             articulation.apply_xfrc(name, force=force.tolist())
-        cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
-        reply = await self.client.step(
-            self._settings.n_substeps, include_cameras=cameras or False, observations=self._level
-        )
-        self._take_frames()
-        return self._observe(reply)
+        return await self.client.step(n_steps, include_cameras=dict(cameras) or False, observations=self._level)
 
     def _add_noise(self, rng: np.random.Generator, qpos: Floats) -> dict[str, dict[str, float]]:
         """Add noise to the positions of joints in place; return the new positions by articulation."""
@@ -196,13 +222,10 @@ class EnvEpisode:
 
     async def _start_task(self, rng: np.random.Generator) -> dict[str, Floats]:
         """Let the task choose the start; return the positions of each articulation that it moved."""
-        task, data = self._settings.task, self.client.data
-        if task is None or data is None:
+        data = self.client.data
+        if self._memory is None or data is None:
             return {}
-        start = Start(task.scene, np.array(data.qpos))
-        task.reset(rng, start)
-        self._goal = start.goal
-        return await self._place_changed(start.qpos)
+        return await self._place_changed(self._memory.begin(0, rng, np.array(data.qpos)))
 
     async def _start_over_wire(self) -> dict[str, Floats]:
         """Vary the start if the server does not; return the positions of each articulation that moved."""
@@ -336,9 +359,23 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
     return randomise
 
 
-def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
-    """Return the prefix of the compiled names of each articulation."""
-    return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
+def space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
+    """Return the articulations of a discovered client as the spaces of an environment."""
+    prefixes = {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
+    controlled = {
+        key: layout
+        for key, layout in articulation_layouts(model, prefixes).items()
+        if client.articulations[key].control_mode is not ControlMode.RAW
+    }
+    return SpaceMapping(
+        model,
+        prefixes,
+        settings.fields,
+        settings.space_mode,
+        settings.articulations,
+        actions=settings.actions,
+        targets=controlled_actuators(client, controlled),
+    )
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client.integrations.gym.spaces import Observation
-from urlab_client.integrations.gym.vectorized import Vectorized
 
 need("stable_baselines3", extra="sb3")
 
@@ -35,7 +34,7 @@ Indices = None | int | Sequence[int]
 
 
 class Sb3VecEnv(_VecEnv):
-    """A `URLabBatchEnv` or `URLabVectorEnv` for `PPO("MlpPolicy", Sb3VecEnv(env))`.
+    """A `URLabBatchEnv` or `URLabVectorEnv`, also in Gymnasium's wrappers, for `PPO("MlpPolicy", Sb3VecEnv(env))`.
 
     The `info` of an environment contains the entries of `infos` at its index and, at the end of an episode, also
     `terminal_observation` and `TimeLimit.truncated`. If an environment fails, its episode ends as truncated, and `info`
@@ -48,15 +47,16 @@ class Sb3VecEnv(_VecEnv):
         ValueError: The environment has a different autoreset mode.
     """
 
-    def __init__(self, env: Vectorized) -> None:
-        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
                 "Stable-Baselines3 resets in the step that ends an episode: make the environment with "
-                f"autoreset_mode=AutoresetMode.SAME_STEP, not {env.autoreset_mode.name}"
+                f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
             )
-        self.env = env
+        self.env: Any = env
         self._actions: Any = None
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, self.env.single_observation_space, self.env.single_action_space)
 
     def reset(self) -> Observation:
         """Start an episode in all environments, with the seeds of `seed()`."""
@@ -77,7 +77,8 @@ class Sb3VecEnv(_VecEnv):
         each: list[dict[str, Any]] = []
         for i in range(self.env.num_envs):
             if ended[i]:
-                info = _info(infos["final_info"], i)
+                # Wrappers put the statistics of the ended episode beside the infos of the next one.
+                info = _info(infos, i) | _info(infos["final_info"], i)
                 info["terminal_observation"] = infos["final_obs"][i]
                 info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             else:
@@ -91,7 +92,7 @@ class Sb3VecEnv(_VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return the picture of each environment, None without a render mode."""
-        pictures = cast("Any", self.env).render()
+        pictures = self.env.render()
         return [None] * self.env.num_envs if pictures is None else list(pictures)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -129,7 +130,15 @@ class Sb3VecEnv(_VecEnv):
 def _info(infos: dict[str, Any], i: int) -> dict[str, Any]:
     """Return the infos of one environment of a vector environment."""
     entries = {name: values for name, values in infos.items() if not name.startswith("_") and name not in _FINAL}
-    return {name: values[i] for name, values in entries.items() if infos[f"_{name}"][i]}
+    return {name: _at(values, i) for name, values in entries.items() if infos[f"_{name}"][i]}
+
+
+def _at(values: Any, i: int) -> Any:
+    """Return the entry of one environment; wrappers nest dictionaries."""
+    if not isinstance(values, dict):
+        return values[i]
+    entries = cast("dict[str, Any]", values)
+    return {name: _at(inner, i) for name, inner in entries.items() if not name.startswith("_")}
 
 
 _FINAL = {"final_obs", "final_info"}

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final, Literal, TypedDict, Unpack
+from weakref import WeakValueDictionary
+
+import mujoco
 
 from urlab_client.aio.arguments import collection, integer, require, text
-from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMode, fields_of
-from urlab_client.integrations.gym.task import ResetNoise, Task
+from urlab_client.integrations.gym.spaces import Actions, Field, Observation, SpaceMapping, SpaceMode, fields_of
+from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_spelling
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""
@@ -17,17 +20,60 @@ TerminationFn = Callable[[Observation, dict[str, Any]], Any]
 """`(observation, info) -> terminated`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EpisodeSettings:
-    """Settings of episodes: the arguments of an environment, else the values of its task, else the defaults.
+class EpisodeOptions(TypedDict, total=False):
+    """The options that all environments share. If one is missing or None, the value of the task applies.
 
-    `URLabEnv` and `Task` describe them.
+    Attributes:
+        task: What the robots are to do. It sets rewards and episode ends, and may change the start that `keyframe` and
+            `reset_noise` give. One instance serves one environment, single or vector, until its `close()`.
+        space_mode: `flat` for one array (the default), or `dict` for dictionaries by articulation and field.
+        observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
+            sequence of those fields. `standard` without a task.
+        actions: How actions become set-points, for all articulations or by key. Without a task, and for articulations
+            that are not named, actions are the set-points themselves.
+        reward_fn: Function called with the observation before the action, the action, the observation after it, and
+            `info`. Without one, rewards are 0. In a vector environment, arguments and result have a leading axis.
+        termination_fn: Function called with the observation after the action and `info`, likewise. Without one,
+            episodes never terminate.
+        max_episode_steps: Actions after which an episode is truncated. No limit without a task.
+        cameras: Cameras whose frames are part of the observation, under `cameras`, as `ARTICULATION/CAMERA` or as the
+            name of a scene-level camera. Requires `space_mode="dict"`.
+        n_substeps: Physics steps per action; 1 without a task.
+        reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints only. A joint
+            stays within its range. No noise without a task.
+        keyframe: Keyframe in which episodes start unless `reset` names another; the initial state by default.
+        render_mode: None or `rgb_array`.
+        render_camera: Camera that `render` shows; the first colour camera of the scene by default.
     """
+
+    task: Task | None
+    space_mode: SpaceMode | None
+    observations: str | Sequence[str] | None
+    actions: Actions | Mapping[str, Actions] | None
+    reward_fn: RewardFn | None
+    termination_fn: TerminationFn | None
+    max_episode_steps: int | None
+    cameras: Sequence[str] | None
+    n_substeps: int | None
+    reset_noise: float | ResetNoise | None
+    keyframe: str | None
+    render_mode: Literal["rgb_array"] | None
+    render_camera: str | None
+
+
+_SERVING: Final[WeakValueDictionary[int, EpisodeSettings]] = WeakValueDictionary()
+"""The settings of each open environment with a task, by the id of the task, which the settings keep alive."""
+
+
+@dataclass(slots=True, kw_only=True, weakref_slot=True, eq=False)
+class EpisodeSettings:
+    """Settings of an environment's episodes: its arguments, else the values of its task, else the defaults."""
 
     task: Task | None
     reward_fn: RewardFn | None
     termination_fn: TerminationFn | None
     fields: tuple[Field, ...]
+    actions: Actions | Mapping[str, Actions] | None
     n_substeps: int
     max_episode_steps: int | None
     keyframe: str | None
@@ -37,59 +83,80 @@ class EpisodeSettings:
     articulations: Sequence[str] | None
     render_mode: str | None
     render_camera: str | None
+    scene: TaskScene | None = None
 
     @classmethod
-    def of(
-        cls,
-        task: Task | None,
-        *,
-        observations: str | Sequence[str] | None = None,
-        reward_fn: RewardFn | None = None,
-        termination_fn: TerminationFn | None = None,
-        n_substeps: int | None = None,
-        max_episode_steps: int | None = None,
-        keyframe: str | None = None,
-        reset_noise: float | ResetNoise | None = None,
-        space_mode: SpaceMode | None = None,
-        cameras: Sequence[str] | None = None,
-        render_mode: str | None = None,
-        render_camera: str | None = None,
-    ) -> EpisodeSettings:
-        """Return the effective settings. None selects the value of the task, or the default without a task."""
+    def of(cls, **options: Unpack[EpisodeOptions]) -> EpisodeSettings:
+        """Return the effective settings.
+
+        Raises:
+            ValueError: An option is out of range or contradicts another, a hook or attribute of the task is misspelt,
+                or the task already serves another environment.
+        """
+        get, task = options.get, options.get("task")
+        render_mode = get("render_mode")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if task is not None:
-            functions = {"reward_fn": reward_fn, "termination_fn": termination_fn}
-            if given := [name for name, function in functions.items() if function]:
+            if given := [name for name in ("reward_fn", "termination_fn") if get(name)]:
                 raise ValueError(
                     f"{', '.join(given)} cannot be given together with a task: override the task's method instead"
                 )
             require("task", task, Task, "a Task")
-        if not isinstance(observations, str | None):
-            collection("observations", observations)
+            check_spelling(task)
+            if id(task) in _SERVING:
+                raise ValueError(
+                    f"this {type(task).__name__} already serves another environment: make one for each environment, "
+                    "or close() the other one first"
+                )
+        if (observed := get("observations")) is not None and not isinstance(observed, str):
+            collection("observations", observed)
         defaults = _NoTask if task is None else task
-        most = defaults.max_episode_steps if max_episode_steps is None else max_episode_steps
-        noise = defaults.reset_noise if reset_noise is None else reset_noise
+
+        def chosen(name: str) -> Any:
+            given = get(name)
+            return getattr(defaults, name) if given is None else given
+
+        most, noise, keyframe = chosen("max_episode_steps"), chosen("reset_noise"), get("keyframe")
         settings = cls(
             task=task,
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            fields=fields_of(defaults.observations if observations is None else observations),
-            n_substeps=integer("n_substeps", defaults.n_substeps if n_substeps is None else n_substeps),
+            reward_fn=get("reward_fn"),
+            termination_fn=get("termination_fn"),
+            fields=fields_of(chosen("observations")),
+            actions=chosen("actions"),
+            n_substeps=integer("n_substeps", chosen("n_substeps")),
             max_episode_steps=None if most is None else integer("max_episode_steps", most),
             keyframe=defaults.keyframe if keyframe is None else text("keyframe", keyframe),
             reset_noise=noise if isinstance(noise, ResetNoise) else ResetNoise(hinge=noise),
-            space_mode=defaults.space_mode if space_mode is None else space_mode,
-            cameras=tuple(collection("cameras", defaults.cameras if cameras is None else cameras)),
+            space_mode=chosen("space_mode"),
+            cameras=tuple(collection("cameras", chosen("cameras"))),
             articulations=defaults.articulations,
             render_mode=render_mode,
-            render_camera=render_camera,
+            render_camera=get("render_camera"),
         )
         if settings.n_substeps < 1:
             raise ValueError(f"n_substeps must be at least 1, not {settings.n_substeps}")
         if settings.max_episode_steps is not None and settings.max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be at least 1 or None, not {settings.max_episode_steps}")
         return settings
+
+    def memory(self, model: mujoco.MjModel, mapping: SpaceMapping, index: Sequence[int]) -> Memory | None:
+        """Return what the task keeps of these environments, None without a task; set the task up the first time.
+
+        From then on it serves no other environment, until `release`.
+        """
+        if self.task is None:
+            return None
+        if self.scene is None:
+            _SERVING[id(self.task)] = self
+            self.scene = TaskScene(model, mapping)
+            self.task.setup(self.scene)
+        return Memory(self.task, self.scene, index)
+
+    def release(self) -> None:
+        """Let the task serve another environment."""
+        if self.task is not None and _SERVING.get(id(self.task)) is self:
+            del _SERVING[id(self.task)]
 
 
 class _NoTask(Task):

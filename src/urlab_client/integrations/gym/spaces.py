@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
+from urlab_client._mujoco import control_counts
+from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, driven_joint
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import CameraMode
+from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.base import Floats
+from urlab_client.values.names import compiled_names
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,12 +35,41 @@ LEVELS: Final[Mapping[str, tuple[Field, ...]]] = {"minimal": ("qpos", "qvel"), "
 _HINGE_AND_SLIDE: Final = (2, 3)
 
 
+@dataclass(frozen=True, slots=True)
+class Actions:
+    """How actions become set-points: `offset + scale * clip(action)`, with one number for each actuator input.
+
+    The bounds of the action space are those of `clip`. A set-point is in the unit of the actuator, or of the joint if
+    a PD controller drives it.
+
+    Attributes:
+        scale: Change of the set-points per unit of action, a single number or one per input.
+        offset: Set-points for an action of 0: a single number, one per input, or the name of a keyframe, whose
+            set-points are its `ctrl`, or its joint positions where a PD controller drives the joints.
+        clip: Lowest and highest action; actions beyond them are clipped.
+    """
+
+    scale: float | Sequence[float] = 1.0
+    offset: float | Sequence[float] | str = 0.0
+    clip: tuple[float, float] = (-1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not self.clip[0] < self.clip[1]:
+            raise ValueError(f"actions: clip must be (low, high) with low < high, not {self.clip}")
+        for name, value in (("scale", self.scale), ("offset", self.offset)):
+            if not isinstance(value, str) and not np.isfinite(value).all():
+                raise ValueError(f"actions: {name} contains NaN or infinity")
+
+
 @dataclass(frozen=True)
 class _Articulation:
     layout: ArticulationLayout
     low: Floats
     high: Floats
     widths: Mapping[Field, int]
+    scale: Floats
+    offset: Floats
+    clip: tuple[float, float] | None
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
@@ -53,11 +86,12 @@ def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
 class SpaceMapping:
     """Mapping of the articulations of a scene to an action space and an observation space.
 
-    Actions are the set-points in `ctrl_array`, float32 as in Gymnasium's own MuJoCo environments. Their bounds are the
-    actuators' `ctrlrange`, or infinite without one. An articulation without actuators, such as a block to push, has no
-    actions. Observations are float64 and unbounded, because joints may overshoot their ranges. Articulations follow
-    the order of their keys in `client.articulations`; fields follow the requested order. The flat spaces concatenate
-    the dictionaries' entries in that order.
+    Actions are float32, as in Gymnasium's own MuJoCo environments. Without a declaration they are the set-points in
+    `ctrl_array`, bounded by the actuators' `ctrlrange`, or by the range of the joint if a PD controller drives it, or
+    infinite without a range. An articulation without actuators, such as a block to push, has no actions. Observations
+    are float64 and unbounded, because joints may overshoot their ranges. Articulations follow the order of their keys
+    in `client.articulations`; fields follow the requested order. The flat spaces concatenate the dictionaries' entries
+    in that order.
 
     Attributes:
         keys: Articulation keys, in order.
@@ -75,6 +109,9 @@ class SpaceMapping:
         fields: Sequence[Field],
         mode: SpaceMode = "flat",
         observed: Sequence[str] | None = None,
+        *,
+        actions: Actions | Mapping[str, Actions] | None = None,
+        targets: frozenset[int] = frozenset(),
     ) -> None:
         """Map articulations of a compiled scene.
 
@@ -84,9 +121,13 @@ class SpaceMapping:
             fields: Fields to observe.
             mode: `flat` or `dict`.
             observed: Keys of the articulations to observe, or None for all.
+            actions: How actions become set-points, for all articulations or by key; None for set-points themselves.
+            targets: Ids of the actuators whose set-points are joint positions, because a controller drives them.
 
         Raises:
-            ValueError: A field, the mode or an articulation is unknown, or there is nothing to observe.
+            ValueError: A field, the mode or an articulation is unknown, there is nothing to observe, or the actions
+                have the wrong length.
+            UnknownKeyframe: No keyframe, or more than one, has the name that the actions give.
         """
         unknown = [field for field in fields if field not in FIELDS]
         if unknown or not fields:
@@ -101,12 +142,21 @@ class SpaceMapping:
             )
         self.fields: tuple[Field, ...] = tuple(fields)
         self.mode: SpaceMode = mode
-        layouts = articulation_layouts(model, prefixes)
-        self._parts = {key: _part(model, layout) for key, layout in layouts.items()}
+        self._model = model
+        self._prefixes = dict(prefixes)
+        self._targets = targets
+        self._parts = {key: _part(model, each, targets) for key, each in articulation_layouts(model, prefixes).items()}
+        self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
+        if actions is not None:
+            declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else actions
+            if wrong := declared.keys() - self._parts.keys():
+                raise ValueError(
+                    f"actions of {', '.join(sorted(wrong))}; the articulations are: {', '.join(self.keys)}"
+                )
+            self._parts |= {key: self._scaled(key, each) for key, each in declared.items()}
         self._where = self._slices()
         ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
         self._n_actions = ends[-1]
-        self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
         self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
         self.action_space: Space = self._make_action_space()
         self.observation_space: Space = self._make_observation_space()
@@ -118,6 +168,55 @@ class SpaceMapping:
     def width(self, key: str, field: Field) -> int:
         """Return the length of a field of an articulation."""
         return self._parts[key].widths[field]
+
+    def keyframe_id(self, name: str) -> int:
+        """Return the id of a keyframe, by its own name or that of the compiled scene.
+
+        Raises:
+            UnknownKeyframe: No keyframe, or more than one, has this name.
+        """
+        known = model_names(self._model, "key")
+        wanted = {name, *compiled_names(name, self._prefixes)}
+        found = [i for i, full in enumerate(known) if full in wanted]
+        if len(found) != 1:
+            raise UnknownKeyframe(
+                "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(known) or 'none'}"
+            )
+        return found[0]
+
+    def held(self, keyframe: str | None) -> dict[str, Floats]:
+        """Return the set-points that hold a keyframe, or the initial state, by articulation, shape (n_ctrl,).
+
+        They are its `ctrl`, 0 in the initial state, and the positions of the joints that a PD controller drives.
+
+        Raises:
+            UnknownKeyframe: No keyframe, or more than one, has this name.
+        """
+        model, key = self._model, -1 if keyframe is None else self.keyframe_id(keyframe)
+        ctrl, qpos = (np.zeros(model.nu), model.qpos0) if key < 0 else (model.key_ctrl[key], model.key_qpos[key])
+        found: dict[str, Floats] = {}
+        for name in self._driven:
+            found[name] = np.array(ctrl[self.layout(name).ctrl_adr], dtype=np.float64)
+            for place, joint in _driven_joints(model, self.layout(name), self._targets):
+                found[name][place] = qpos[model.jnt_qposadr[joint]]
+        return found
+
+    def flat(self, action: Any) -> Floats:
+        """Return actions as one array, shape (…, n_actions): the articulations with actuators in their order."""
+        if self.mode == "dict":
+            return np.concatenate([np.asarray(action[key], dtype=np.float64) for key in self._driven], axis=-1)
+        return np.asarray(action, dtype=np.float64)
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actuator inputs: the length of `flat`."""
+        return self._n_actions
+
+    def actions(self, key: str) -> Actions:
+        """Return how the actions of an articulation become set-points, with one number per actuator input."""
+        part = self._parts[key]
+        clip = (-np.inf, np.inf) if part.clip is None else part.clip
+        return Actions(scale=part.scale.tolist(), offset=part.offset.tolist(), clip=clip)
 
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
         """Return the names of the hinge and slide joints of an articulation: joints with a scalar position."""
@@ -150,7 +249,25 @@ class SpaceMapping:
                 raise ValueError(f"the action of {key} has shape {values.shape}; its last axis must be {n_ctrl} long")
             if not np.isfinite(values).all():
                 raise ValueError(f"the action of {key} contains NaN or infinity: {values}")
+            part = self._parts[key]
+            if part.clip is not None:
+                found[key] = part.offset + part.scale * np.clip(values, *part.clip)
         return found
+
+    def _scaled(self, key: str, actions: Actions) -> _Articulation:
+        """Return an articulation whose actions become set-points as declared."""
+        part = self._parts[key]
+        offset = self.held(actions.offset)[key] if isinstance(actions.offset, str) else actions.offset
+        try:
+            scale, offset = (
+                np.broadcast_to(np.asarray(v, np.float64), part.low.shape) for v in (actions.scale, offset)
+            )
+        except ValueError:
+            raise ValueError(
+                f"actions of {key}: scale and offset take one number, or one for each of the {len(part.low)} inputs"
+            ) from None
+        low, high = (np.full(part.low.shape, bound) for bound in actions.clip)
+        return replace(part, low=low, high=high, scale=scale, offset=offset, clip=actions.clip)
 
     def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
         """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
@@ -205,10 +322,24 @@ class SpaceMapping:
         )
 
 
-def _part(model: mujoco.MjModel, layout: ArticulationLayout) -> _Articulation:
+def _driven_joints(
+    model: mujoco.MjModel, layout: ArticulationLayout, targets: frozenset[int]
+) -> Iterator[tuple[int, int]]:
+    """Yield the place among an articulation's controls and the joint of each actuator in `targets`."""
+    place, counts = 0, control_counts(model)
+    for actuator in layout.actuators.values():
+        joint = driven_joint(model, actuator) if actuator in targets else None
+        if joint is not None:
+            yield place, joint
+        place += int(counts[actuator])
+
+
+def _part(model: mujoco.MjModel, layout: ArticulationLayout, targets: frozenset[int]) -> _Articulation:
     address = layout.ctrl_adr
     limited = model.actuator_ctrllimited[address].astype(bool)
-    low, high = model.actuator_ctrlrange[address].T
+    low, high = np.array(model.actuator_ctrlrange[address], dtype=np.float64).T
+    for place, joint in _driven_joints(model, layout, targets):
+        limited[place], (low[place], high[place]) = model.jnt_limited[joint], model.jnt_range[joint]
     widths: dict[Field, int] = {
         "qpos": len(layout.qpos_adr),
         "qvel": len(layout.qvel_adr),
@@ -216,7 +347,8 @@ def _part(model: mujoco.MjModel, layout: ArticulationLayout) -> _Articulation:
         "act": len(address),
         "sensors": int(sum(model.sensor_dim[i] for i in layout.sensors.values())),
     }
-    return _Articulation(layout, np.where(limited, low, -np.inf), np.where(limited, high, np.inf), widths)
+    low, high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+    return _Articulation(layout, low, high, widths, np.ones(len(address)), np.zeros(len(address)), None)
 
 
 def _bounded(low: Floats, high: Floats) -> Space:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any, ClassVar, cast
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, cast
 
 import mujoco
 import numpy as np
@@ -15,11 +18,12 @@ from numpy.typing import NDArray
 
 from urlab_client.aio.arguments import require
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.integrations.gym.spaces import Actions, Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.protocol.base import Floats
 from urlab_client.values.names import unknown_name
 
 Bools = NDArray[np.bool_]
+_SKY_M: Final = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +110,17 @@ class Start:
         scene: The scene.
         qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write in place.
         goal: Goal of the episode, by name: numbers or arrays whose shape is the same in all episodes.
+        index: Index of the environment.
+        memory: What the task keeps of the environment, by name, initially zeros. Write in place.
     """
 
-    def __init__(self, scene: TaskScene, qpos: Floats) -> None:
+    def __init__(
+        self, scene: TaskScene, qpos: Floats, index: int = 0, memory: Mapping[str, Floats] = MappingProxyType({})
+    ) -> None:
         self.scene = scene
         self.qpos = qpos
+        self.index = index
+        self.memory = memory
         self.goal: dict[str, Floats] = {}
 
     def joint(self, name: str, position: float) -> None:
@@ -136,6 +146,26 @@ class Start:
         self.qpos[address : address + 3] = position
         self.qpos[address + 3 : address + 7] = quaternion
 
+    def ground(self, x: float, y: float) -> float:
+        """Return the height of the ground at a place, metres: the highest plane, height field or other fixed geom.
+
+        Poses are those of the start, and moving bodies do not count. So on uneven ground a robot starts at
+        `start.place("robot/trunk", [x, y, start.ground(x, y) + 0.3])`.
+
+        Raises:
+            ValueError: There is no ground at this place.
+        """
+        model, data = self.scene.model, self.scene.data
+        data.qpos[:] = self.qpos
+        mujoco.mj_kinematics(model, data)
+        above, down, hit = np.array([x, y, _SKY_M]), np.array([0.0, 0.0, -1.0]), np.full((1, 1), -1, dtype=np.int32)
+        while (depth := mujoco.mj_ray(model, data, above, down, None, 1, -1, hit)) >= 0:
+            above[2] -= depth
+            if model.body_weldid[model.geom_bodyid[hit[0, 0]]] == 0:
+                return float(above[2])
+            above[2] -= 1e-6
+        raise ValueError(f"there is no ground at x = {x:g}, y = {y:g}")
+
     def noise(self, rng: np.random.Generator, key: str, noise: ResetNoise) -> None:
         """Add random noise to the hinge and slide joints of an articulation, within their ranges."""
         model = self.scene.model
@@ -153,10 +183,25 @@ class States:
         qvel: Velocities, shape (n, nv).
         time: Simulation time, seconds, shape (n,).
         goal: Values that `Task.reset` put into `Start.goal`, each with a leading axis.
+        index: Indices of the environments, shape (n,).
+        last_action: Actions that led to the states, shape (n, n_actions), before delays; zeros after a reset. Those of
+            all articulations are concatenated.
+        previous_action: Actions before those, likewise.
+        memory: What the task keeps, by name, each with a leading axis. Only `Task.update` may write it.
     """
 
     def __init__(
-        self, scene: TaskScene, qpos: Floats, qvel: Floats, time: Floats, goals: Sequence[Mapping[str, Floats]]
+        self,
+        scene: TaskScene,
+        qpos: Floats,
+        qvel: Floats,
+        time: Floats,
+        goals: Sequence[Mapping[str, Floats]],
+        *,
+        index: NDArray[np.intp] | None = None,
+        last_action: Floats | None = None,
+        previous_action: Floats | None = None,
+        memory: Mapping[str, Floats] = MappingProxyType({}),
     ):
         self.scene = scene
         self.qpos = qpos
@@ -167,9 +212,18 @@ class States:
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
+        self.index = np.arange(len(qpos)) if index is None else index
+        still = np.zeros((len(qpos), scene.mapping.n_actions))
+        self.last_action = still if last_action is None else last_action
+        self.previous_action = still if previous_action is None else previous_action
+        self.memory = memory
 
     def __len__(self) -> int:
         return len(self.qpos)
+
+    def goal_of(self, row: int) -> dict[str, Floats]:
+        """Return the goal of one of the environments, by name."""
+        return {name: values[row] for name, values in self.goal.items()}
 
     def positions(self, key: str) -> Floats:
         """Return the positions of an articulation, shape (n, its nq), in the order of `qpos_array`."""
@@ -191,19 +245,30 @@ class States:
         """Return the position of a site, metres, world frame, shape (n, 3)."""
         return self._poses["site_xpos"][:, self.scene.id("site", name)]
 
-    def touching(self, one: str, other: str | None = None) -> Bools:
-        """Return whether two bodies or geoms touch, shape (n,). With one name: whether it touches anything.
+    def touching(self, one: str | Sequence[str], other: str | Sequence[str] | None = None) -> Bools:
+        """Return whether two bodies or geoms touch, shape (n,), or (n, k) for a sequence of k names.
 
-        Names are resolved as in `TaskScene.geoms`.
+        Args:
+            one: Name of a body or geom, as in `TaskScene.geoms`, or several, such as the feet.
+            other: What they touch: a name, or several of which one suffices; anything by default.
         """
-        first = self.scene.geoms(one)
-        second = None if other is None else self.scene.geoms(other)
-        touching = np.zeros(len(self), dtype=bool)
-        for i, pairs in enumerate(self._contacts):
-            mine = np.isin(pairs, first)
-            partner = np.ones_like(mine) if second is None else np.isin(pairs, second)
-            touching[i] = bool((mine & partner[:, ::-1]).any())
-        return touching
+        if not isinstance(one, str):
+            return np.stack([self.touching(name, other) for name in one], axis=-1)
+        owner, pairs = self._contacts
+        first, second = self._marked([one]), np.ones(self.scene.model.ngeom, dtype=bool)
+        if other is not None:
+            second = self._marked([other] if isinstance(other, str) else other)
+        a, b = pairs.T
+        found = np.zeros(len(self), dtype=bool)
+        found[owner[(first[a] & second[b]) | (first[b] & second[a])]] = True
+        return found
+
+    def _marked(self, names: Sequence[str]) -> Bools:
+        """Return which geoms of the model have one of these names, shape (ngeom,)."""
+        marked = np.zeros(self.scene.model.ngeom, dtype=bool)
+        for name in names:
+            marked[self.scene.geoms(name)] = True
+        return marked
 
     @cached_property
     def _poses(self) -> dict[str, Floats]:
@@ -217,7 +282,8 @@ class States:
         return found
 
     @cached_property
-    def _contacts(self) -> list[NDArray[np.int32]]:
+    def _contacts(self) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """The state of each contact, shape (contacts,), and its two geoms, shape (contacts, 2)."""
         model, data = self.scene.model, self.scene.data
         found: list[NDArray[np.int32]] = []
         for qpos in self.qpos:
@@ -225,23 +291,179 @@ class States:
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_collision(model, data)
-            found.append(np.array(data.contact.geom[: data.ncon]).reshape(-1, 2))
-        return found
+            found.append(np.array(data.contact.geom).reshape(-1, 2))
+        return np.repeat(np.arange(len(self)), [len(pairs) for pairs in found]), np.concatenate(found)
+
+
+class Memory:
+    """What a task keeps of each of n environments: goal, actions, and the arrays of `Task.memory`, reset with it.
+
+    Args:
+        task: The task, set up.
+        scene: Its scene.
+        index: Indices of the environments.
+    """
+
+    def __init__(self, task: Task, scene: TaskScene, index: Sequence[int]) -> None:
+        self.index: NDArray[np.intp] = np.array(index, dtype=np.intp)
+        n = len(index)
+        self._task = task
+        self._scene = scene
+        self._goals: list[dict[str, Floats]] = [{} for _ in index]
+        self._kept = {name: np.zeros((n, *shape)) for name, shape in task.memory.items()}
+        self._actions = np.zeros((2, n, scene.mapping.n_actions))
+
+    def begin(self, row: int, rng: np.random.Generator, qpos: Floats) -> Floats:
+        """Let the task choose the start of an episode; return its positions, shape (nq,)."""
+        for values in (*self._kept.values(), *self._actions):
+            values[row] = 0.0
+        start = Start(
+            self._scene,
+            qpos.copy(),
+            int(self.index[row]),
+            {name: values[row, ...] for name, values in self._kept.items()},
+        )
+        self._task.reset(rng, start)
+        self._goals[row] = start.goal
+        return start.qpos
+
+    def updated(self, rows: NDArray[np.intp], actions: Floats, qpos: Floats, qvel: Floats, time: Floats) -> States:
+        """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
+        self._actions[1, rows], self._actions[0, rows] = self._actions[0, rows], actions
+        states = self.states(rows, qpos, qvel, time)
+        if self._kept:
+            _set_writeable(states.memory, True)
+            self._task.update(states)
+            for name, values in self._kept.items():
+                values[rows] = states.memory[name]
+            _set_writeable(states.memory, False)
+        return states
+
+    def states(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats, time: Floats) -> States:
+        """Return the states of some environments, in the form that is passed to the task."""
+        last, previous = self._actions[:, rows]
+        memory = {name: values[rows] for name, values in self._kept.items()}
+        _set_writeable(memory, False)  # a write would be lost, except in `update`
+        return States(
+            self._scene,
+            qpos,
+            qvel,
+            time,
+            [self._goals[int(row)] for row in rows],
+            index=self.index[rows],
+            last_action=last,
+            previous_action=previous,
+            memory=memory,
+        )
+
+
+def _set_writeable(arrays: Mapping[str, Floats], writeable: bool) -> None:
+    for values in arrays.values():
+        values.flags.writeable = writeable
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeEnd:
+    """How an episode ended.
+
+    Attributes:
+        index: Index of the environment.
+        success: Whether the last state was a success; False if the task defines none.
+        terminated: Whether the task terminated it, rather than `max_episode_steps`.
+        steps: Number of actions.
+        total: Return of the episode: the sum of its rewards.
+        goal: Its goal, by name.
+    """
+
+    index: int
+    success: bool
+    terminated: bool
+    steps: int
+    total: float
+    goal: Mapping[str, Floats]
 
 
 def joined(parts: Sequence[States | None]) -> States:
-    """Return the states of several environments as one. A missing state (None) repeats the first known one."""
+    """Return the states of environments 0 to n - 1 as one. A missing state (None) repeats the first known one."""
     known = next((part for part in parts if part is not None), None)
     if known is None:
         raise ValueError("no environment has a state")
     rows = [known if part is None else part for part in parts]
+
+    def column(name: str) -> Floats:
+        return np.concatenate([getattr(row, name) for row in rows])
+
     return States(
         known.scene,
-        np.concatenate([row.qpos for row in rows]),
-        np.concatenate([row.qvel for row in rows]),
-        np.concatenate([row.time for row in rows]),
-        [{name: values[0] for name, values in row.goal.items()} for row in rows],
+        column("qpos"),
+        column("qvel"),
+        column("time"),
+        [row.goal_of(0) for row in rows],
+        index=np.concatenate([row.index for row in rows]),
+        last_action=column("last_action"),
+        previous_action=column("previous_action"),
+        memory={name: np.concatenate([row.memory[name] for row in rows]) for name in known.memory},
     )
+
+
+def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools, Bools | None]:
+    """Return the rewards, the terminations and the successes (None if the task defines none), checked.
+
+    Raises:
+        ValueError: A method of the task returned the wrong shape, or NaN or infinity.
+    """
+    rewards = _answer(task, "reward", task.reward(states, actions), len(states))
+    if not np.isfinite(rewards).all():
+        first = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise ValueError(
+            f"{type(task).__name__}.reward() returned {rewards[first]} for environment {states.index[first]}"
+        )
+    terminated = _answer(task, "terminated", task.terminated(states), len(states)).astype(bool)
+    return rewards.astype(np.float64), terminated, succeeded(task, states)
+
+
+def succeeded(task: Task, states: States) -> Bools | None:
+    """Return which states are a success, shape (n,), or None if the task defines none.
+
+    Raises:
+        ValueError: The task returned the wrong shape.
+    """
+    success = task.success(states)
+    return None if success is None else _answer(task, "success", success, len(states)).astype(bool)
+
+
+def _answer(task: Task, hook: str, answer: Any, n: int) -> NDArray[Any]:
+    found = np.asarray(answer)
+    if found.shape != (n,):
+        raise ValueError(
+            f"{type(task).__name__}.{hook}() returned shape {found.shape} for {n} environments; it must return one "
+            f"value for each, shape ({n},)"
+        )
+    return found
+
+
+def check_spelling(task: Task) -> None:
+    """Check that the hooks and attributes of a task are the ones that environments use.
+
+    Raises:
+        ValueError: A name is nearly that of a hook or attribute, or a hook takes other arguments.
+    """
+    kind = type(task)
+    own = {name for one in kind.__mro__ if issubclass(one, Task) and one is not Task for name in vars(one)}
+    for name in sorted(own | vars(task).keys()):
+        if name in _HOOKS:
+            wanted = [*inspect.signature(getattr(Task, name)).parameters][1:]
+            try:
+                inspect.signature(getattr(task, name)).bind(*wanted)
+            except TypeError:
+                raise ValueError(f"{kind.__name__}.{name}() must take ({', '.join(wanted)})") from None
+        elif not name.startswith("_") and name not in _ATTRIBUTES:
+            known = _HOOKS if callable(inspect.getattr_static(task, name)) else _ATTRIBUTES
+            if near := difflib.get_close_matches(name, known, 1, _SIMILAR):
+                raise ValueError(
+                    f"{kind.__name__}.{name} is not used by environments; did you mean {near[0]!r}? Give your own "
+                    "attributes other names."
+                )
 
 
 def with_task(space: Space, task: Task | None) -> Space:
@@ -256,9 +478,11 @@ def with_task(space: Space, task: Task | None) -> Space:
 
 def add_observed(observation: Observation, task: Task, observed: Floats) -> Observation:
     """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes."""
-    if observed.shape[-1:] != (task.n_observed,):
+    found = np.shape(observed)[-1:]
+    if found != (task.n_observed,):
         raise ValueError(
-            f"{type(task).__name__}.observe() returned {observed.shape[-1]} numbers; n_observed is {task.n_observed}"
+            f"{type(task).__name__}.observe() returned {found[0] if found else 0} numbers; "
+            f"n_observed is {task.n_observed}"
         )
     if not task.n_observed:
         return observation
@@ -271,7 +495,7 @@ class Task:
     """What robots are to do. Derive a class from it and pass an instance to any of the environments.
 
     All methods except `reset` handle n environments at once and return arrays of length n; a single environment has
-    n = 1. An instance serves one environment, single or vector.
+    n = 1. An instance serves one environment, single or vector, until its `close()`.
 
     Arguments of an environment override the attributes of the same name here.
 
@@ -280,6 +504,9 @@ class Task:
         observations: Observed fields, or an observation level; see `URLabEnv`. Rewards, terminations and success do
             not depend on them.
         n_observed: Length of what `observe` adds to an observation.
+        actions: How actions become set-points, for all articulations or by key. None: actions are set-points.
+        memory: Shape of each array that the task keeps of an environment, such as a phase, air times or contact
+            timers, by name: `{"air_time": (4,), "phase": ()}`. They are zeros at a reset; `update` advances them.
         n_substeps: Physics steps per action.
         max_episode_steps: Actions per episode, or None for no limit.
         keyframe: Keyframe in which episodes start before `reset` changes the start, or None for the initial state.
@@ -293,6 +520,8 @@ class Task:
     scene_address: ClassVar[str]
     observations: ClassVar[str | Sequence[str]] = "minimal"
     n_observed: ClassVar[int] = 0
+    actions: ClassVar[Actions | Mapping[str, Actions] | None] = None
+    memory: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
     n_substeps: ClassVar[int] = 10
     max_episode_steps: ClassVar[int | None] = 200
     keyframe: ClassVar[str | None] = None
@@ -314,6 +543,9 @@ class Task:
             start: The start, to be changed in place.
         """
 
+    def update(self, states: States) -> None:
+        """Advance the arrays in `states.memory`, in place. Called once after each action, before the methods below."""
+
     def observe(self, states: States) -> Floats:
         """Return what observations hold besides the fields, such as goals and commands, shape (n, n_observed)."""
         return np.zeros((len(states), self.n_observed))
@@ -330,10 +562,10 @@ class Task:
         """Return which states are a success, shape (n,); `info` has it as `success`. None if the task defines none."""
         return None
 
-    def ended(self, success: bool, steps: int) -> None:
-        """Handle the end of an episode. A curriculum can use it to adapt what `reset` draws.
+    def ended(self, episode: EpisodeEnd) -> None:
+        """Handle the end of an episode. A curriculum can use it to adapt what `reset` draws."""
 
-        Args:
-            success: Whether the last state of the episode was a success.
-            steps: Number of actions in the episode.
-        """
+
+_HOOKS: Final = ("setup", "reset", "update", "observe", "reward", "terminated", "success", "ended")
+_ATTRIBUTES: Final = tuple(Task.__annotations__)
+_SIMILAR: Final = 0.76

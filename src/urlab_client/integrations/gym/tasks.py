@@ -6,7 +6,8 @@ They are registered with Gymnasium under `urlab/`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any, ClassVar, Final, Literal
 
 import gymnasium
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import URLabEnv
-from urlab_client.integrations.gym.spaces import SpaceMode
+from urlab_client.integrations.gym.spaces import Actions, SpaceMode
 from urlab_client.integrations.gym.task import ResetNoise, Start, States, Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 from urlab_client.protocol.base import Floats
+from urlab_client.values.names import did_you_mean
 
 Bools = NDArray[np.bool_]
 
@@ -161,9 +163,10 @@ class PushPictures(Push):
 class Walk(Task):
     """The quadruped follows a velocity command (forward, left and yaw rate), drawn for each episode.
 
-    Actions are joint targets of its PD controller. Observations add the command, m/s and rad/s, base frame, to the
-    positions and velocities. The reward, between 0 and 1.5, measures how closely the robot follows the command. The
-    episode terminates when the robot falls. Success means that the velocity error is below `CLOSE`.
+    Actions from -1 to 1 move the joint targets of its PD controller around the standing pose. Observations add the
+    command, m/s and rad/s, base frame, to the positions and velocities. The reward, between 0 and 1.5, measures how
+    closely the robot follows the command. The episode terminates when the robot falls. Success means that the velocity
+    error is below `CLOSE`.
     """
 
     LOW: Final = np.array([-0.2, -0.1, -0.4])
@@ -172,6 +175,7 @@ class Walk(Task):
 
     scene_address: ClassVar[str] = "sim://quadruped?controller=quadruped=pd,kp=60,kv=2"
     n_observed: ClassVar[int] = 3
+    actions: ClassVar[Actions | Mapping[str, Actions] | None] = Actions(scale=(0.3, 0.6, 0.8) * 4)  # rad
     max_episode_steps: ClassVar[int | None] = 500
 
     def reset(self, rng: np.random.Generator, start: Start) -> None:
@@ -226,18 +230,69 @@ TASKS: Final[dict[str, type[Task]]] = {
 """Tasks by their Gymnasium id."""
 
 
+def register_task(task_id: str, task: type[Task]) -> None:
+    """Register a task with Gymnasium, for single, vector and batch environments.
+
+    After `register_task("me/Go-v0", Go)`, there are `gymnasium.make("me/Go-v0")`, `gymnasium.make_vec("me/Go-v0", n)`,
+    which starts a server for each environment, and `gymnasium.make_vec("me/Go-v0", n, backend="batch")`.
+
+    Args:
+        task_id: The id, such as `me/Go-v0`.
+        task: The class, with a `scene_address`; it is made without arguments.
+
+    Raises:
+        ValueError: The class is not a task, lacks a scene, or the id already names another one.
+        gymnasium.error.Error: The id has another form.
+    """
+    if not issubclass(task, Task) or not hasattr(task, "scene_address"):
+        raise ValueError(f"{task.__name__} must be a subclass of Task with a scene_address")
+    if TASKS.get(task_id, task) is not task:
+        raise ValueError(f"{task_id!r} already names {TASKS[task_id].__name__}")
+    if task_id not in gymnasium.registry:
+        gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
+            task_id,
+            # A string, so that the specification can be serialised: Minari stores it with its datasets.
+            entry_point=f"{__name__}:{make_endless.__name__}",
+            vector_entry_point=f"{__name__}:{make_vec.__name__}",
+            max_episode_steps=task.max_episode_steps,
+            kwargs={"task_id": task_id},
+        )
+    TASKS[task_id] = task
+
+
+def task_named(name: str) -> type[Task]:
+    """Return a task by its id, or any class by `module:Class`.
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    if name in TASKS:
+        return TASKS[name]
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        known = f"There are: {', '.join(TASKS)}; name one of your own as module:Class"
+        raise ValueError(f"{name!r} is not a task.{did_you_mean(name, TASKS)} {known}")
+    try:
+        found = getattr(import_module(module), attribute, None)
+    except ImportError as error:
+        raise ValueError(f"the module of the task {name!r} cannot be imported: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        raise ValueError(f"{attribute!r} in module {module!r} is not a subclass of Task")  # noqa: TRY004 - a wrong name
+    return found
+
+
 def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     """Make the environment of a task. It creates its own client and closes it.
 
     Args:
-        task_id: Key of `TASKS`.
+        task_id: Id of the task, or `module:Class`.
         address: Address of the server; by default, a simulated server is started.
         options: Further arguments of `URLabEnv`.
 
     Raises:
         URLabError: The server cannot be reached or has no articulation.
     """
-    task = TASKS[task_id]()
+    task = task_named(task_id)()
     return URLabEnv.connect(address or task.scene_address, task=task, **options)
 
 
@@ -252,7 +307,7 @@ def make_vec(
     """Make the vector environment of a task.
 
     Args:
-        task_id: Key of `TASKS`.
+        task_id: Id of the task, or `module:Class`.
         num_envs: Number of environments.
         backend: `servers` for one simulated server per environment, `batch` for physics in this process without a
             wire.
@@ -265,19 +320,9 @@ def make_vec(
     if backend not in ("servers", "batch"):
         raise ValueError(f"backend must be 'servers' or 'batch', not {backend!r}")
     kind = URLabVectorEnv if backend == "servers" else URLabBatchEnv
-    task = TASKS[task_id]()
+    task = task_named(task_id)()
     return kind(task.scene_address, num_envs, task=task, **options)
 
 
-def register() -> None:
-    """Register the tasks with Gymnasium. Calling it again has no effect."""
-    for task_id, task in TASKS.items():
-        if task_id not in gymnasium.registry:
-            gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
-                task_id,
-                # A string, so that the specification can be serialised: Minari stores it with its datasets.
-                entry_point=f"{__name__}:{make_endless.__name__}",
-                vector_entry_point=f"{__name__}:{make_vec.__name__}",
-                max_episode_steps=task.max_episode_steps,
-                kwargs={"task_id": task_id},
-            )
+for _id, _task in [*TASKS.items()]:
+    register_task(_id, _task)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -19,10 +19,10 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.episode import EnvEpisode
-from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, client_defaults
-from urlab_client.integrations.gym.spaces import Observation, SpaceMode
-from urlab_client.integrations.gym.task import ResetNoise, States, Task, joined
-from urlab_client.integrations.gym.vectorized import Indices, Vectorized, put
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
+from urlab_client.integrations.gym.spaces import Observation
+from urlab_client.integrations.gym.task import States, joined
+from urlab_client.integrations.gym.vectorized import Applied, Indices, Vectorized, put
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
@@ -41,10 +41,13 @@ class _Session:
         address: str,
         starts: asyncio.Semaphore,
         client_options: Mapping[str, Any],
+        *,
         settings: EpisodeSettings,
         randomise: Randomisation | None,
+        index: int,
     ) -> None:
         self.address = address
+        self._index = index
         self.restarts = -1
         self.episode: EnvEpisode | None = None
         self._starts = starts
@@ -63,11 +66,15 @@ class _Session:
             raise URLabError("The environment was closed.")
         return await self.episode.reset(rng, keyframe, seed)
 
-    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+    async def step(self, forces: Mapping[str, Floats], applied: Applied) -> Observation:
         """Apply set-points and forces for one action."""
         if self.episode is None:
             raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
-        return await self.episode.step(set_points, forces)
+        i = self._index
+        now, before = (
+            {key: values[i] for key, values in each.items()} for each in (applied.set_points, applied.before)
+        )
+        return await self.episode.step(now, forces, applied.actions[i], before, int(applied.late[i]))
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
@@ -77,7 +84,8 @@ class _Session:
         return self._opening
 
     async def close(self) -> None:
-        """Close the client."""
+        """Close the client, and let the task serve another environment."""
+        self._settings.release()
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait((self._opening,))
@@ -92,7 +100,11 @@ class _Session:
             try:
                 await client.discover()
                 self.episode = self._earlier = EnvEpisode(
-                    client, settings=self._settings, randomise=self._randomise, earlier=self._earlier
+                    client,
+                    settings=self._settings,
+                    randomise=self._randomise,
+                    earlier=self._earlier,
+                    index=self._index,
                 )
             except BaseException:
                 await client.close()
@@ -130,23 +142,12 @@ class URLabVectorEnv(Vectorized):
         addresses: str | Sequence[str],
         num_envs: int | None = None,
         *,
-        space_mode: SpaceMode | None = None,
-        observations: str | Sequence[str] | None = None,
-        reward_fn: RewardFn | None = None,
-        termination_fn: TerminationFn | None = None,
-        max_episode_steps: int | None = None,
-        cameras: Sequence[str] | None = None,
-        n_substeps: int | None = None,
-        reset_noise: float | ResetNoise | None = None,
-        keyframe: str | None = None,
-        render_mode: Literal["rgb_array"] | None = None,
-        render_camera: str | None = None,
-        task: Task | None = None,
         randomise: Randomisation | str | os.PathLike[str] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         step_timeout: float = 10.0,
         start_timeout: float = 60.0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
+        **options: Unpack[EpisodeOptions],
     ) -> None:
         """Start the sessions.
 
@@ -154,23 +155,13 @@ class URLabVectorEnv(Vectorized):
             addresses: One `sim://` address for all environments, or one address per environment. Servers started here
                 honour the model's `<option>`, unless the address contains `?no-mjcf-options`.
             num_envs: Number of environments; required only with a single address.
-            space_mode: See `URLabEnv`.
-            observations: See `URLabEnv`.
-            reward_fn: See `URLabEnv`. All arguments and the result have a leading axis of environments.
-            termination_fn: See `URLabEnv`. All arguments and the result have a leading axis of environments.
-            max_episode_steps: See `URLabEnv`.
-            cameras: See `URLabEnv`.
-            n_substeps: See `URLabEnv`.
-            reset_noise: See `URLabEnv`.
-            keyframe: See `URLabEnv`.
-            render_mode: None or `rgb_array`. With `rgb_array`, every step draws a picture of each environment.
-            render_camera: Camera that `render` shows; the first colour camera of the scene by default.
-            task: See `URLabEnv`. One instance serves all environments.
             randomise: See `URLabEnv`.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             step_timeout: Longest time for a step or reset of one environment, seconds.
             start_timeout: Longest time for the start of one server, seconds, counted from its own start.
             client_options: Further options of the clients.
+            options: See `EpisodeOptions`. With `render_mode="rgb_array"`, every step draws a picture of each
+                environment.
 
         Raises:
             URLabError: A session cannot be started. The message names its index.
@@ -187,20 +178,7 @@ class URLabVectorEnv(Vectorized):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
-        settings = EpisodeSettings.of(
-            task,
-            observations=observations,
-            reward_fn=reward_fn,
-            termination_fn=termination_fn,
-            n_substeps=n_substeps,
-            max_episode_steps=max_episode_steps,
-            keyframe=keyframe,
-            reset_noise=reset_noise,
-            space_mode=space_mode,
-            cameras=cameras,
-            render_mode=render_mode,
-            render_camera=render_camera,
-        )
+        settings = EpisodeSettings.of(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
         if declared is not None:
             text = declared.to_json()
@@ -210,8 +188,15 @@ class URLabVectorEnv(Vectorized):
         client_options = client_defaults(client_options)
         starts = asyncio.Semaphore(_processors())
         self._sessions = [
-            _Session(with_start_timeout(address, start_timeout), starts, client_options, settings, declared)
-            for address in addresses
+            _Session(
+                with_start_timeout(address, start_timeout),
+                starts,
+                client_options,
+                settings=settings,
+                randomise=declared,
+                index=i,
+            )
+            for i, address in enumerate(addresses)
         ]
         self._portal = Portal()
         try:
@@ -270,7 +255,7 @@ class URLabVectorEnv(Vectorized):
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
     def _advance(
-        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
     ) -> Mapping[int, Exception]:
         calls: dict[int, Callable[[], Coroutine[Any, Any, Observation]]] = {}
         for i in map(int, fresh):
@@ -278,8 +263,7 @@ class URLabVectorEnv(Vectorized):
             calls[i] = partial(self._sessions[i].reset, self._rngs[i], keyframe, seed)
         forces = self._forces(acting)
         for i in map(int, acting):
-            own = {key: values[i] for key, values in set_points.items()}
-            calls[i] = partial(self._sessions[i].step, own, forces.get(i, {}))
+            calls[i] = partial(self._sessions[i].step, forces.get(i, {}), applied)
         errors: dict[int, Exception] = {}
         for i, result in self._portal.call(self._all, calls).items():
             if isinstance(result, Exception):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Any, cast
 
 import gymnasium
@@ -17,13 +17,33 @@ from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
-from urlab_client.integrations.gym.task import States, Task
+from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, succeeded
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 _NONE = np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What all environments do during one action.
+
+    Attributes:
+        actions: The actions, shape (environments, n_actions).
+        set_points: Set-points of each articulation, shape (environments, n_ctrl).
+        before: Set-points that are in force during the first `late` physics steps of the action, likewise.
+        late: Number of these physics steps, shape (environments,).
+    """
+
+    actions: Floats
+    set_points: Mapping[str, Floats]
+    before: Mapping[str, Floats]
+    late: Indices
+
+
+_NOTHING = Applied(np.zeros((0, 0)), {}, {}, _NONE)
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
@@ -71,7 +91,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         n_task = 0 if self.task is None else self.task.n_observed
         self._disturbances: list[Disturbances] = []
         if randomise is not None:
-            self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
+            self._disturbances = [
+                Disturbances(randomise, mapping, n_task, settings.n_substeps) for _ in range(num_envs)
+            ]
         self._observations_disturbed = randomise is not None and randomise.disturbs_observations
         self.num_envs = num_envs
         self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
@@ -85,6 +107,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self._observations_disturbed:
             self._sensed = create_empty_array(observation_space, num_envs)
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._totals = np.zeros(num_envs)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
         self._keyframe: str | None = None
@@ -92,9 +115,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     @abstractmethod
     def _advance(
-        self, fresh: Indices, keyframe: str | None, acting: Indices, set_points: Mapping[str, Floats]
+        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
     ) -> Mapping[int, Exception]:
-        """Reset some environments and step others, given the set-points of all; return the failures by index.
+        """Reset some environments to a keyframe and step others; return the failures by index.
 
         `put` the observations of the others into `_observations`.
         """
@@ -164,24 +187,24 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
         fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
         before = None if self.reward_fn is None else self._true_observations()
-        delayed = self._delayed(acting, actions)
-        if delayed is not actions:
-            set_points = self._set_points(delayed)
-        errors = self._move(fresh, self._keyframe, acting, set_points)
+        errors = self._move(fresh, self._keyframe, acting, self._applied(acting, actions, set_points))
         infos = self._infos(errors)
         stepped = np.zeros(self.num_envs, dtype=bool)
         stepped[acting] = True
         stepped[list(errors)] = False
-        rewards, terminated = self._judge(before, actions, stepped, infos)
+        rewards, terminated, states = self._judge(before, actions, stepped, infos)
         truncated = np.zeros(self.num_envs, dtype=bool)
         if self.max_episode_steps is not None:
             truncated[acting] = self._elapsed[acting] >= self.max_episode_steps
         truncated[list(errors)] = True
         self._ended = terminated | truncated
-        if self.task is not None:
-            successes = infos.get("success", np.zeros(self.num_envs, dtype=bool))
-            for i in np.flatnonzero(self._ended & stepped):
-                self.task.ended(bool(successes[i]), int(self._elapsed[i]))
+        self._totals += rewards
+        if self.task is not None and states is not None:
+            successes = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
+            for i in np.flatnonzero(self._ended & stepped).tolist():
+                steps, total = int(self._elapsed[i]), float(self._totals[i])
+                end = EpisodeEnd(i, successes[i], bool(terminated[i]), steps, total, states.goal_of(i))
+                self.task.ended(end)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._same_step_reset(infos)
         return self._disturbed_observations(), rewards, terminated, truncated, infos
@@ -202,29 +225,33 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         fresh: Indices,
         keyframe: str | None,
         acting: Indices = _NONE,
-        set_points: Mapping[str, Floats] = MappingProxyType({}),
+        applied: Applied = _NOTHING,
     ) -> Mapping[int, Exception]:
         """Start episodes and continue others; return the failures by index."""
+        keyframe = self._settings.keyframe if keyframe is None else keyframe
         for i, disturbances in self._disturbed(fresh):
-            disturbances.begin(self._rngs[i])
-        errors = self._advance(fresh, keyframe, acting, set_points)
+            disturbances.begin(self._rngs[i], keyframe)
+        errors = self._advance(fresh, keyframe, acting, applied)
         for i, disturbances in self._disturbed(np.concatenate([fresh, acting])) if self._observations_disturbed else ():
             put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
-        self._elapsed[fresh] = 0
+        self._elapsed[fresh], self._totals[fresh] = 0, 0.0
         self._elapsed[acting] += 1
         self._ended[fresh] = False
         self._ended[list(errors)] = True
         return errors
 
-    def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
+    def _judge(
+        self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]
+    ) -> tuple[Floats, Bools, States | None]:
+        """Return rewards, terminations and, for a task, the states; add `success` to `infos`."""
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
         after = None if self.reward_fn is None and self.termination_fn is None else self._true_observations()
         failed = infos.get("_error", np.zeros(self.num_envs, dtype=bool))
+        states: States | None = None
         if self.task is not None and not failed.all():  # otherwise no state may exist
             states = self._states(np.arange(self.num_envs))
-            rewards[:], terminated[:] = self.task.reward(states, actions), self.task.terminated(states)
-            success = self.task.success(states)
+            rewards, terminated, success = judged(self.task, states, actions)
             if success is not None:
                 infos["success"], infos["_success"] = success & ~failed, ~failed
         if self.reward_fn is not None:
@@ -232,7 +259,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self.termination_fn is not None:
             terminated[:] = self.termination_fn(after, infos)
         rewards[~stepped] = 0.0
-        return rewards, terminated & stepped
+        return rewards, terminated & stepped, states
 
     def _same_step_reset(self, infos: dict[str, Any]) -> dict[str, Any]:
         ended = self._ended.copy()
@@ -248,7 +275,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _add_success(self, infos: dict[str, Any], fresh: Indices) -> None:
         """Add the `success` of episodes that have just begun: a reset reports it as a step does."""
-        success = self.task.success(self._states(fresh)) if self.task is not None and len(fresh) else None
+        success = succeeded(self.task, self._states(fresh)) if self.task is not None and len(fresh) else None
         if success is None:
             return
         for name in ("success", "_success"):
@@ -289,14 +316,18 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Return the observations with all disturbances."""
         return mapped(np.copy, self._sensed if self._observations_disturbed else self._observations)
 
-    def _delayed(self, indices: Indices, actions: Any) -> Any:
-        """Return the actions that take effect now; those of other environments are unchanged."""
+    def _applied(self, indices: Indices, actions: Any, set_points: dict[str, Floats]) -> Applied:
+        """Return what takes effect now in some environments, whose actions may be delayed."""
+        flat, late = self.mapping.flat(actions), np.zeros(self.num_envs, dtype=np.intp)
         if self.randomise is None or not self.randomise.delays_actions:
-            return actions
-        delayed = mapped(np.array, actions)
+            return Applied(flat, set_points, set_points, late)
+        before, now = ({key: values.copy() for key, values in set_points.items()} for _ in range(2))
         for i, disturbances in self._disturbed(indices):
-            put(delayed, i, disturbances.delayed(_pick(delayed, i)))
-        return delayed
+            earlier, later = disturbances.delayed({key: values[i] for key, values in set_points.items()})
+            late[i] = disturbances.late_steps
+            for key in set_points:
+                before[key][i], now[key][i] = earlier[key], later[key]
+        return Applied(flat, now, before, late)
 
     def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
         """Return the pushes during the next action, by environment; environments without a push are omitted."""

@@ -13,7 +13,14 @@ from urlab_client.integrations.policy.evaluation import (
     wilson,
 )
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
-from urlab_client.integrations.policy.network import Network, OnnxDictNetwork, OnnxInputs, OnnxNetwork, PicturesNetwork
+from urlab_client.integrations.policy.network import (
+    Network,
+    OnnxDictNetwork,
+    OnnxInputs,
+    OnnxNetwork,
+    PicturesNetwork,
+    task_network,
+)
 from urlab_client.integrations.policy.policy import Policy, load
 from urlab_client.integrations.policy.runner import PolicyRun, require, run, run_blocking
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
@@ -43,5 +50,6 @@ __all__ = [
     "require",
     "run",
     "run_blocking",
+    "task_network",
     "wilson",
 ]

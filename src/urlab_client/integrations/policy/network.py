@@ -148,6 +148,28 @@ class OnnxDictNetwork(OnnxInputs):
         return super().__call__(_entries(observation))
 
 
+def task_network(path: Path, observation_space: Any, action_space: Any) -> Network | OnnxDictNetwork:
+    """Return the network in an ONNX file that maps the observations of an environment to its actions.
+
+    Args:
+        path: The file.
+        observation_space: `single_observation_space` of the environment, flat or a `Dict`.
+        action_space: Its `single_action_space`.
+
+    Raises:
+        PolicyFileError: The file is missing, is not an ONNX file, or does not fit the environment.
+        ImportError: The extra `onnx` is not installed.
+    """
+    if hasattr(observation_space, "spaces"):
+        ((_, box),) = action_space.items()
+        return OnnxDictNetwork(path, observation_space, len(box.low))
+    network = OnnxNetwork(path)
+    for name, space in (("inputs", observation_space), ("outputs", action_space)):
+        if getattr(network, name) not in (None, space.shape[0]):
+            raise PolicyFileError(f"{path} has {getattr(network, name)} {name}, but the task has {space.shape[0]}.")
+    return network
+
+
 def _session(path: Path) -> Any:
     """Return an ONNX Runtime session of a file, on one thread: more threads slow small networks down."""
     need("onnxruntime", extra="onnx")

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from urlab_client.enums import CameraMode
 from urlab_client.integrations._feed.messages import CompressedImage, EpisodeMessage, OutcomeMessage, RawImage
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.values.pictures import Pixels, without_alpha
+from urlab_client.values.pictures import Pixels, shown_png, without_alpha
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
@@ -159,6 +160,18 @@ class Camera:
 
     time: float
     pixels: Pixels
+
+    @property
+    def mode(self) -> CameraMode:
+        """`depth` for depths, else `real`: segmentations, too, are stored as colours."""
+        return CameraMode.DEPTH if self.pixels.ndim == 2 else CameraMode.REAL
+
+    def __repr__(self) -> str:
+        height, width = self.pixels.shape[:2]
+        return f"<Camera {self.mode} {width}x{height} at {self.time:.3f} s>"
+
+    def _repr_png_(self) -> bytes | None:
+        return shown_png(self.pixels, self.mode)
 
 
 @dataclass(frozen=True, slots=True)

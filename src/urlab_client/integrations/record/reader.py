@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
@@ -43,6 +44,8 @@ from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Pr
 from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
+from urlab_client.values.html import curve, fields, table
+from urlab_client.values.pictures import thumbnail
 
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -54,6 +57,7 @@ _KEPT_BYTES = 32 << 20
 _MOST_VALUES = 8 << 20
 _VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
 _NAMES_CHARS = 32 << 20
+_CURVE_POINTS = 100
 _T = TypeVar("_T")
 
 
@@ -326,6 +330,12 @@ class Run:
             found = min(firsts, key=lambda one: one.log_time)
         return _picture(index, found)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {str(self.path)!r}>"
+
+    def _repr_html_(self) -> str:
+        return _shown(self)
+
     def _camera(self, name: str) -> list[IndexedChannel]:
         index = self._index()
         channels = [one for one in index.channels_of(*_PICTURES) if one.topic == _CAMERA + name]
@@ -406,6 +416,36 @@ class Run:
                 for name, reading in state.sensors.items()
                 for i in range(len(reading))
             ]
+
+
+def _shown(run: Run) -> str:
+    """Return a recording for a notebook: its summary, a picture from the middle, and curves of joint positions."""
+    try:
+        summary, (start, end) = run.summary(), run.time_range()
+        states = [run.state_at(float(time)) for time in np.linspace(start, end, _CURVE_POINTS)]
+        curves = [
+            (f"{owner}/{name}", f"{values.min():.4g} to {values.max():.4g}", curve(values))
+            for owner, names in run.positions().items()
+            for name, values in zip(names, _positions(states, owner, len(names)), strict=False)
+        ]
+        camera = next(iter(run.cameras()), None)
+        middle = None if camera is None else run.picture_at(camera, (start + end) / 2)
+        pictures = {} if middle is None else {str(camera): thumbnail(middle.pixels, middle.mode, str(camera))}
+    except (OSError, URLabError) as error:  # for example a file that is gone
+        return fields(repr(run)[1:-1], {"problem": str(error)})
+    said = {
+        "duration": f"{summary.duration_s:.2f} s",
+        "episodes": summary.episodes,
+        "damage": summary.damage,
+        **pictures,
+    }
+    return fields(repr(run)[1:-1], said) + table(curves, caption="joint positions")
+
+
+def _positions(states: Sequence[RecordedState | None], owner: str, count: int) -> Floats:
+    """Return the positions of a robot at several times, shape (values, times); times without them are left out."""
+    there = [state.articulations[owner].qpos for state in states if state is not None and owner in state.articulations]
+    return np.array([qpos for qpos in there if len(qpos) == count]).reshape((-1, count)).T
 
 
 def phases(size: int, progress: Progress | None, count: int) -> list[Progress]:

@@ -9,9 +9,8 @@ import numpy as np
 
 from urlab_client.aio.arguments import finite
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.model.elements import Actuator
 from urlab_client.errors import URLabError
-from urlab_client.integrations.ik import IkSolution, InverseKinematics, Vector, only_robot, own_sites, positive, vector
+from urlab_client.integrations.ik import InverseKinematics, Vector, only_robot, own_sites, positive, vector
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.client import URLabClient
 
@@ -72,10 +71,11 @@ class HandControl:
         self.turn_speed: float = positive("turn_speed", turn_speed)
         self.blocked: bool = False
         self.set_points: dict[str, float] = {}
-        solution = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
-        found = self._gripper(gripper, solution)
+        found = self.ik.gripper if gripper is None else self._robot.actuators[gripper]
+        if found is not None and found.ctrlrange is None:
+            raise ValueError(f"the gripper {gripper!r} has no control range")
         self.gripper: str | None = None if found is None else found.name
-        self._range = (0.0, 0.0) if found is None else found.ctrlrange or (0.0, 0.0)
+        self._range = (found and found.ctrlrange) or (0.0, 0.0)
         self.hold()
 
     @property
@@ -133,15 +133,6 @@ class HandControl:
             self.set_points[self.gripper] = self._opening
         self._robot.set_ctrl(self.set_points)
         return found.reached
-
-    def _gripper(self, name: str | None, solution: IkSolution) -> Actuator | None:
-        actuators = self._robot.actuators
-        if name is None:
-            others = [one for key, one in actuators.items() if key not in solution.set_points and one.ctrlrange]
-            return others[0] if len(others) == 1 else None
-        if actuators[name].ctrlrange is None:
-            raise ValueError(f"the gripper {name!r} has no control range")
-        return actuators[name]
 
     def __repr__(self) -> str:
         return f"<HandControl of {self.ik.frame!r} of {self.key!r}>"

@@ -208,7 +208,7 @@ class _Session:
             from urlab_client.integrations.gym.episode import EnvEpisode
             from urlab_client.integrations.gym.settings import EpisodeSettings
 
-            settings = EpisodeSettings.of(task, cameras=())
+            settings = EpisodeSettings.of(task=task, cameras=())
             self._n_steps = settings.n_substeps
             self._starts = EnvEpisode(client, settings=settings)
         self._hand = HandControl(client) if hand is None else hand

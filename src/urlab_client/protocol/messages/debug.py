@@ -21,7 +21,7 @@ class DrawMarkerOk(Reply, tag="draw_marker_ok", kw_only=True):
     """Drawn."""
 
 
-class DrawMarker(Request[DrawMarkerOk], tag="draw_marker", kw_only=True, omit_defaults=True):
+class DrawMarker(Request[DrawMarkerOk], tag="draw_marker", kw_only=True):
     """Draw a sphere of 5 cm radius, optionally with a label."""
 
     location: Point
@@ -35,7 +35,7 @@ class DrawLineOk(Reply, tag="draw_line_ok", kw_only=True):
     """Drawn."""
 
 
-class DrawLine(Request[DrawLineOk], tag="draw_line", kw_only=True, omit_defaults=True):
+class DrawLine(Request[DrawLineOk], tag="draw_line", kw_only=True):
     """Draw a line segment."""
 
     from_: Point = field(name="from")
@@ -50,7 +50,7 @@ class DrawBoxOk(Reply, tag="draw_box_ok", kw_only=True):
     """Drawn."""
 
 
-class DrawBox(Request[DrawBoxOk], tag="draw_box", kw_only=True, omit_defaults=True):
+class DrawBox(Request[DrawBoxOk], tag="draw_box", kw_only=True):
     """Draw a wire box."""
 
     center: Point
@@ -65,7 +65,7 @@ class DrawArrowOk(Reply, tag="draw_arrow_ok", kw_only=True):
     """Drawn."""
 
 
-class DrawArrow(Request[DrawArrowOk], tag="draw_arrow", kw_only=True, omit_defaults=True):
+class DrawArrow(Request[DrawArrowOk], tag="draw_arrow", kw_only=True):
     """Draw an arrow."""
 
     from_: Point = field(name="from")
@@ -81,7 +81,7 @@ class DrawAxesOk(Reply, tag="draw_axes_ok", kw_only=True):
     """Drawn."""
 
 
-class DrawAxes(Request[DrawAxesOk], tag="draw_axes", kw_only=True, omit_defaults=True):
+class DrawAxes(Request[DrawAxesOk], tag="draw_axes", kw_only=True):
     """Draw a red, green and blue triad. Unreal's frame is left-handed, so green points along MuJoCo's -y."""
 
     location: Point
@@ -96,7 +96,7 @@ class ClearMarkersOk(Reply, tag="clear_markers_ok", kw_only=True):
     """Cleared."""
 
 
-class ClearMarkers(Request[ClearMarkersOk], tag="clear_markers", kw_only=True, omit_defaults=True):
+class ClearMarkers(Request[ClearMarkersOk], tag="clear_markers", kw_only=True):
     """Remove all debug drawing from the world in use."""
 
     tag: Tag = None
@@ -106,7 +106,7 @@ class SetOverlayTextOk(Reply, tag="set_overlay_text_ok", kw_only=True):
     """Shown."""
 
 
-class SetOverlayText(Request[SetOverlayTextOk], tag="set_overlay_text", kw_only=True, omit_defaults=True):
+class SetOverlayText(Request[SetOverlayTextOk], tag="set_overlay_text", kw_only=True):
     """Show a line of text on the screen for 10 s; empty text clears it."""
 
     text: Annotated[str, doc("The text.")]

@@ -14,7 +14,7 @@ class AcquireLeaseOk(Reply, tag="acquire_lease_ok", kw_only=True):
     ttl_s: Annotated[float, doc("Seconds without a request after which the lease expires.")]
 
 
-class AcquireLease(Request[AcquireLeaseOk], tag="acquire_lease", kw_only=True, omit_defaults=True):
+class AcquireLease(Request[AcquireLeaseOk], tag="acquire_lease", kw_only=True):
     """Acquire the server's only driver lease and return its id.
 
     The lease is advisory: it shows other clients that the server is in use, and the server does not enforce it.

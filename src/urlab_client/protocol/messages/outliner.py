@@ -81,7 +81,7 @@ class FindActorsOk(ActorsReply, tag="find_actors_ok", kw_only=True):
     """Actors that pass every filter."""
 
 
-class FindActors(Request[FindActorsOk], tag="find_actors", kw_only=True, omit_defaults=True):
+class FindActors(Request[FindActorsOk], tag="find_actors", kw_only=True):
     """List the actors that pass every given filter."""
 
     class_filter: Annotated[str | None, doc("Class or parent class name, any letter case.")] = None
@@ -100,7 +100,7 @@ class GetActorBoundsOk(Reply, tag="get_actor_bounds_ok", kw_only=True):
     extents: Annotated[Vec3, doc("Half sizes, metres.")]
 
 
-class GetActorBounds(Request[GetActorBoundsOk], tag="get_actor_bounds", kw_only=True, omit_defaults=True):
+class GetActorBounds(Request[GetActorBoundsOk], tag="get_actor_bounds", kw_only=True):
     """Return the axis-aligned box around an actor at its authored pose."""
 
     target: ActorTarget
@@ -114,7 +114,7 @@ class SelectActorOk(Reply, tag="select_actor_ok", kw_only=True):
     actor_name: Annotated[str, doc("Engine actor name.")]
 
 
-class SelectActor(Request[SelectActorOk], tag="select_actor", kw_only=True, omit_defaults=True):
+class SelectActor(Request[SelectActorOk], tag="select_actor", kw_only=True):
     """Select an actor in the editor, replacing the selection."""
 
     target: ActorTarget
@@ -132,7 +132,7 @@ class AddQuickConvertOk(Reply, tag="add_quick_convert_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class AddQuickConvert(Request[AddQuickConvertOk], tag="add_quick_convert", kw_only=True, omit_defaults=True):
+class AddQuickConvert(Request[AddQuickConvertOk], tag="add_quick_convert", kw_only=True):
     """Turn a static-mesh actor into a MuJoCo body, from the next play session on."""
 
     target: ActorTarget
@@ -151,7 +151,7 @@ class RemoveQuickConvertOk(Reply, tag="remove_quick_convert_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class RemoveQuickConvert(Request[RemoveQuickConvertOk], tag="remove_quick_convert", kw_only=True, omit_defaults=True):
+class RemoveQuickConvert(Request[RemoveQuickConvertOk], tag="remove_quick_convert", kw_only=True):
     """Undo `add_quick_convert`."""
 
     target: ActorTarget

@@ -15,7 +15,7 @@ class RecordingStartOk(Reply, tag="recording_start_ok", kw_only=True):
     max_duration_s: Annotated[float, doc("Length of the rolling window, seconds of simulation time.")]
 
 
-class RecordingStart(Request[RecordingStartOk], tag="recording_start", kw_only=True, omit_defaults=True):
+class RecordingStart(Request[RecordingStartOk], tag="recording_start", kw_only=True):
     """Start recording joint states."""
 
     name: Annotated[str | None, doc("Accepted but not used; the server names the session.")] = None
@@ -40,7 +40,7 @@ class RecordingSaveOk(Reply, tag="recording_save_ok", kw_only=True):
     absolute_path: Annotated[str, doc("Path on the server's machine.")]
 
 
-class RecordingSave(Request[RecordingSaveOk], tag="recording_save", kw_only=True, omit_defaults=True):
+class RecordingSave(Request[RecordingSaveOk], tag="recording_save", kw_only=True):
     """Write the active session to a JSON file."""
 
     path: Annotated[str | None, doc("File name; default `recording.json`.")] = None

@@ -24,6 +24,34 @@ from urlab_client.values.rotation import Vec3
 from urlab_client.values.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 
+class ClaimControlOk(Reply, tag="claim_control_ok", kw_only=True):
+    """The client owns the robot."""
+
+    articulation: Annotated[str, doc("Engine's object name, regardless of the requested name.")]
+    owner: Annotated[str, doc("Owner: `control_owner`, or the session id if the server does not read that field.")]
+    ttl_s: Annotated[float, doc("Seconds without a write after which the claim expires; 0 for never.")]
+
+
+class ClaimControl(ControlRequest[ClaimControlOk], tag="claim_control", kw_only=True):
+    """Become the only owner of a robot, or renew the ownership."""
+
+    articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
+    ttl_s: Annotated[float, doc("Seconds without a write after which the claim expires; 0 or less for never.")] = 0.0
+    force: Annotated[bool, doc("Take the robot from its owner.")] = False
+
+
+class ReleaseControlOk(Reply, tag="release_control_ok", kw_only=True):
+    """The robot has no owner."""
+
+    articulation: Annotated[str, doc("Engine's object name, regardless of the requested name.")]
+
+
+class ReleaseControl(ControlRequest[ReleaseControlOk], tag="release_control", kw_only=True):
+    """Release a robot."""
+
+    articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
+
+
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
     """The mode before and after."""
 
@@ -69,7 +97,7 @@ class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_
     articulation: Annotated[str | None, doc("Articulation key, with that scope.")] = None
 
 
-class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
+class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_source", kw_only=True):
     """Choose the source of the set-points for the actuators: this protocol or the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
@@ -84,7 +112,7 @@ class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
     angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s.")]
 
 
-class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
+class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True):
     """Store a commanded base velocity for policies to read; it does not drive the simulation."""
 
     articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
@@ -102,7 +130,7 @@ class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
     free_base_shortcut: Annotated[bool, doc("True if only the free base was written.")]
 
 
-class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
+class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True):
     """Write joint positions of an articulation and run `mj_forward`. Velocities and time do not change."""
 
     target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]
@@ -122,7 +150,7 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
     """The pose in force."""
 
 
-class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
+class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True):
     """Place a mocap body. Body poses change at the next step or `forward()`."""
 
     body: Annotated[str, doc("Compiled name, or short name with or without the articulation's key or actor id.")]
@@ -157,7 +185,7 @@ class ContactFilter(Serializable, Struct, kw_only=True, omit_defaults=True):
     geom2: Annotated[str | None, doc("Second geom.")] = None
 
 
-class GetContacts(Request[GetContactsOk], tag="get_contacts", kw_only=True, omit_defaults=True):
+class GetContacts(Request[GetContactsOk], tag="get_contacts", kw_only=True):
     """Return a snapshot of the active contacts."""
 
     max_contacts: Annotated[int, doc("Maximum number of contacts to return.")] = 64
@@ -201,7 +229,7 @@ class SetUserChannelsOk(Reply, tag="set_user_channels_ok", kw_only=True):
     ]
 
 
-class SetUserChannels(Request[SetUserChannelsOk], tag="set_user_channels", kw_only=True, omit_defaults=True):
+class SetUserChannels(Request[SetUserChannelsOk], tag="set_user_channels", kw_only=True):
     """Write user channels that the level declares for its robots or the scene; the state returns their values.
 
     Returns the reason for each rejected value, by `<articulation>/<channel>` or `scene/<channel>`.
@@ -266,7 +294,6 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         errors=("not_ready", "missing_field"),
-        generated=True,
         returns="percent",
         positional=1,
     ),
@@ -338,6 +365,20 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         errors=("not_ready",),
+        dialects=("beta",),
+    ),
+    Op(
+        request=ClaimControl,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "control_claimed"),
+        dialects=("beta",),
+    ),
+    Op(
+        request=ReleaseControl,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner"),
         dialects=("beta",),
     ),
 )

@@ -41,7 +41,7 @@ class ImportXmlOk(Reply, tag="import_xml_ok", kw_only=True):
     imported_now: Annotated[bool, doc("False if an existing blueprint was reused.")]
 
 
-class ImportXml(Request[ImportXmlOk], tag="import_xml", kw_only=True, omit_defaults=True):
+class ImportXml(Request[ImportXmlOk], tag="import_xml", kw_only=True):
     """Import an MJCF file on the server's disk as an articulation blueprint."""
 
     path: Annotated[str, doc("MJCF file on the server's machine; absolute paths are safest.")]
@@ -52,7 +52,7 @@ class CreateLevelOk(LevelReply, tag="create_level_ok", kw_only=True):
     """The new level, open and saved."""
 
 
-class CreateLevel(Request[CreateLevelOk], tag="create_level", kw_only=True, omit_defaults=True):
+class CreateLevel(Request[CreateLevelOk], tag="create_level", kw_only=True):
     """Create an empty level, open it and save it.
 
     The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
@@ -118,7 +118,7 @@ class SpawnActorOk(Reply, tag="spawn_actor_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class SpawnActor(Request[SpawnActorOk], tag="spawn_actor", kw_only=True, omit_defaults=True):
+class SpawnActor(Request[SpawnActorOk], tag="spawn_actor", kw_only=True):
     """Place an instance of a blueprint in the edited level, or move the actor that has the id."""
 
     blueprint: Annotated[str, doc("Blueprint, or its package or class path.")]
@@ -148,7 +148,7 @@ class SpawnGridOk(Reply, tag="spawn_grid_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class SpawnGrid(Request[SpawnGridOk], tag="spawn_grid", kw_only=True, omit_defaults=True):
+class SpawnGrid(Request[SpawnGridOk], tag="spawn_grid", kw_only=True):
     """Place a grid of actors in one request; at most 1024 cells."""
 
     blueprint: Annotated[str, doc("Blueprint, or its package or class path.")]
@@ -176,7 +176,7 @@ class SpawnLightOk(Reply, tag="spawn_light_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class SpawnLight(Request[SpawnLightOk], tag="spawn_light", kw_only=True, omit_defaults=True):
+class SpawnLight(Request[SpawnLightOk], tag="spawn_light", kw_only=True):
     """Place a light. Each call adds one."""
 
     kind: Annotated[str, doc("`directional`, `point` or `spot`.")] = "directional"
@@ -193,7 +193,7 @@ class DestroyActorOk(Reply, tag="destroy_actor_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True, omit_defaults=True):
+class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True):
     """Remove an actor from the edited level."""
 
     target: ActorTarget
@@ -206,7 +206,7 @@ class RemoveActorOk(Reply, tag="remove_actor_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True, omit_defaults=True):
+class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True):
     """Remove an actor from the edited level; the beta's name for `destroy_actor`."""
 
     target: ActorTarget
@@ -233,7 +233,7 @@ class SetActorTransformOk(Reply, tag="set_actor_transform_ok", kw_only=True):
     requires_pie_restart: RequiresPieRestart
 
 
-class SetActorTransform(Request[SetActorTransformOk], tag="set_actor_transform", kw_only=True, omit_defaults=True):
+class SetActorTransform(Request[SetActorTransformOk], tag="set_actor_transform", kw_only=True):
     """Move an actor of the edited level. Omitted parts of the transform do not change."""
 
     target: ActorTarget
@@ -252,7 +252,7 @@ class DuplicateActorOk(Reply, tag="duplicate_actor_ok", kw_only=True):
     blueprint_class_path: Annotated[str, doc("Class path.")]
 
 
-class DuplicateActor(Request[DuplicateActorOk], tag="duplicate_actor", kw_only=True, omit_defaults=True):
+class DuplicateActor(Request[DuplicateActorOk], tag="duplicate_actor", kw_only=True):
     """Spawn another instance of an actor's class with the same rotation and scale."""
 
     target: ActorTarget
@@ -267,7 +267,7 @@ class ActorHierarchyOk(Reply, tag="actor_hierarchy_ok", kw_only=True):
     root: Annotated[ActorHierarchyNode, doc("The requested actor.")]
 
 
-class ActorHierarchy(Request[ActorHierarchyOk], tag="actor_hierarchy", kw_only=True, omit_defaults=True):
+class ActorHierarchy(Request[ActorHierarchyOk], tag="actor_hierarchy", kw_only=True):
     """Return the tree of actors attached to an actor. A robot is a single node."""
 
     target: ActorTarget

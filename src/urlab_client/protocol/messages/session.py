@@ -134,6 +134,10 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
         if self.arts is not None:
             self.per_articulation = self.arts
 
+    def __repr__(self) -> str:  # one line, without arrays and pixels
+        robots = ", ".join(self.per_articulation) or "no robots"
+        return f"<{type(self).__name__} step {self.step} at {self.time:.3f} s: {robots}>"
+
 
 class ReplayProgress(Serializable, Struct, kw_only=True):
     """Progress of a replay."""
@@ -142,7 +146,7 @@ class ReplayProgress(Serializable, Struct, kw_only=True):
     total_frames: Annotated[int, doc("Number of frames of the session.")]
 
 
-class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
+class StepOk(StateReply, tag="step_ok", kw_only=True):
     """State after the step."""
 
     entities: Annotated[dict[str, EntityState] | None, doc("Plain entities by name.")] = None
@@ -180,7 +184,7 @@ CameraChoice: TypeAlias = bool | Mapping[str, str | dict[str, float] | None]
 """Pictures that a step requests: all or none, or camera name to the kind of picture."""
 
 
-class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+class Step(ControlRequest[StepOk], tag="step", kw_only=True, forbid_unknown_fields=True):
     """Advance physics, or exchange state, according to the step mode."""
 
     n_steps: Annotated[Int32, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
@@ -201,11 +205,11 @@ class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True,
     time: Annotated[float | None, doc("`mjData.time`, seconds; absent sets 0. Puppet only.")] = None
 
 
-class ResetOk(StateReply, tag="reset_ok", kw_only=True, omit_defaults=True):
+class ResetOk(StateReply, tag="reset_ok", kw_only=True):
     """State after the reset; `step` is 0."""
 
 
-class Reset(Request[ResetOk], tag="reset", kw_only=True, omit_defaults=True):
+class Reset(Request[ResetOk], tag="reset", kw_only=True):
     """Reset the simulation, optionally to a keyframe, then override joints."""
 
     keyframe_name: Annotated[str | None, doc("Compiled keyframe name, prefix included.")] = None
@@ -215,7 +219,7 @@ class Reset(Request[ResetOk], tag="reset", kw_only=True, omit_defaults=True):
     ] = None
 
 
-class ForwardOk(StateReply, tag="forward_ok", kw_only=True, omit_defaults=True):
+class ForwardOk(StateReply, tag="forward_ok", kw_only=True):
     """State after `mj_forward`."""
 
 
@@ -289,7 +293,7 @@ class EntityInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     free_joint: Annotated[str | None, doc("Name of the free joint.")] = None
 
 
-class RobotEntry(ArticulationInfo, kw_only=True, omit_defaults=True):
+class RobotEntry(ArticulationInfo, kw_only=True):
     """One entry of `entities` on servers that list robots there; entries without `prefix` are not robots."""
 
     prefix: Annotated[str, doc("Articulation key; empty for what is not a robot.")] = ""
@@ -369,7 +373,7 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
         return self.entities if isinstance(self.entities, dict) else {}
 
 
-class Hello(Request[HelloOk], tag="hello", kw_only=True, omit_defaults=True):
+class Hello(Request[HelloOk], tag="hello", kw_only=True):
     """Open a session. The previous one becomes invalid immediately."""
 
     client_version: Annotated[str | None, doc("Name of the client, for the server's log only.")] = None

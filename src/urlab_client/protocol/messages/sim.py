@@ -17,7 +17,7 @@ class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
     handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, if ready.")] = None
 
 
-class BeginPie(Request[BeginPieOk], tag="begin_pie", kw_only=True, omit_defaults=True):
+class BeginPie(Request[BeginPieOk], tag="begin_pie", kw_only=True):
     """Start Play-In-Editor and wait until the model is compiled."""
 
     level_path: Annotated[str | None, doc("Level to open first, a full `/Game/` path.")] = None

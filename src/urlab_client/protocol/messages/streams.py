@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Struct
@@ -16,7 +16,7 @@ from urlab_client.protocol.messages.session import ArticulationState, Clock, Ent
 from urlab_client.protocol.rows import Row
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.values.layouts import BytesLike
-from urlab_client.values.pictures import JPEG_QUALITY, Pixels, jpeg, png
+from urlab_client.values.pictures import JPEG_QUALITY, Pixels, jpeg, png, shown_png
 from urlab_client.values.plain import Serializable
 
 
@@ -29,6 +29,10 @@ class StreamPolicy(StrEnum):
     """The newest message of each topic."""
     ALL = "all"
     """Every message, up to a limit."""
+
+
+StreamPolicyName: TypeAlias = Literal["latest", "latest_per_key", "all"]
+"""A policy of streams, by name."""
 
 
 class StreamItem(Serializable, Struct, kw_only=True, omit_defaults=True):
@@ -61,7 +65,7 @@ class StreamStats(Serializable, Struct, kw_only=True, frozen=True):
     last_age_s: Annotated[float | None, doc("Seconds since the last message arrived; None before the first.")]
 
 
-class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True, eq=False):
+class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, eq=False):
     """State of everything at the end of one tick, always at observation level `standard`."""
 
     time: Annotated[float, doc("`mjData.time`, seconds. Order live snapshots by this, not by `step`.")]
@@ -84,6 +88,10 @@ class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, 
             self.per_articulation = self.arts
         if self.scene is not None:
             self.entities = self.scene
+
+    def __repr__(self) -> str:  # one line, without arrays
+        robots = ", ".join(self.per_articulation) or "no robots"
+        return f"<StateSnapshot step {self.step} at {self.time:.3f} s: {robots}>"
 
     @classmethod
     def of(cls, reply: StateReply) -> StateSnapshot:
@@ -166,3 +174,14 @@ class CameraSample(StreamItem, kw_only=True, eq=False):
             ValueError: The quality or size is out of range.
         """
         return jpeg(self.pixels, self.mode, quality, max_size=max_size)
+
+    def __repr__(self) -> str:
+        height, width = self.pixels.shape[:2]
+        at = "" if self.sim_time is None else f" at {self.sim_time:.3f} s"
+        return f"<CameraSample {self.camera!r} {self.mode} {width}x{height}{at}>"
+
+    def _repr_html_(self) -> None:  # the picture itself says more than a table
+        return None
+
+    def _repr_png_(self) -> bytes | None:
+        return shown_png(self.pixels, self.mode)

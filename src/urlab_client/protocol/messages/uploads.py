@@ -54,7 +54,6 @@ class UploadModelChunk(
     Request[UploadModelChunkOk],
     tag="upload_model_chunk",
     kw_only=True,
-    omit_defaults=True,
     forbid_unknown_fields=True,
 ):
     """Send a chunk of a file."""

@@ -34,7 +34,7 @@ class SetCameraOk(CameraReply, tag="set_camera_ok", kw_only=True):
     """The pose in force."""
 
 
-class SetCamera(Request[SetCameraOk], tag="set_camera", kw_only=True, omit_defaults=True):
+class SetCamera(Request[SetCameraOk], tag="set_camera", kw_only=True):
     """Place the perspective viewport's camera."""
 
     location: Location
@@ -57,7 +57,7 @@ class FrameActorOk(CameraReply, tag="frame_actor_ok", kw_only=True):
     """The pose in force."""
 
 
-class FrameActor(Request[FrameActorOk], tag="frame_actor", kw_only=True, omit_defaults=True):
+class FrameActor(Request[FrameActorOk], tag="frame_actor", kw_only=True):
     """Move the camera so that an actor fills the view. The view direction does not change."""
 
     target: ActorTarget
@@ -82,7 +82,7 @@ class TrackActorOk(Reply, tag="track_actor_ok", kw_only=True):
     tracked_actor_path: Annotated[str, doc("Full object path.")]
 
 
-class TrackActor(Request[TrackActorOk], tag="track_actor", kw_only=True, omit_defaults=True):
+class TrackActor(Request[TrackActorOk], tag="track_actor", kw_only=True):
     """Make the camera follow an actor, and return its object path. A new call replaces the target."""
 
     target: ActorTarget

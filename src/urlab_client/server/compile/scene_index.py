@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import (
+    QPOS_WIDTH,
+    QVEL_WIDTH,
     control_counts,
     control_starts,
     force_counts,
     force_starts,
+    spans,
 )
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
@@ -23,6 +26,7 @@ from urlab_client.simulation.cameras import DEFAULT_CAMERA_SIZE, SceneCamera
 from urlab_client.simulation.controller_config import CUSTOM_TEXT, ControllerConfig
 
 Ints = NDArray[np.int32]
+Addresses = NDArray[np.intp]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,11 +59,11 @@ class ArticulationIndex:
     joint_names: tuple[str, ...]
     actuator_names: tuple[str, ...]
     sensor_names: tuple[str, ...]
-    qpos_adr: Ints
-    qvel_adr: Ints
-    ctrl_adr: Ints
+    qpos_adr: Addresses
+    qvel_adr: Addresses
+    ctrl_adr: Addresses
     act_adr: Ints
-    force_adr: Ints
+    force_adr: Addresses
     actuator_types: Mapping[str, str]
     cameras: tuple[SceneCamera, ...]
     controller: ControllerConfig | None = None
@@ -103,7 +107,7 @@ def index_articulation(
     actuators, actuator_names = find(objects.mjOBJ_ACTUATOR, blueprint.actuators)
     sensors, sensor_names = find(objects.mjOBJ_SENSOR, blueprint.sensors)
     cameras, camera_names = find(objects.mjOBJ_CAMERA, blueprint.cameras)
-    positions, velocities = _joint_widths(model, joints)
+    kinds = model.jnt_type[joints]
     controls = control_counts(model)[actuators]
     return ArticulationIndex(
         key=actor.name,
@@ -118,11 +122,11 @@ def index_articulation(
         joint_names=joint_names,
         actuator_names=actuator_names,
         sensor_names=sensor_names,
-        qpos_adr=_spans(model.jnt_qposadr[joints], positions),
-        qvel_adr=_spans(model.jnt_dofadr[joints], velocities),
-        ctrl_adr=_spans(control_starts(model)[actuators], controls),
+        qpos_adr=spans(model.jnt_qposadr[joints], QPOS_WIDTH[kinds]),
+        qvel_adr=spans(model.jnt_dofadr[joints], QVEL_WIDTH[kinds]),
+        ctrl_adr=spans(control_starts(model)[actuators], controls),
         act_adr=np.repeat(model.actuator_actadr[actuators], controls).astype(np.int32),
-        force_adr=_spans(force_starts(model)[actuators], force_counts(model)[actuators]),
+        force_adr=spans(force_starts(model)[actuators], force_counts(model)[actuators]),
         actuator_types=MappingProxyType({name: blueprint.actuator_types[name] for name in actuator_names}),
         cameras=tuple(
             _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)
@@ -139,19 +143,6 @@ def _controller(actor: Actor, blueprint: Blueprint) -> ControllerConfig | None:
         return ControllerConfig.parse(text) if text else None
     except ValueError as error:
         raise CompileFailed(f"{blueprint.stem}: custom text '{CUSTOM_TEXT}': {error}") from None
-
-
-def _joint_widths(model: mujoco.MjModel, joints: Ints) -> tuple[Ints, Ints]:
-    """Return how many coordinates and velocities each joint has."""
-    kinds = model.jnt_type[joints]
-    free, ball = kinds == int(mujoco.mjtJoint.mjJNT_FREE), kinds == int(mujoco.mjtJoint.mjJNT_BALL)
-    return np.select([free, ball], [7, 4], 1).astype(np.int32), np.select([free, ball], [6, 3], 1).astype(np.int32)
-
-
-def _spans(starts: Ints, lengths: Ints) -> Ints:
-    """Return the concatenation of the ranges start, start + 1, … of the given lengths."""
-    spans = [np.arange(start, start + length, dtype=np.int32) for start, length in zip(starts, lengths, strict=True)]
-    return np.concatenate(spans) if spans else np.empty(0, dtype=np.int32)
 
 
 def _camera(model: mujoco.MjModel, index: int, name: str, size: tuple[int, int] | None) -> SceneCamera:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from ctypes import c_float
 from dataclasses import replace
 from typing import Literal
 
@@ -19,11 +18,6 @@ def require(value: str, name: str) -> None:
     """Refuse with `missing_field` if a name is empty."""
     if not value:
         raise Refusal("missing_field", f"{name} must not be empty")
-
-
-def float32(value: float) -> float:
-    """Round to single precision, as the plugin stores it."""
-    return c_float(value).value
 
 
 def refuse_infinite(values: Iterable[float], names: str, code: str) -> None:

@@ -13,14 +13,13 @@ from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.level import LevelError, read_level, write_level
 from urlab_client.server.editor.level_actors import LevelActors, require
 from urlab_client.server.refusal import Refusal
-from urlab_client.values.names import WINDOWS_DEVICES
+from urlab_client.values.names import is_file_name
 from urlab_client.values.scene_types import BlueprintInfo
 
 UNTITLED: Final = "/Temp/Untitled_1"
 
 
 _LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
-_MAX_SEGMENT_BYTES: Final = 240
 _RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
 
 
@@ -36,11 +35,7 @@ def level_package(name: str) -> str:
     if described.casefold() == package.casefold():  # an object path says the name again; the engine ignores case
         parts[-1] = package
     for part in parts:
-        if (
-            not _LEVEL_SEGMENT.fullmatch(part)
-            or len(part.encode()) > _MAX_SEGMENT_BYTES
-            or part.upper() in WINDOWS_DEVICES
-        ):
+        if not _LEVEL_SEGMENT.fullmatch(part) or not is_file_name(part):
             raise ValueError(
                 f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
                 "or a path of such parts that begins with /Game/"

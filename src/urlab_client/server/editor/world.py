@@ -28,13 +28,12 @@ from urlab_client.server.assets.actors import (
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
-from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.composition import actor_bounds
 from urlab_client.server.editor.level_actors import (
     ActorNames,
     LevelActors,
     checked_pose,
     checked_rotation,
-    float32,
     match_actor,
     refuse_infinite,
     refuse_scale,
@@ -42,6 +41,7 @@ from urlab_client.server.editor.level_actors import (
 )
 from urlab_client.server.editor.levels import Blueprints, Levels
 from urlab_client.server.refusal import CompileFailed, Refusal
+from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import IDENTITY, Quat, Vec3, euler_to_quat, swap_frame
 from urlab_client.values.scene_types import ActorBounds, ActorHierarchyNode
 

@@ -1,4 +1,4 @@
-"""Handlers of the `runtime` ops: live changes to the running simulation and its cameras."""
+"""Handlers of the `runtime` and `farm` ops: changes to the running simulation, and who may make them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,99 @@ import numpy as np
 from msgspec import field
 
 from urlab_client.enums import StepMode
-from urlab_client.protocol.base import Request
-from urlab_client.protocol.messages import cameras, runtime
+from urlab_client.protocol.base import ControlRequest, Request
+from urlab_client.protocol.messages import cameras, farm, jobs, runtime
 from urlab_client.server.core import ServerCore
 from urlab_client.server.dialects import ALPHA, Dialect
-from urlab_client.server.handlers.control import check_all_owners, check_owner
 from urlab_client.server.physics.controllers import ArticulationControl, ControlSource
 from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.observe import SCENE
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
-from urlab_client.server.rpc.requests import need
+from urlab_client.server.rpc.requests import need, usable
 from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import Quat, Vec3
 from urlab_client.values.types import Contact, KeyframeInfo, SimOptions
+
+
+def _owner(request: ControlRequest[Any]) -> str:
+    return request.control_owner or request.session_id
+
+
+def check_owner(server: ServerCore, request: ControlRequest[Any], robot: ArticulationControl) -> None:
+    """Refuse a write to a robot by a client that does not own it, if robots have owners."""
+    if server.dialect.claims:
+        server.play.running().claims.check(robot.index.key, _owner(request))
+
+
+def check_all_owners(server: ServerCore, request: ControlRequest[Any]) -> None:
+    """Refuse a write to all robots while another client owns one of them, if robots have owners."""
+    if server.dialect.claims:
+        running = server.play.running()
+        keys = [robot.index.key for robot in running.engine.articulations.controls.values()]
+        running.claims.check_all(keys, _owner(request))
+
+
+@handles(runtime.ClaimControl)
+def claim_control(server: ServerCore, request: runtime.ClaimControl) -> runtime.ClaimControlOk:
+    running = server.play.running()
+    key = running.engine.articulations.control(need(request, request.articulation, "articulation")).index.key
+    owner = _owner(request)
+    running.claims.claim(key, owner, request.ttl_s, force=request.force)
+    return runtime.ClaimControlOk(articulation=key, owner=owner, ttl_s=request.ttl_s)
+
+
+@handles(runtime.ReleaseControl)
+def release_control(server: ServerCore, request: runtime.ReleaseControl) -> runtime.ReleaseControlOk:
+    running = server.play.running()
+    key = running.engine.articulations.control(need(request, request.articulation, "articulation")).index.key
+    running.claims.release(key, _owner(request))
+    return runtime.ReleaseControlOk(articulation=key)
+
+
+@handles(farm.AcquireLease)
+def acquire_lease(server: ServerCore, request: farm.AcquireLease) -> farm.AcquireLeaseOk:
+    return farm.AcquireLeaseOk(lease_id=server.lease.acquire(request.ttl_s), ttl_s=request.ttl_s)
+
+
+@handles(farm.ReleaseLease)
+def release_lease(server: ServerCore, request: farm.ReleaseLease) -> farm.ReleaseLeaseOk:
+    server.lease.release(usable(request.lease_id, ""))
+    return farm.ReleaseLeaseOk()
+
+
+@handles(jobs.OpStatus)
+def op_status(server: ServerCore, request: jobs.OpStatus) -> jobs.OpStatusOk:
+    job = usable(request.job_id, "")
+    if not job:
+        raise Refusal("bad_request", "op_status: field 'job_id' is empty or cannot be read as text")
+    result = server.jobs.take(job)
+    if result is None:
+        return jobs.OpStatusOk(job_id=job, state="running")
+    return jobs.OpStatusOk(job_id=job, state="failed" if result["op"] == "error" else "done", result=result)
+
+
+@handles(runtime.SetUserChannels)
+def set_user_channels(server: ServerCore, request: runtime.SetUserChannels) -> runtime.SetUserChannelsOk:
+    running = server.play.running()
+    applied = 0
+    rejected: dict[str, str] = {}
+    for name, values in (request.arts or {}).items():
+        robot = running.engine.articulations.find(name)
+        owner = name if robot is None else running.engine.articulations.name(robot)
+        for channel, value in values.items():
+            reason = running.channels.write(owner, channel, value)
+            applied += reason is None
+            if reason is not None:
+                rejected[f"{name}/{channel}"] = reason
+    for channel, value in (request.scene or {}).items():
+        reason = running.channels.write(SCENE, channel, value)
+        applied += reason is None
+        if reason is not None:
+            rejected[f"{SCENE}/{channel}"] = reason
+    return runtime.SetUserChannelsOk(applied=applied, rejected=rejected)
+
 
 MAX_CONTACTS: Final = 64
 

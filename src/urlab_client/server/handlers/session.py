@@ -11,12 +11,12 @@ import msgspec
 import mujoco
 
 from urlab_client.enums import ObservationLevel, PIEState, StepMode
+from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.messages import session, sim
-from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RPC_STRIDE
 from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
-from urlab_client.server.handlers.control import check_owner
+from urlab_client.server.handlers.runtime import check_owner
 from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal

@@ -10,7 +10,7 @@ from typing import Any, Final
 from urlab_client.protocol.base import EulerDeg, Request
 from urlab_client.protocol.messages import debug, viewport
 from urlab_client.server.assets.actors import Actor
-from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.composition import actor_bounds
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
@@ -153,7 +153,7 @@ def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
     return (x, y, z), xyzw((quat[0], quat[1], quat[2], quat[3]))
 
 
-class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True, omit_defaults=True):
+class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True):
     """A box request with the angles that the plugin also reads, although its clients do not send them."""
 
     rotation_euler: EulerDeg | None = None

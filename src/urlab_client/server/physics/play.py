@@ -9,26 +9,76 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from urlab_client.enums import PIEState
+from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
-from urlab_client.server.physics.channels import UserChannels
-from urlab_client.server.physics.claims import ControlClaims
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.observe import Observer
+from urlab_client.server.physics.observe import Observer, UserChannels
 from urlab_client.server.physics.options import OptionOverrides
 from urlab_client.server.physics.replay import ReplaySessions
 from urlab_client.server.physics.reply_template import StepReplies
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.render.camera_renderer import CameraRenderer
 from urlab_client.server.system.threads import Health
+
+
+@dataclass(slots=True)
+class _Claim:
+    owner: str
+    ttl_s: float
+    touched: float
+
+
+class ControlClaims:
+    """The owners of the robots, by key. Robots are unclaimed at first, and unclaimed robots accept no writes."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._claims: dict[str, _Claim] = {}
+
+    def owner(self, key: str) -> str:
+        """Return the owner of a robot, or `(unclaimed)`."""
+        claim = self._claims.get(key)
+        if claim is not None and 0 < claim.ttl_s < self._clock() - claim.touched:
+            del self._claims[key]
+            claim = None
+        return UNCLAIMED if claim is None else claim.owner
+
+    def claim(self, key: str, owner: str, ttl_s: float, *, force: bool) -> None:
+        """Make `owner` the owner, unless another client is."""
+        holder = self.owner(key)
+        if holder not in (UNCLAIMED, owner) and not force:
+            raise Refusal("control_claimed", f"'{key}' belongs to '{holder}'", owner=holder)
+        self._claims[key] = _Claim(owner, ttl_s, self._clock())
+
+    def release(self, key: str, owner: str) -> None:
+        """Release the claim on a robot."""
+        self.check(key, owner)
+        del self._claims[key]
+
+    def check(self, key: str, owner: str) -> None:
+        """Refuse a write to a robot by anybody but its owner, and renew the claim."""
+        holder = self.owner(key)
+        if holder != owner:
+            status = "is unclaimed: claim it first" if holder == UNCLAIMED else f"belongs to '{holder}'"
+            raise Refusal("not_control_owner", f"articulation '{key}' {status}", owner=holder)
+        self._claims[key].touched = self._clock()
+
+    def check_all(self, keys: Iterable[str], owner: str) -> None:
+        """Refuse a write to robots of which another client owns one."""
+        for key in keys:
+            holder = self.owner(key)
+            if holder not in (UNCLAIMED, owner):
+                raise Refusal("not_control_owner", f"articulation '{key}' belongs to '{holder}'", owner=holder)
+
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.server.compile.bounds import box_around
+from urlab_client.server.compile.composition import box_around
 from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
 from urlab_client.simulation.drawing import Bytes, Stage, follow_subject

@@ -1,0 +1,135 @@
+"""What a notebook shows: tables, pictures and curves instead of reprs, which stay one line in a terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from urlab_client import URLabClient
+from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.integrations.record import read_run, record
+from urlab_client.protocol.messages.streams import CameraSample
+from urlab_client.server import SimulatedServer
+from urlab_client.values.html import curve, fields, table
+
+NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebook.ipynb"
+
+EXECUTE = """
+import nbclient, nbformat, sys
+notebook = nbformat.read(sys.argv[1], 4)
+nbclient.NotebookClient(notebook, timeout=240, kernel_name="python3").execute()
+print(nbformat.writes(notebook))
+"""
+
+PENDULUM = """
+<mujoco><worldbody><body name="bob"><joint name="swing" axis="0 1 0"/><geom size=".1"/></body></worldbody>
+<actuator><motor name="swing" joint="swing"/></actuator></mujoco>
+"""
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> str:
+    path = tmp_path / "pendulum.xml"
+    path.write_text(PENDULUM)
+    return str(path)
+
+
+def html_of(value: Any) -> str:
+    shown: str = value._repr_html_()
+    assert "\n" not in repr(value), "a terminal shows one line"
+    return re.sub(r"<[^>]*>", " ", shown)
+
+
+@pytest.mark.long
+@pytest.mark.opengl
+def test_the_notebook_shows_values(tmp_path: Path) -> None:
+    own = {f"JUPYTER_{kind}_DIR": str(tmp_path / kind) for kind in ("RUNTIME", "CONFIG", "DATA")}
+    done = subprocess.run(
+        [sys.executable, "-c", EXECUTE, NOTEBOOK],
+        cwd=tmp_path,
+        env={**os.environ, **own, "IPYTHONDIR": str(tmp_path / "ipython")},
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    cells = [cell for cell in json.loads(done.stdout)["cells"] if cell["cell_type"] == "code"]
+    shown = ["".join(cell["source"]).splitlines()[-1] for cell in cells]
+    data = [output["data"] for cell in cells for output in cell["outputs"] if "data" in output]
+    assert len(data) == len(shown) - 1, "every cell but close() shows its last value"
+    assert [kind for kind in ("image/png", "text/html") for one in data if kind in one].count("image/png") == 1
+    assert all(len("".join(one["text/plain"]).splitlines()) == 1 for one in data)
+
+
+def test_blocking_objects_show_tables(model: str) -> None:
+    with SimulatedServer(model, play=True) as server, URLabClient(**server.client_options()) as client:
+        assert "connected" in html_of(client)
+        client.discover()
+        assert "robots pendulum" in re.sub(r" +", " ", html_of(client))
+        assert "swing" in html_of(client.articulations["pendulum"])
+        assert "pendulum" in html_of(client.articulations)
+        assert "pendulum" in html_of(client.step())
+        diagnosis = client.explain()
+        assert "play" in html_of(diagnosis)
+        assert "#2e7d32" in str(diagnosis._repr_html_()), "what is in order is green"
+    assert "closed" in html_of(client)
+
+
+async def test_async_objects_show_tables(model: str) -> None:
+    with SimulatedServer(model, play=True) as server:
+        async with AsyncClient(**server.client_options()) as client:
+            await client.discover()
+            assert "swing" in html_of(client.articulations["pendulum"])
+            sent = client.transport_stats.sent
+            assert "connected" in html_of(client)
+            assert client.transport_stats.sent == sent
+
+
+def test_a_recording_shows_its_curves(model: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with SimulatedServer(model, play=True) as server, URLabClient(**server.client_options()) as client:
+        client.discover()
+        with record(client, path):
+            client.articulations["pendulum"].set_ctrl({"swing": 1.0})
+            for _ in range(5):
+                client.step()
+    run = read_run(path)
+    assert "pendulum/swing" in html_of(run)
+    assert "<polyline" in run._repr_html_()
+    path.unlink()
+    assert "problem" in html_of(run)
+
+
+def test_pictures_show_themselves() -> None:
+    depth = np.linspace(1, 4, 12, dtype=np.float32).reshape(3, 4)
+    for pixels, mode in ((depth, "depth"), (np.zeros((3, 4, 4), np.uint8), "real")):
+        sample = CameraSample(camera="eye", mode=mode, pixels=pixels)
+        assert sample._repr_html_() is None
+        assert (sample._repr_png_() or b"").startswith(b"\x89PNG")
+        assert "4x3" in repr(sample)
+
+
+def test_names_are_escaped() -> None:
+    assert "<script>" not in table([("<script>", {"<script>": "<script>"})], heads=["<script>"], caption="<script>")
+
+
+def test_long_tables_are_cut() -> None:
+    many = fields("", {"rows": [{"n": n} for n in range(1000)], "values": np.zeros(1000)})
+    assert "950 more" in many
+    assert "(1000)" in many
+    assert len(many) < 10_000
+
+
+def test_rounding_noise_is_a_straight_line() -> None:
+    heights = {point.split(",")[1] for point in re.findall(r"[\d.]+,[\d.]+", curve(1e-14 * np.sin(np.arange(50.0))))}
+    assert len(heights) == 1
+    assert curve([1.0]) == ""

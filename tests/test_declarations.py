@@ -1,0 +1,115 @@
+"""What the modules declare fits together: every default is a value of its own type, and what grows is given by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import urlab_client
+
+HERE = Path(urlab_client.__file__).parent
+PACKAGES = sorted(path.stem for path in HERE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists())
+GROWING = ("protocol.messages", "events", "randomise.declaration", "integrations.policy.spec", "values.descriptions")
+
+
+@cache
+def modules(package: str) -> list[ModuleType]:
+    """The modules of a package, as far as what they need is installed."""
+    found: list[ModuleType] = []
+    for path in sorted([*HERE.glob(f"{package}.py"), *(HERE / package).rglob("*.py")]):
+        parts = [*path.relative_to(HERE).with_suffix("").parts]
+        if {"__main__", "windows"} & {*parts}:
+            continue
+        try:
+            found.append(import_module(".".join(["urlab_client", *parts]).removesuffix(".__init__")))
+        except ImportError:
+            continue
+    return found
+
+
+def classes(module: ModuleType) -> Iterator[type[Any]]:
+    for value in vars(module).values():
+        if isinstance(value, type) and value.__module__ == module.__name__:
+            yield value
+
+
+def defaults(module: ModuleType) -> Iterator[tuple[str, Any, Any]]:
+    """Where a module declares a default, its annotation, and the default."""
+    functions = [value for value in vars(module).values() if getattr(value, "__module__", "") == module.__name__]
+    for cls in classes(module):
+        if issubclass(cls, msgspec.Struct):
+            for field in msgspec.structs.fields(cls):
+                if field.default is not msgspec.NODEFAULT:
+                    yield f"{cls.__name__}.{field.name}", field.type, field.default
+        elif dataclasses.is_dataclass(cls):
+            for item in dataclasses.fields(cls):
+                if item.default is not dataclasses.MISSING:
+                    yield f"{cls.__name__}.{item.name}", item.type, item.default
+        functions += [getattr(value, "__func__", value) for value in vars(cls).values()]
+    for function in filter(inspect.isfunction, functions):
+        if function.__code__.co_filename != module.__file__:  # a dataclass's own
+            continue
+        for name, parameter in inspect.signature(function).parameters.items():
+            if parameter.default is not parameter.empty:
+                yield f"{function.__qualname__}({name})", parameter.annotation, parameter.default
+
+
+def fits(value: Any, annotation: Any, module: ModuleType) -> bool:
+    """Whether a value is of a type, as far as that is known when the program runs."""
+    try:
+        kind = eval(annotation, vars(module)) if isinstance(annotation, str) else annotation
+        msgspec.convert(value, kind, dec_hook=lambda cls, given: given)
+    except msgspec.ValidationError:
+        return False
+    except (NameError, TypeError):  # known to type checkers alone, or to no codec
+        return value is not None or "None" in str(annotation)
+    return True
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_default_is_a_value_of_its_own_type(package: str) -> None:
+    wrong = [
+        f"{module.__name__}: {where} = {value!r}, not {annotation}"
+        for module in modules(package)
+        for where, annotation, value in defaults(module)
+        if not fits(value, annotation, module)
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", GROWING)
+def test_what_gains_fields_is_made_by_their_names(name: str) -> None:
+    """A field that is added anywhere changes no caller."""
+    for module in modules(name.partition(".")[0]):
+        if module.__name__.startswith(f"urlab_client.{name}"):
+            structs = [cls for cls in classes(module) if issubclass(cls, msgspec.Struct)]
+            kinds = {one.kind for cls in structs for one in inspect.signature(cls).parameters.values()}
+            assert kinds <= {inspect.Parameter.KEYWORD_ONLY}, module.__name__
+
+
+def test_values_that_are_handed_out_cannot_be_changed() -> None:
+    found = [cls for module in modules("values") for cls in classes(module) if issubclass(cls, msgspec.Struct)]
+    changeable = {cls.__name__ for cls in found if not cls.__struct_config__.frozen}
+    assert changeable == {"PIEStartResult", "SimOptions", "URLabAsset"}
+
+
+def test_an_order_of_the_browser_that_says_nothing_asks_for_nothing() -> None:
+    from urlab_client.console import messages
+
+    fields = [
+        field for cls in classes(messages) if issubclass(cls, msgspec.Struct) for field in msgspec.structs.fields(cls)
+    ]
+    numbers = {
+        np.any(field.default) for field in fields if field.default is not msgspec.NODEFAULT and not field.required
+    }
+    assert numbers == {False}
