@@ -329,11 +329,7 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         "Editor 3.1 set_actor_transform",
         {"request": in_request("set_actor_transform", drop("location"))},
     ),
-    "a job that a new session does not know": (
-        "beta",
-        "Generation 2 8",
-        {"request": in_request("op_status", put("job_id", "job_999999"))},
-    ),
+    "a job's result in a new session": ("beta", "Generation 2 8", {"reply": imported(put("code", "busy"))}),
     "a missing file's code": ("beta", "Generation 2 5", {"reply": imported(put("code", "bad_request"))}),
     "a quick op as a job": ("beta", "Generation 2 9", {"reply": in_reply("snapshot_ok", put("op", "op_started"))}),
     "entities without play": (
