@@ -163,12 +163,12 @@ async def test_handles_describe_the_compiled_model(connect: Any, serve: Any) -> 
         (arm,) = client.articulations.values()
         model = client.model
         for name, joint in arm.joints.items():
-            assert model.joint(joint.id).name == f"{arm.prefix}_{name}"
+            assert model.joint(joint.id).name == f"{arm.compiled_prefix}_{name}"
             assert joint.qpos_offset == model.jnt_qposadr[joint.id]
             assert arm.qpos_array[joint.qpos_local_offset] == client.data.qpos[joint.qpos_offset]
             assert (joint.range is not None) == bool(model.jnt_limited[joint.id])
         for name, actuator in arm.actuators.items():
-            assert model.actuator(actuator.id).name == f"{arm.prefix}_{name}"
+            assert model.actuator(actuator.id).name == f"{arm.compiled_prefix}_{name}"
             assert actuator.joint is None or actuator.joint in arm.joints
             assert actuator.type is not None
         await client.step()
@@ -205,7 +205,7 @@ async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any
         await client.step(100)
         reply = await client.reset(keyframe_name="home")
         assert (reply.step, client.step_count) == (0, 0)
-        key = client.model.key(f"{robot.prefix}_home")
+        key = client.model.key(f"{robot.compiled_prefix}_home")
         assert np.array_equal(client.data.qpos, key.qpos)
         with pytest.raises(UnknownKeyframe, match=f"{robot.prefix}_home"):
             await client.reset(keyframe_name="homme")

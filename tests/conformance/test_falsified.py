@@ -52,6 +52,11 @@ def instance(change: Any) -> Any:
     return in_reply("hello_ok", lambda reply: change(reply["instance"]) and None)
 
 
+def imported(change: Any) -> Any:
+    """Change the result of an import that failed."""
+    return in_reply("op_status_ok", lambda reply: change(reply["result"]) and None if "result" in reply else None)
+
+
 def commands(change: Any) -> Any:
     return in_request("step", lambda request: [change(one) for one in request.get("per_articulation", {}).values()])
 
@@ -274,6 +279,24 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a time limit that is forgotten": ("beta", "Beta 15", {"reply": in_reply("claim_control_ok", put("ttl_s", 0.0))}),
     "a claim that never expires": ("beta", "Beta 16", {"request": in_request("claim_control", put("ttl_s", 0.0))}),
     "a lease that shows nowhere": ("beta", "Beta 27", {"reply": instance(put("busy", False))}),
+    "a lease that never ends": (
+        "beta",
+        "Beta 29",
+        {
+            "request": in_request("acquire_lease", each("ttl_s", lambda _: 60.0)),
+            "reply": in_reply("acquire_lease_ok", put("ttl_s", 0.5)),
+        },
+    ),
+    "a control source that another client cannot hold": (
+        "beta",
+        "Beta 21",
+        {"request": in_request("set_control_source", put("control_owner", "other"))},
+    ),
+    "a choice of the mode that ends the pause": (
+        "beta",
+        "Beta 95",
+        {"reply": in_reply("forward_ok", each("time", lambda v: v + 0.002))},
+    ),
     "a lease of another length": ("beta", "Beta 26", {"reply": in_reply("acquire_lease_ok", put("ttl_s", 30.0))}),
     # Streams
     "a snapshot's topic": ("beta", "Beta 43", {"message": in_topic(b"state/full", b"state/fool")}),
@@ -306,6 +329,23 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         "Editor 3.1 set_actor_transform",
         {"request": in_request("set_actor_transform", drop("location"))},
     ),
+    "a job's result in a new session": ("beta", "Generation 2 8", {"reply": imported(put("code", "busy"))}),
+    "a missing file's code": ("beta", "Generation 2 5", {"reply": imported(put("code", "bad_request"))}),
+    "a quick op as a job": ("beta", "Generation 2 9", {"reply": in_reply("snapshot_ok", put("op", "op_started"))}),
+    "entities without play": (
+        "beta",
+        "Beta 2",
+        {"reply": in_reply("hello_ok", lambda r: r.setdefault("entities", {}))},
+    ),
+    "frame ids that go on": ("beta", "Generation 2 22", {"reply": in_reply("step_ok", put("frame_id", 7.0))}),
+    "a document that is asked for again": (
+        "beta",
+        "Beta 59",
+        {"reply": in_reply("upload_model_manifest_ok", put("need_xml", True))},
+    ),
+    "wrong bytes that are taken": ("beta", "Beta 60", {"reply": in_reply("error:hash_mismatch", put("code", "busy"))}),
+    "an unknown upload's code": ("beta", "Beta 61", {"reply": in_reply("error:unknown_upload", put("code", "busy"))}),
+    "an upload that leads nowhere": ("beta", "Beta 62", {"reply": in_reply("upload_model_commit_ok", put("nq", 7.0))}),
     "a job's number": ("beta", "Generation 2 2", {"reply": SameJob()}),
     "a rotation that is not one": (
         ANY,
@@ -319,6 +359,20 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
 }
 
 PICTURES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "a long delay that is ignored": (
+        "beta",
+        "Beta 94",
+        {"request": in_request("set_camera_delay", each("cameras", lambda v: dict.fromkeys(v, 0.0)))},
+    ),
+    "a switch that is always wide": (
+        "beta",
+        "Generation 2 36",
+        {
+            "request": in_request(
+                "set_camera_streaming", each("cameras", lambda v: {k: bool(one) for k, one in v.items()})
+            )
+        },
+    ),
     "a stale picture": ("beta", "Beta 50", {"reply": pictures(each("frame_id", lambda v: v - 1))}),
     "a picture of another time": ("beta", "Beta 50", {"reply": pictures(each("sim_time", lambda v: v + 0.002))}),
     "a picture's size": (ANY, "Session 8.4", {"reply": pictures(put("width", 32.0))}),

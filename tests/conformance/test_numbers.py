@@ -100,7 +100,7 @@ async def test_one_of_several_inputs_is_named_by_its_number(connect: Any, serve:
     with serve(path, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
-        bot = client.articulations["bot"]
+        (bot,) = client.articulations.values()
         bot.actuators["servo"].set_control([1.0, 2.0], out_of_range="error")
         assert bot.ctrl_array.tolist() == [0, 0, 1, 2]
         bot.ctrl_array[:] = [NAN, 0, 0, INF]
@@ -120,15 +120,17 @@ async def test_huge_set_points_are_numbers(client: Any) -> None:
 
 async def test_a_push_is_of_numbers(client: Any) -> None:
     await client.runtime.set_mode("puppet")
-    at = client.articulations["bot"].joints["hinge"].qpos_offset
+    bot = client.articulations["bot"]
+    at = bot.joints["hinge"].qpos_offset
     client.data.qpos[at] = NAN
+    hinge = f"{bot.compiled_prefix}_hinge"
     for n_steps in (0, 1):
-        with pytest.raises(ValueError, match=rf"step: data.qpos\[{at}\] of joint 'bot_hinge' is nan. Nothing was sent"):
+        with pytest.raises(ValueError, match=rf"step: data.qpos\[{at}\] of joint '{hinge}' is nan. Nothing was sent"):
             await client.step(n_steps)
     assert math.isnan(client.data.qpos[at]), "MuJoCo would have reset it all"
     client.data.qpos[at] = 0.5
     client.data.qvel[0] = INF
-    with pytest.raises(ValueError, match=r"data.qvel\[0\] of joint 'bot_root' is inf"):
+    with pytest.raises(ValueError, match=rf"data.qvel\[0\] of joint '{bot.compiled_prefix}_root' is inf"):
         await client.step(0)
     client.data.qvel[0] = 0
     client.data.time = NAN

@@ -270,7 +270,7 @@ async def test_mocap_keyframes_twist_and_speed(connect: Any, serve: Any, bot: st
         with pytest.raises(UnknownBody):
             await client.runtime.read_mocap_pose("ghost")
         (key,) = await client.runtime.list_keyframes()
-        assert (key.name, key.time, len(key.qpos)) == (f"{art.prefix}_home", 1.5, client.model.nq)
+        assert (key.name, key.time, len(key.qpos)) == (f"{art.compiled_prefix}_home", 1.5, client.model.nq)
         await client.runtime.set_twist(art.prefix, linear=(0.5, 0.25, 9), angular=(9, 9, 1.5))
         await client.step()
         assert art.twist_linear.tolist() == [0.5, 0.25, 0.0]

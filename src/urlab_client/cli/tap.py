@@ -9,16 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, cast
 
-import msgspec
-
 from urlab_client.aio.transport.connection import client_keys
-from urlab_client.cli._arguments import Parser, add_address, port
+from urlab_client.cli._arguments import Parser, add_address, add_client, port
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
 from urlab_client.conformance.sessions import Passed, Ports, Relay
-from urlab_client.conformance.wire import oddities, plain
+from urlab_client.conformance.wire import oddities, plain, reply_oddities
 from urlab_client.keys import KeyPair, read_pair
-from urlab_client.protocol.messages.jobs import OpStarted
-from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS
 
 DESCRIPTION = (
@@ -50,14 +46,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--strict", action="store_true", help="name what our declarations do not know")
     parser.add_argument("--quiet", action="store_true", help="do not print ops")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="answer from this recorded session")
-    group = parser.add_argument_group("connection")
-    group.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
-    group.add_argument(
-        "--state-port", type=port, default=5555, metavar="PORT",
-        help="port of the state stream of a server that tells none (default: %(default)s)",
-    )  # fmt: skip
-    group.add_argument("--server-key", metavar="FILE", help="public key of the server (default: $URLAB_SERVER_KEY)")
-    group.add_argument("--client-key", metavar="FILE", help="secret key towards the server ($URLAB_CLIENT_KEY)")
+    add_client(parser)
 
 
 def run(arguments: Namespace) -> int:
@@ -100,7 +89,7 @@ def _relay(arguments: Namespace, ports: Ports, own: dict[str, int]) -> int:
         keys = client_keys(endpoint, arguments.server_key, arguments.client_key)
     with (
         _saved(arguments) as writer,
-        _Tap(arguments, writer, endpoint, keys, arguments.state_port, ports, **own) as tap,
+        _Tap(arguments, writer, endpoint, keys, arguments.state_port or 5555, ports, **own) as tap,
     ):
         print(f"{endpoint} at {ports.host}:{tap.port}, state at {tap.state_port}", flush=True)
         tap.join()
@@ -193,14 +182,9 @@ def departures(passed: Passed) -> list[str]:
     op = OPS.get(passed.op)
     if op is None:
         return [f"the op {passed.op!r} is not declared"]
-    lines: list[str] = []
     try:
         request, reply = plain(passed.request), plain(passed.reply)
     except ValueError as error:
         return [f"{passed.op}: {error}"]
-    kinds: dict[str, type[msgspec.Struct]] = {op.reply_name: op.reply, "error": ErrorReply, "op_started": OpStarted}
-    kind = kinds.get(str(reply.get("op")))
-    lines += [f"{passed.op}: {line}" for line in oddities(request, op.request)]
-    if kind is None:
-        return [*lines, f"{passed.op}: the reply's op {reply.get('op')!r} is not declared"]
-    return [*lines, *(f"{reply['op']}: {line}" for line in oddities(reply, kind))]
+    lines = [f"{passed.op}: {line}" for line in oddities(request, op.request)]
+    return [*lines, *(f"{reply.get('op')}: {line}" for line in reply_oddities(op, reply))]

@@ -168,14 +168,21 @@ def _stamp(bench: Bench, message: Message) -> PictureStamp:
 async def _watch(bench: Bench, endpoint: str, count: int, n_steps: int) -> tuple[list[Message], list[dict[str, Any]]]:
     """Step while a camera streams; return its messages and the replies."""
     replies: list[dict[str, Any]] = []
-    listening = asyncio.ensure_future(bench.wire.listen(bench.endpoint(endpoint), 15.0, lambda got: len(got) >= count))
-    try:
-        while not listening.done():
+    heard = asyncio.Event()
+
+    async def listen() -> list[Message]:
+        try:
+            return await bench.wire.listen(bench.endpoint(endpoint), 15.0, lambda got: len(got) >= count)
+        finally:
+            heard.set()
+
+    async def steps() -> None:
+        while not heard.is_set():
             replies.append(await bench.step(n_steps=n_steps))
             await asyncio.sleep(0.02)
-        return await listening, replies
-    finally:
-        listening.cancel()
+
+    messages, _ = await asyncio.gather(listen(), steps())
+    return messages, replies
 
 
 @pictured("Beta 56", "Generation 2 35", "Generation 2 40", dialects=NEWER)

@@ -120,7 +120,10 @@ class Service:
         failure: Why it ended; None while it runs.
     """
 
-    def __init__(self, name: str, ports: Ports, port: int) -> None:
+    _thread: threading.Thread
+    """Runs `_run`."""
+
+    def __init__(self, ports: Ports, port: int) -> None:
         self.failure: URLabError | None = None
         self._ports = ports
         self._poller = zmq.Poller()
@@ -130,7 +133,6 @@ class Service:
         for socket in (self._front, self._stop):
             self._poller.register(socket, zmq.POLLIN)
         self._ended = threading.Event()
-        self._thread = background_thread(name, self._run, failed=self._fail)
 
     def take(self, socket: Socket) -> None:
         """Take what has come to a socket; called on the thread."""
@@ -193,7 +195,8 @@ class Relay(Service):
         port: int = 0,
         state_port: int = 0,
     ) -> None:
-        super().__init__("urlab-relay", ports, port)
+        super().__init__(ports, port)
+        self._thread = background_thread("urlab-relay", self._run, failed=self._fail)
         self._host = endpoint.partition("://")[2].rpartition(":")[0]
         self._keys = keys
         self._back = self._connected(zmq.DEALER, endpoint)
@@ -465,7 +468,8 @@ class Replay(Service):
     """
 
     def __init__(self, session: list[Recorded], ports: Ports, *, port: int = 0, state_port: int = 0) -> None:
-        super().__init__("urlab-replay", ports, port)
+        super().__init__(ports, port)
+        self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
         self.unknown: Counter[str] = Counter()
         self._state, self.state_port = ports.bind(zmq.PUB, state_port)
         self._cameras: dict[str, tuple[Socket, int]] = {}

@@ -142,12 +142,9 @@ class Wire:
         return reply
 
     def _hold(self, op: Op, reply: dict[str, Any]) -> None:
-        kinds = {op.reply_name: op.reply, "error": ErrorReply, "op_started": OpStarted}
-        kind = kinds.get(reply.get("op", ""))
-        if kind is ErrorReply:
+        if reply.get("op") == "error":
             self.refusals.setdefault(str(reply.get("code")), op.name)
-        found = [f"op is {reply.get('op')!r}"] if kind is None else oddities(reply, kind)
-        if found:
+        if found := reply_oddities(op, reply):
             self.odd.setdefault(op.name, set()).update(found)
 
     async def ask(self, op: str, /, **fields: Any) -> dict[str, Any]:
@@ -271,6 +268,13 @@ def other_numbers(frame: bytes) -> dict[str, int]:
     if values or at != len(frame):
         raise ValueError(f"the message ends at byte {at} of {len(frame)}")
     return dict(found)
+
+
+def reply_oddities(op: Op, reply: dict[str, Any]) -> list[str]:
+    """Return where a reply to an op departs from its declaration."""
+    kinds: dict[str, type[Struct]] = {op.reply_name: op.reply, "error": ErrorReply, "op_started": OpStarted}
+    kind = kinds.get(str(reply.get("op")))
+    return [f"op is {reply.get('op')!r}"] if kind is None else oddities(reply, kind)
 
 
 def oddities(value: Any, declared: Any) -> list[str]:
