@@ -108,7 +108,8 @@ def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
     from urlab_client.protocol.messages.runtime import SetPaused  # noqa: PLC0415
     from urlab_client.protocol.registry import OPS  # noqa: PLC0415  # older packages lack this op
 
-    claim: Request[Any] = OPS["claim_control"].request(articulation=hello.articulations[0].prefix)
+    claim_control: Any = OPS["claim_control"].request
+    claim: Request[Any] = claim_control(articulation=hello.articulations[0].prefix)
     plain = msgspec.msgpack.decode(floor.ask(encode_request(Hello(), "")))
     for elsewhere in ("instance", "shm_rpc"):
         plain.pop(elsewhere, None)

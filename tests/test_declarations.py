@@ -43,12 +43,19 @@ def classes(module: ModuleType) -> Iterator[type[Any]]:
             yield value
 
 
+def struct_fields(cls: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    try:
+        return msgspec.structs.fields(cls)
+    except NameError:  # of annotations that only type checkers read; nothing decodes such a struct
+        return ()
+
+
 def defaults(module: ModuleType) -> Iterator[tuple[str, Any, Any]]:
     """Where a module declares a default, its annotation, and the default."""
     functions = [value for value in vars(module).values() if getattr(value, "__module__", "") == module.__name__]
     for cls in classes(module):
         if issubclass(cls, msgspec.Struct):
-            for field in msgspec.structs.fields(cls):
+            for field in struct_fields(cls):
                 if field.default is not msgspec.NODEFAULT:
                     yield f"{cls.__name__}.{field.name}", field.type, field.default
         elif dataclasses.is_dataclass(cls):

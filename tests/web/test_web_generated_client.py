@@ -42,11 +42,19 @@ def generate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generate:
         (tmp_path / "openapi.json").write_bytes(document)
         (tmp_path / "settings.yml").write_text(SETTINGS, encoding="utf-8")
         command = [sys.executable, "-m", "openapi_python_client", "generate", "--path", "openapi.json"]
-        command += ["--config", "settings.yml", "--meta", "none", "--output-path", "generated", "--fail-on-warning"]
+        command += [
+            "--config",
+            "settings.yml",
+            "--meta",
+            "none",
+            "--output-path",
+            "console_client",
+            "--fail-on-warning",
+        ]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         monkeypatch.syspath_prepend(tmp_path)
-        return lambda name: importlib.import_module(f"generated.{name}")
+        return lambda name: importlib.import_module(f"console_client.{name}")
 
     return made
 

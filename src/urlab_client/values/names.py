@@ -12,8 +12,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
-from urlab_client.values.html import fields
-
 T = TypeVar("T")
 D = TypeVar("D")
 
@@ -218,6 +216,8 @@ class NameMap(PublicDir, dict[str, T]):
         return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
 
     def _repr_html_(self) -> str:
+        from urlab_client.values.html import fields  # NumPy, which the command line loads late
+
         return fields(self.kind, {name: repr(one) for name, one in self.items()})
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
