@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from children import signals_kept
 
 from urlab_client import ProtocolError, URLabClient
 from urlab_client.aio.arguments import integer
@@ -132,6 +133,6 @@ def test_commands(
     line: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with suppress(SystemExit):  # of the parser
+    with signals_kept(), suppress(SystemExit):  # of the parser
         assert main(line.split()) == 2
     assert said in capsys.readouterr().err

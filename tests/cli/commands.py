@@ -47,18 +47,6 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
     return line
 
 
-@contextlib.contextmanager
-def signals_kept() -> Generator[None]:
-    """Put back what `urlab serve` does to the process that it owns."""
-    numbers = [number for number in signal.Signals if number.name in {"SIGINT", "SIGTERM", "SIGHUP"}]
-    before = [signal.getsignal(number) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-
-
 class Server:
     """A running `urlab serve`."""
 

@@ -9,8 +9,8 @@ import socket
 from pathlib import Path
 
 import pytest
-from children import DEADLINE_S, in_background
-from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, signals_kept, urlab
+from children import DEADLINE_S, in_background, signals_kept
+from commands import FREE_PORTS, GYMNASIUM_MODELS, refusal, served, urlab
 from forked import program
 from waiting import eventually
 

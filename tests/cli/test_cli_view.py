@@ -68,5 +68,5 @@ def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: py
     assert {name: getattr(told[0], name) for name in names} == {
         "address": "sim://arm", "host": "127.0.0.1", "port": 0, "allow_host": [], "open": False, "handshake": None,
         "recordings": Path("recordings"), "mjcf_options": False, "server_key": None, "client_key": None,
-        "step_port": 5559, "state_port": None,
+        "step_port": 5559, "state_port": None, "public_url": None, "json_log": False,
     }  # fmt: skip

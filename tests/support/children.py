@@ -50,6 +50,18 @@ def in_background() -> Generator[None]:
 
 
 @contextlib.contextmanager
+def signals_kept() -> Generator[None]:
+    """Put back what `urlab serve` does to the process that it owns."""
+    numbers = [number for number in signal.Signals if number.name in {"SIGINT", "SIGTERM", "SIGHUP"}]
+    before = [signal.getsignal(number) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
 def ended_with_a_failure() -> Generator[None]:
     """Kill all that a block has started when it fails: children's children and orphans, too, where `/proc` tells."""
     mark = os.environ[_MARK] = f"{os.getpid()}-{next(_numbers)}"
