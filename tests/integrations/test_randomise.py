@@ -48,6 +48,10 @@ EVERYTHING = Randomisation(
     delay=Delay(observation=(0, 2), action=(0, 2), drop=0.2),
 )
 
+BETA: Any = {"dialect": "beta"}
+PLUGIN: Any = {**BETA, "actor_names": "plugin"}
+"""Options of a server whose compiled names begin otherwise than its robots are called."""
+
 
 class FreeWalk(Walk):
     """Starts where it is put, so that what varies of the start stays."""
@@ -60,13 +64,15 @@ def where(server: SimulatedServer) -> str:
     return f"{server.address}:{server.step_port}"
 
 
+@pytest.mark.parametrize("naming", [{}, PLUGIN], ids=["model", "plugin"])
 def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
-    made: list[Any], monkeypatch: pytest.MonkeyPatch
+    made: list[Any], naming: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
-    server = SimulatedServer("quadruped", play=True, controllers=pd, randomise=EVERYTHING)
-    plain = SimulatedServer("quadruped", play=True, controllers=pd)
-    with server, plain, SimulatedServer("quadruped", play=True, controllers=pd, randomise=EVERYTHING) as second:
+    options: Any = {"play": True, "controllers": pd, **naming}
+    server = SimulatedServer("quadruped", **options, randomise=EVERYTHING)
+    plain = SimulatedServer("quadruped", **options)
+    with server, plain, SimulatedServer("quadruped", **options, randomise=EVERYTHING) as second:
         copies = URLabBatchEnv(where(server), 2, task=FreeWalk(), max_episode_steps=5)
         wire = URLabVectorEnv([where(server), where(second)], task=FreeWalk(), max_episode_steps=5)
         monkeypatch.setattr(batch, "batch_class", lambda: None)  # as with releases before mujoco.batch
@@ -113,15 +119,15 @@ def declared_while(client: urlab_client.URLabClient, path: Path) -> Randomisatio
     return None if said is None else Randomisation.from_json(said)
 
 
-@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+@pytest.mark.parametrize("naming", [{}, BETA, PLUGIN], ids=["alpha", "beta", "plugin"])
 def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(
-    made: list[Any], dialect: Any, tmp_path: Path
+    made: list[Any], naming: Any, tmp_path: Path
 ) -> None:
     settable = {"gravity", "position", "base_position", "base_yaw", "kp", "kv"}
     declared = Randomisation(vary=tuple(vary for vary in EVERYTHING.vary if vary.what in settable))
     pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
     options = {"randomise": declared, "max_episode_steps": 5, "reset_noise": 0.05}
-    with SimulatedServer("quadruped", play=True, controllers=pd, dialect=dialect) as server:
+    with SimulatedServer("quadruped", play=True, controllers=pd, **naming) as server:
         copies = URLabBatchEnv(where(server), 1, task=FreeWalk(), **options)
         with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client:
             client.discover()

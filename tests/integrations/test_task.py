@@ -33,6 +33,10 @@ STEPPED: Any = {"play": True, "step_mode": "direct"}
 """Options of a server that does not go on in live mode after its clients have closed."""
 
 
+PLUGIN: Any = {"dialect": "beta", "actor_names": "plugin"}
+"""Options of a server whose compiled names begin otherwise than its robots are called."""
+
+
 @pytest.fixture(scope="module")
 def arms() -> Iterator[list[str]]:
     """Addresses of two servers."""
@@ -62,7 +66,20 @@ def pushers() -> Iterator[list[str]]:
         yield [f"{server.address}:{server.step_port}" for server in (one, two)]
 
 
-@pytest.mark.parametrize(("kind", "servers"), [(Reach, "arms"), (Push, "pushers"), (Walk, "walkers")])
+@pytest.fixture(scope="module")
+def plugin_pushers() -> Iterator[list[str]]:
+    """Addresses of two servers with what `Push` needs, named as the plugin names it."""
+    models = ("arm", "block", "floor")
+    with (
+        SimulatedServer(*models, play=True, camera_size=(96, 72), **PLUGIN) as one,
+        SimulatedServer(*models, play=True, camera_size=(96, 72), **PLUGIN) as two,
+    ):
+        yield [f"{server.address}:{server.step_port}" for server in (one, two)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "servers"), [(Reach, "arms"), (Push, "pushers"), (Push, "plugin_pushers"), (Walk, "walkers")]
+)
 def test_all_three_environments_agree_bit_for_bit(
     kind: type[Task], servers: str, made: list[Any], request: pytest.FixtureRequest
 ) -> None:
@@ -194,7 +211,8 @@ def test_where_some_episodes_begin_anew_infos_tell_of_all(arms: list[str], made:
     assert infos["final_info"].keys() == told.keys()
 
 
-def test_poses_and_contacts_are_those_of_the_state(walkers: list[str], made: list[Any]) -> None:
+@pytest.mark.parametrize("naming", [{}, PLUGIN], ids=["model", "plugin"])
+def test_poses_and_contacts_are_those_of_the_state(naming: Any, made: list[Any]) -> None:
     class Stand(Walk):
         seen: ClassVar[list[States]] = []
 
@@ -202,17 +220,22 @@ def test_poses_and_contacts_are_those_of_the_state(walkers: list[str], made: lis
             self.seen.append(states)
             return np.zeros(len(states))
 
-    env = URLabBatchEnv(walkers[0], 2, task=Stand())
+    pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
+    with SimulatedServer("quadruped", **STEPPED, controllers=pd, **naming) as server:
+        env = URLabBatchEnv(f"{server.address}:{server.step_port}", 2, task=Stand())
     made.append(env)
     env.reset(seed=0)
     for _ in range(30):
         env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-    states, model = Stand.seen[-1], env.model
+    states, model, calf = Stand.seen[-1], env.model, f"{env.mapping.prefixes['quadruped']}_FL_calf"
+    assert calf == ("quadruped_C_0_FL_calf" if naming else "quadruped_FL_calf")
+    for written in ("quadruped_FL_calf", "quadruped/FL_calf", calf):
+        assert states.scene.id("body", written) == model.body(calf).id
     data = mujoco.MjData(model)
     for i in range(2):
         data.qpos[:] = states.qpos[i]
         mujoco.mj_forward(model, data)
-        assert np.array_equal(states.body_position("quadruped/FL_calf")[i], data.body("quadruped_FL_calf").xpos)
+        assert np.array_equal(states.body_position("quadruped/FL_calf")[i], data.body(calf).xpos)
     for foot in ("quadruped/FL_calf", "quadruped/FL_foot"):
         assert states.touching(foot).all()
         assert states.touching(foot, "quadruped/floor").all()

@@ -29,7 +29,9 @@ def server_variation(
     from urlab_client.randomise.variation import Variation, declared_in
 
     declared = declared_in(model)
-    return None if declared is None else Variation(declared, model, controlled_actuators(client, layouts))
+    if declared is None:
+        return None
+    return Variation(declared, model, controlled_actuators(client, layouts), compiled_prefixes(client))
 
 
 def wire_variation(client: URLabClient) -> WireVariation | None:
@@ -80,7 +82,9 @@ class WireVariation(ClientObserver):
         self.draws: EpisodeDraws | None = None
         controlled = controlled_actuators(client, layouts)
         _check(client, model, declared, controlled)
-        self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
+        self.variation: Variation = (
+            Variation(declared, model, controlled, compiled_prefixes(client)) if earlier is None else earlier.variation
+        )
         self._client = client
         if (before := wire_variation(client)) is not None:
             client.remove_observer(before)
@@ -133,9 +137,11 @@ class WireVariation(ClientObserver):
 def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
     from urlab_client.randomise.quantities import START, elements_of
 
+    prefixes = compiled_prefixes(client)
+
     def settable(vary: Vary) -> bool:
         if vary.what in ("kp", "kv"):
-            return controlled.issuperset(elements_of(vary, model, controlled).ids.tolist())
+            return controlled.issuperset(elements_of(vary, model, controlled, prefixes).ids.tolist())
         return vary.what in START or vary.what == "gravity"
 
     refused = [vary.what for vary in declared.vary if not settable(vary)]
@@ -151,3 +157,8 @@ def controlled_actuators(client: URLabClient, layouts: Mapping[str, Articulation
         if controller is not None and controller.kind == ControllerKind.PD:
             controlled.update(layout.actuators[name] for name in controller.params["kp"])
     return frozenset(controlled)
+
+
+def compiled_prefixes(client: URLabClient) -> dict[str, str]:
+    """Return what the names of an articulation's elements begin with in the compiled model, by its key."""
+    return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Vary
+from urlab_client.values.names import spellings
 
 Ints = NDArray[np.intp]
 Fields = Callable[[str], NDArray[Any]]
@@ -73,20 +75,20 @@ class Elements:
     names: tuple[str, ...]
 
 
-def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -> Elements:
+def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int], prefixes: Mapping[str, str]) -> Elements:
     """Return the elements whose quantity varies; there must be one.
 
     A geom is found by its own name or its body's, a free joint likewise. `controlled` are the actuators that a
-    controller with gains drives.
+    controller with gains drives, `prefixes` what compiled names begin with, by key of the articulation.
     """
     if vary.what == "gravity":
         return Elements(np.zeros(1, dtype=np.intp), ("scene",))
     kind, _ = QUANTITIES[vary.what]
     names = _names(model, kind)
     aliases = _aliases(model, kind, names)
+    written = [list(itertools.chain(*spellings(each, prefixes))) for each in aliases]
     having = [i for i in range(len(names)) if _has(vary.what, model, i, controlled)]
-    patterns = [pattern.replace("/", "_", 1) for pattern in vary.patterns]
-    chosen = [i for i in having if any(fnmatch.fnmatchcase(alias, p) for alias in aliases[i] for p in patterns)]
+    chosen = [i for i in having if any(fnmatch.filter(written[i], pattern) for pattern in vary.patterns)]
     if not chosen:
         there = ", ".join(dict.fromkeys(alias for i in having for alias in aliases[i] if alias)) or "none"
         raise ValueError(f"no {kind} with a {vary.what} is called {' or '.join(vary.patterns)}; there are: {there}")

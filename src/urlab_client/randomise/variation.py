@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Final
 
 import mujoco
@@ -99,7 +100,11 @@ class Variation:
     """
 
     def __init__(
-        self, declaration: Randomisation, model: mujoco.MjModel, controlled: frozenset[int] = frozenset()
+        self,
+        declaration: Randomisation,
+        model: mujoco.MjModel,
+        controlled: frozenset[int] = frozenset(),
+        prefixes: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Find the elements that vary.
 
@@ -107,13 +112,14 @@ class Variation:
             declaration: The declaration.
             model: The compiled scene without variation; the varying fields are copied.
             controlled: Actuators that a controller with gains drives.
+            prefixes: Prefix of the compiled element names of each articulation, by key.
 
         Raises:
             ValueError: A name matches no element.
         """
         self.declaration = declaration
         self._model = model
-        self._elements = [elements_of(vary, model, controlled) for vary in declaration.vary]
+        self._elements = [elements_of(vary, model, controlled, prefixes) for vary in declaration.vary]
         self.fields: tuple[str, ...] = tuple(
             sorted({name for vary in declaration.vary for name in QUANTITIES[vary.what][1]})
         )

@@ -266,3 +266,38 @@ def compiled_names(name: str, prefixes: Mapping[str, str]) -> set[str]:
     local = {f"{prefix}_{name}" for prefix in prefixes.values()}
     keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
     return local | keyed
+
+
+def spellings(names: Iterable[str], prefixes: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """Return what users may write for the elements of a compiled model.
+
+    Args:
+        names: Compiled names.
+        prefixes: As in `compiled_names`.
+
+    Returns:
+        Per name, in order, the name itself, then `ARTICULATION/NAME` by the articulation's key and by its prefix, and
+        `ARTICULATION_NAME` by its key. Where an element belongs to none, any underscore may be written as the slash.
+    """
+    keys = {prefix: key for key, prefix in prefixes.items()}
+    found: list[tuple[str, ...]] = []
+    for owner, local in split_prefix(names, keys):
+        if owner is None:
+            cuts = (i for i, character in enumerate(local) if character == "_")
+            found.append((local, *(f"{local[:i]}/{local[i + 1 :]}" for i in cuts)))
+        else:
+            key = keys[owner]
+            found.append((f"{owner}_{local}", f"{key}/{local}", f"{owner}/{local}", f"{key}_{local}"))
+    return found
+
+
+def element_ids(names: Iterable[str], prefixes: Mapping[str, str], kind: str) -> NameMap[int]:
+    """Return the ids of the named elements of one kind by compiled name, with their other `spellings` as aliases."""
+    ids: dict[str, int] = {}
+    aliases: dict[str, list[str]] = {}
+    for i, (name, *others) in enumerate(spellings(names, prefixes)):
+        if name:
+            ids[name] = i
+            for other in others:
+                aliases.setdefault(other, []).append(name)
+    return NameMap(ids, aliases, kind)

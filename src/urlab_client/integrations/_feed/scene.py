@@ -25,7 +25,7 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
-from urlab_client.integrations._variation import server_variation
+from urlab_client.integrations._variation import compiled_prefixes, server_variation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 from urlab_client.values.names import cleaned_name
@@ -99,7 +99,7 @@ class FollowedScene:
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
         """Build the description of a client's scene."""
         model, arts = client.model, client.articulations
-        prefixes = {key: art.compiled_prefix for key, art in arts.items()}
+        prefixes = compiled_prefixes(client)
         layouts = {key: ArticulationLayout() for key in arts}
         if model is not None:
             layouts = articulation_layouts(model, prefixes)

@@ -32,6 +32,7 @@ from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
+from urlab_client.values.names import element_ids
 from urlab_client.values.pictures import to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
@@ -137,8 +138,10 @@ class URLabBatchEnv(Vectorized):
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
         self._varied = None
         if declared is not None and declared.vary:
-            self._varied = _CopyVariation(declared, model, self._batch, num_envs, self._controllers)
-        self._bodies = {name: i for i, name in enumerate(model_names(model, "body"))}
+            self._varied = _CopyVariation(
+                declared, model, self._batch, num_envs, self._controllers, prefixes=mapping.prefixes
+            )
+        self._bodies = element_ids(model_names(model, "body"), mapping.prefixes, "body")
         for push in () if declared is None else declared.push:
             self._body(push.body)
         self._step_count = np.zeros(num_envs, dtype=np.int64)
@@ -299,7 +302,7 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _body(self, name: str) -> int:
-        found = self._bodies.get(name, self._bodies.get(name.replace("/", "_", 1)))
+        found = self._bodies.get(name)
         if found is None:
             raise ValueError(f"push: unknown body {name!r}; the bodies are: {', '.join(self._bodies)}")
         return found
@@ -315,10 +318,12 @@ class _CopyVariation:
         batch: Any,
         nsim: int,
         controllers: Mapping[str, Controller],
+        *,
+        prefixes: Mapping[str, str],
     ) -> None:
         self._pd = {key: found for key, found in controllers.items() if isinstance(found, PDController)}
         controlled = frozenset(int(i) for found in self._pd.values() for i in found.bound_actuators)
-        self._variation = Variation(declaration, model, controlled)
+        self._variation = Variation(declaration, model, controlled, prefixes)
         self._batch = batch
         self._fields: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.fields}
         self._visible: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.visible_fields}

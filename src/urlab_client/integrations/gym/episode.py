@@ -18,7 +18,12 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._variation import WireVariation, controlled_actuators, server_variation
+from urlab_client.integrations._variation import (
+    WireVariation,
+    compiled_prefixes,
+    controlled_actuators,
+    server_variation,
+)
 from urlab_client.integrations.gym.settings import EpisodeSettings
 from urlab_client.integrations.gym.spaces import (
     LEVELS,
@@ -361,7 +366,7 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
 
 def space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
     """Return the articulations of a discovered client as the spaces of an environment."""
-    prefixes = {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
+    prefixes = compiled_prefixes(client)
     controlled = {
         key: layout
         for key, layout in articulation_layouts(model, prefixes).items()

@@ -98,6 +98,7 @@ class SpaceMapping:
         observed: Keys of the observed articulations.
         fields: Observed fields, in order.
         mode: `flat` or `dict`.
+        prefixes: Prefix of the compiled element names of each articulation, by key.
         action_space: `Box(n,)`, or `Dict` of one `Box` per articulation.
         observation_space: `Box(n,)`, or `Dict` of one `Dict` of fields per articulation.
     """
@@ -143,7 +144,7 @@ class SpaceMapping:
         self.fields: tuple[Field, ...] = tuple(fields)
         self.mode: SpaceMode = mode
         self._model = model
-        self._prefixes = dict(prefixes)
+        self.prefixes: dict[str, str] = dict(prefixes)
         self._targets = targets
         self._parts = {key: _part(model, each, targets) for key, each in articulation_layouts(model, prefixes).items()}
         self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
@@ -176,7 +177,7 @@ class SpaceMapping:
             UnknownKeyframe: No keyframe, or more than one, has this name.
         """
         known = model_names(self._model, "key")
-        wanted = {name, *compiled_names(name, self._prefixes)}
+        wanted = {name, *compiled_names(name, self.prefixes)}
         found = [i for i, full in enumerate(known) if full in wanted]
         if len(found) != 1:
             raise UnknownKeyframe(

@@ -20,7 +20,7 @@ from urlab_client.aio.arguments import require
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Actions, Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.protocol.base import Floats
-from urlab_client.values.names import unknown_name
+from urlab_client.values.names import NameMap, element_ids
 
 Bools = NDArray[np.bool_]
 _SKY_M: Final = 1e3
@@ -72,7 +72,7 @@ class TaskScene:
         self.model = model
         self.mapping = mapping
         self.data: mujoco.MjData = mujoco.MjData(model)
-        self._ids: dict[str, dict[str, int]] = {}
+        self._ids: dict[str, NameMap[int]] = {}
 
     def id(self, kind: str, name: str) -> int:
         """Return the id of a `body`, `site`, `geom` or `joint`.
@@ -80,11 +80,9 @@ class TaskScene:
         Raises:
             KeyError: The scene has no such element.
         """
-        known = self._ids.setdefault(kind, {n: i for i, n in enumerate(model_names(self.model, kind))})
-        found = known.get(name, known.get(name.replace("/", "_", 1)))
-        if found is None:
-            raise unknown_name(kind, name, filter(None, known))
-        return found
+        if kind not in self._ids:
+            self._ids[kind] = element_ids(model_names(self.model, kind), self.mapping.prefixes, kind)
+        return self._ids[kind][name]
 
     def geoms(self, name: str) -> NDArray[np.intp]:
         """Return the ids of the geoms of a body, without those of its children, or the id of one geom.

@@ -33,7 +33,8 @@ class SceneVariation:
         found = (control.controller for control in articulations.controls.values())
         self._controllers = [controller for controller in found if isinstance(controller, PDController)]
         controlled = frozenset(int(i) for controller in self._controllers for i in controller.bound_actuators)
-        self._variation = Variation(declaration, scene.model, controlled)
+        prefixes = {name: control.index.key for name, control in articulations.controls.items()}
+        self._variation = Variation(declaration, scene.model, controlled, prefixes)
         self._following = np.random.default_rng(0)
 
     @property
