@@ -227,8 +227,8 @@ def render_ops() -> str:
         "",
         "## Errors",
         "",
-        "[The page of errors](ops-errors.md) lists every code that a server answers, with its exception and advice, and",
-        "all other exceptions of the package.",
+        "[The page of errors](ops-errors.md) lists every code that a server answers, with its exception and advice,",
+        "and all other exceptions of the package.",
     ]
     return "\n".join(lines) + "\n"
 
