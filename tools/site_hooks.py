@@ -1,8 +1,9 @@
 """What the site adds to the pages in `docs/`, as hooks of MkDocs.
 
 The pages at the root of the repository belong to the site, too, and links between the two work in both places. Files
-that are not pages, such as sources, are named but not linked. A page that the navigation does not mention is put at its
-end. Code blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
+that are not pages, such as sources, are named but not linked. In the navigation, pages `NAME-….md` stand below
+the page `NAME.md` that lists them, in its order; a page that the navigation does not mention is put at its end. Code
+blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
 """
 
 from __future__ import annotations
@@ -35,13 +36,33 @@ _CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put pages at the end of the navigation that it does not mention."""
+    """Put pages in the navigation below the one that lists them; those that it does not mention, at its end."""
     docs = Path(config.docs_dir)
+    config.nav = with_listed(config.nav, docs)
     named = set(_targets(config.nav))
     others = sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
     if missing := [name for name in others if name not in named]:
         config.nav = [*(config.nav or []), {"More": missing}]
     return config
+
+
+def with_listed(nav: Any, docs: Path) -> Any:
+    """Return a navigation in which the pages `NAME-….md` that `NAME.md` links to stand below it.
+
+    Args:
+        nav: Navigation, or a part of it, as MkDocs reads it.
+        docs: Folder of the pages.
+    """
+    if isinstance(nav, list):
+        return [with_listed(item, docs) for item in nav]
+    if isinstance(nav, dict):
+        return {title: with_listed(item, docs) for title, item in nav.items()}
+    path = docs / nav if isinstance(nav, str) else None
+    if path is None or not path.exists():
+        return nav
+    names = re.findall(rf"\]\(({re.escape(path.stem)}-[\w-]+\.md)", path.read_text(encoding="utf-8"))
+    below = [posixpath.join(posixpath.dirname(nav), name) for name in dict.fromkeys(names)]
+    return [nav, *below] if below else nav
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -20,13 +20,13 @@ from urlab_client.errors import RPC_ERRORS
 from urlab_client.protocol.messages.scene import EnsureManager
 from urlab_client.protocol.registry import OPS
 
-REFERENCE = ROOT / "docs" / "reference" / "ops.md"
+REFERENCE = ROOT / "docs" / "reference"
 
 
-def rows(heading: str) -> list[list[str]]:
-    """Return the cells of the table rows below a heading and its sub-headings."""
-    text = REFERENCE.read_text(encoding="utf-8")
-    section = re.split(r"^## ", text.split(f"\n## {heading}\n")[1], flags=re.MULTILINE)[0]
+def rows(page: str, heading: str = "") -> list[list[str]]:
+    """Return the cells of the table rows of a page, or of those below a heading and its sub-headings."""
+    text = (REFERENCE / page).read_text(encoding="utf-8")
+    section = re.split(r"^## ", (text.split(f"\n## {heading}\n")[1] if heading else text), flags=re.MULTILINE)[0]
     lines = [line for line in section.splitlines() if line.startswith(("| `", "| [`"))]
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
 
@@ -51,14 +51,16 @@ def test_check_finds_a_stale_file_and_writes_nothing(tmp_path: Path, capsys: pyt
 
 
 def test_every_op_has_a_row_of_full_width() -> None:
-    table = rows("Ops")
-    assert sorted(row[0] for row in table) == sorted(f"[`{name}`](protocol.md#{name})" for name in OPS)
+    table = [row for namespace in gen_docs.namespaces() for row in rows(gen_docs.namespace_page("ops", namespace))]
+    assert sorted(row[0] for row in table) == sorted(
+        f"[`{name}`]({gen_docs.field_page(op)}#{name})" for name, op in OPS.items()
+    )
     assert {len(row) for row in table} == {6}
     assert all(row[2] for row in table), "an op without a sentence"
 
 
 def test_every_error_code_has_a_row() -> None:
-    table = rows("Errors that a server answers")
+    table = rows("ops-errors.md", "Errors that a server answers")
     assert [row[0] for row in table] == [f"`{code}`" for code in RPC_ERRORS]
     assert {len(row) for row in table} == {5}
 
@@ -68,7 +70,7 @@ def test_the_kinds_of_errors_are_complete() -> None:
 
     classes = {cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.URLabError)}
     expected = {f"`{cls.__name__}`" for cls in classes - set(RPC_ERRORS.values()) - {errors.URLabError}}
-    assert {row[0] for row in rows("All kinds of errors")} == expected
+    assert {row[0] for row in rows("ops-errors.md", "All kinds of errors")} == expected
 
 
 def test_an_op_without_a_method_is_refused() -> None:
@@ -82,8 +84,8 @@ def test_an_op_without_a_method_is_refused() -> None:
 
 @pytest.mark.parametrize("op", OPS.values(), ids=lambda op: op.name)
 def test_every_field_of_an_op_has_a_row_with_type_default_and_meaning(op: Any) -> None:
-    text = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
-    section = re.split(r"^##+ ", text.split(f"\n### `{op.name}`\n")[1], flags=re.MULTILINE)[0]
+    text = (REFERENCE / gen_docs.field_page(op)).read_text(encoding="utf-8")
+    section = re.split(r"^##+ ", text.split(f"\n## `{op.name}`\n")[1], flags=re.MULTILINE)[0]
     request, reply = section.split(f"\nReply `{op.reply_name}`:\n")
     assert f"Category `{op.needs.value}`." in request
     assert all(f"`{code}`" in request for code in op.errors)
@@ -123,9 +125,8 @@ def test_where_public_names_are_defined_is_found() -> None:
 
 
 def test_every_option_of_every_command_is_in_the_reference() -> None:
-    text = (ROOT / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
     for name, command in _parser().commands.items():
-        section = text.split(f"\n## urlab {name}\n")[1].split("\n## ")[0]
+        section = (REFERENCE / f"cli-{name}.md").read_text(encoding="utf-8")
         options = re.findall(r"(?<![\w-])--[a-z-]+", command.format_help().split("\nexamples:")[0])
         assert [option for option in options if option not in (*section.split("`"), "--help")] == [], name
         assert all(f"`{line}`" in section for line, _ in command.examples)
@@ -133,10 +134,14 @@ def test_every_option_of_every_command_is_in_the_reference() -> None:
 
 def test_the_reference_of_the_commands_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert gen_cli.main(["--check"]) == 0, "run python tools/gen_cli.py"
-    monkeypatch.setattr(gen_cli, "OUTPUT", tmp_path / "cli.md")
+    monkeypatch.setattr(gen_cli, "OUTPUT", tmp_path)
     assert gen_cli.main(["--check"]) == 1
     assert gen_cli.main([]) == 0
     assert gen_cli.main(["--check"]) == 0
+    (tmp_path / "cli-levitate.md").write_text(f"{gen_cli.GENERATED}\n", encoding="utf-8")
+    assert gen_cli.main(["--check"]) == 1, "the page of a command that is gone"
+    assert gen_cli.main([]) == 0
+    assert not (tmp_path / "cli-levitate.md").exists()
 
 
 def test_help_shows_a_methods_text_as_its_op_declares_it() -> None:
