@@ -61,8 +61,16 @@ def with_listed(nav: Any, docs: Path) -> Any:
     if path is None or not path.exists():
         return nav
     names = re.findall(rf"\]\(({re.escape(path.stem)}-[\w-]+\.md)", path.read_text(encoding="utf-8"))
-    below = [posixpath.join(posixpath.dirname(nav), name) for name in dict.fromkeys(names)]
+    below = [
+        {_heading(path.parent / name): posixpath.join(posixpath.dirname(nav), name)} for name in dict.fromkeys(names)
+    ]
     return [nav, *below] if below else nav
+
+
+def _heading(page: Path) -> str:
+    """Return a page's title, which MkDocs does not find below the comment of a generated page."""
+    found = re.search(r"^# (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return page.stem if found is None else found[1].replace("`", "")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -1,4 +1,4 @@
-"""Code in both flavours is in tabs, of which the site opens the same one everywhere."""
+"""What the hooks of the site make: tabs of code in both flavours, and the navigation of the reference."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.util
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pages import ROOT, pages, shown
@@ -26,8 +27,10 @@ def test_the_home_page_and_the_quickstart_have_them() -> None:
     assert with_tabs >= {"README.md", "docs/index.md", "docs/start.md", "docs/quickstart.md"}
 
 
-def test_the_site_makes_tabs_of_neighbours_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("mkdocs", "mkdocs.structure", "mkdocs.structure.files"):  # which the tests do without
+@pytest.fixture(name="hooks")
+def fixture_hooks(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return the hooks of the site, without MkDocs, which the tests do without."""
+    for name in ("mkdocs", "mkdocs.structure", "mkdocs.structure.files"):
         monkeypatch.setitem(sys.modules, name, type(sys)(name))
     for name in ("File", "Files"):
         monkeypatch.setattr(sys.modules["mkdocs.structure.files"], name, object, raising=False)
@@ -36,6 +39,19 @@ def test_the_site_makes_tabs_of_neighbours_only(monkeypatch: pytest.MonkeyPatch)
     assert spec.loader is not None
     hooks = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hooks)
+    return hooks
+
+
+def test_the_navigation_has_the_pages_that_a_page_lists_below_it(hooks: Any) -> None:
+    nav = [{"Reference": [{"Command line": "reference/cli.md"}]}, "index.md"]
+    (reference, home) = hooks.with_listed(nav, ROOT / "docs")
+    ((index, first, *others),) = (below["Command line"] for below in reference["Reference"])
+    assert (index, home) == ("reference/cli.md", "index.md")
+    assert first == {"urlab serve": "reference/cli-serve.md"}
+    assert len(others) + 1 == len(list((ROOT / "docs" / "reference").glob("cli-*.md")))
+
+
+def test_the_site_makes_tabs_of_neighbours_only(hooks: Any) -> None:
     tab = "<!-- tab: {0} -->\n```python\n{1}\n```\n"
     first, second, third = tab.format("Blocking", "a"), tab.format("Async", "b"), tab.format("Blocking", "c")
     page = f"{first}\n```text\n1\n```\n\n{second}\nwords\n\n{third}"
