@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
 from urlab_client.conformance.bench import ROBOT, Bench
-from urlab_client.conformance.declarations import BETA, NEWER, Group, NotTried, check, has, holds, same
+from urlab_client.conformance.declarations import BETA, NEWER, Body, Group, NotTried, check, has, holds, same
 
-author = partial(check, group=Group.AUTHOR)
+author: Callable[..., Callable[[Body], Body]] = partial(check, group=Group.AUTHOR)
 
 _ID: Final = "conformance"
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -98,7 +98,8 @@ class Bench:
         self, wire: Wire, *, own_server: bool = False, trusted: bool | None = None, import_file: str | None = None
     ) -> None:
         self.wire = wire
-        self.ask, self.refused = wire.ask, wire.refused
+        self.ask: Callable[..., Coroutine[Any, Any, dict[str, Any]]] = wire.ask
+        self.refused: Callable[..., Coroutine[Any, Any, dict[str, Any]]] = wire.refused
         self.plain_hello: dict[str, Any] = {}
         self.hello: HelloOk
         self.ops: dict[str, dict[str, Any]] = {}

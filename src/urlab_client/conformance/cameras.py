@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import struct
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +15,7 @@ from urlab_client.conformance.declarations import (
     ALPHA,
     BETA,
     NEWER,
+    Body,
     Differs,
     Group,
     NotTried,
@@ -27,7 +29,7 @@ from urlab_client.conformance.wire import Message
 from urlab_client.protocol import shm
 from urlab_client.values.pictures import PictureStamp, picture_stamp
 
-pictured = partial(check, group=Group.PLAY, needs=("camera",))
+pictured: Callable[..., Callable[[Body], Body]] = partial(check, group=Group.PLAY, needs=("camera",))
 
 _WAIT: Final[dict[str, Any]] = {"render": "sync", "camera_timeout_ms": 10_000.0}
 _HEADER: Final = 40

@@ -18,6 +18,7 @@ from urlab_client.conformance.declarations import (
     BETA,
     NEWER,
     OLDER,
+    Body,
     Differs,
     Group,
     NotTried,
@@ -33,7 +34,7 @@ from urlab_client.protocol import shm
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow, decode_row
 from urlab_client.protocol.topics import StreamTopic, TopicKind
 
-play = partial(check, group=Group.PLAY)
+play: Callable[..., Callable[[Body], Body]] = partial(check, group=Group.PLAY)
 
 _SUBSTEPS: Final = 10
 _ROW: Final = 2e-6

@@ -127,6 +127,7 @@ class Service:
         self.failure: URLabError | None = None
         self._ports = ports
         self._poller = zmq.Poller()
+        self.port: int
         self._front, self.port = ports.bind(zmq.ROUTER, port)
         self._stop = ports.context.socket(zmq.PAIR)
         self._stop.bind(_STOP)
@@ -204,6 +205,7 @@ class Relay(Service):
         self._pairs: dict[Socket, tuple[Socket, str]] = {}
         self._cameras: dict[str, int] = {}
         self._pending: dict[tuple[bytes, ...], tuple[bytes, float, int]] = {}
+        self.state_port: int
         self._state, self.state_port = self._publisher(f"tcp://{self._host}:{server_state_port}", "state", state_port)
         self._state_ports = {server_state_port}
 
@@ -471,6 +473,7 @@ class Replay(Service):
         super().__init__(ports, port)
         self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
         self.unknown: Counter[str] = Counter()
+        self.state_port: int
         self._state, self.state_port = ports.bind(zmq.PUB, state_port)
         self._cameras: dict[str, tuple[Socket, int]] = {}
         self._equal: dict[Any, deque[Recorded]] = defaultdict(deque)

@@ -16,7 +16,14 @@ from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
-from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, keyframe_option
+from urlab_client.integrations.gym.settings import (
+    EpisodeOptions,
+    EpisodeSettings,
+    RewardFn,
+    TerminationFn,
+    client_defaults,
+    keyframe_option,
+)
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
 from urlab_client.integrations.gym.task import EpisodeEnd, Task, judged, succeeded
 from urlab_client.protocol.base import Floats
@@ -89,7 +96,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             aio_of(client), settings=settings, randomise=None if randomise is None else Randomisation.of(randomise)
         )
         self.randomise: Randomisation | None = self._episode.randomise
-        self.task = task = settings.task
+        self.task: Task | None = settings.task
+        task = settings.task
         n_task = 0 if task is None else task.n_observed
         self._disturbances = None
         if self.randomise is not None:
@@ -101,8 +109,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             **self.metadata,
             "render_fps": 1.0 / (model.opt.timestep * settings.n_substeps) if model else _FALLBACK_FPS,
         }
-        self.reward_fn = settings.reward_fn
-        self.termination_fn = settings.termination_fn
+        self.reward_fn: RewardFn | None = settings.reward_fn
+        self.termination_fn: TerminationFn | None = settings.termination_fn
         self._max_episode_steps = settings.max_episode_steps
         self._owns_client = owns_client
         self._observation: Observation = None

@@ -210,10 +210,10 @@ class States:
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
-        self.index = np.arange(len(qpos)) if index is None else index
+        self.index: NDArray[np.intp] = np.arange(len(qpos)) if index is None else index
         still = np.zeros((len(qpos), scene.mapping.n_actions))
-        self.last_action = still if last_action is None else last_action
-        self.previous_action = still if previous_action is None else previous_action
+        self.last_action: Floats = still if last_action is None else last_action
+        self.previous_action: Floats = still if previous_action is None else previous_action
         self.memory = memory
 
     def __len__(self) -> int:
