@@ -11,6 +11,7 @@ import contextlib
 import queue
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from pathlib import Path
@@ -112,7 +113,7 @@ class Ports:
         return f"tcp://0.0.0.0:{port}"
 
 
-class Service:
+class Service(ABC):
     """A thread that answers at ports of its own, until it is closed or fails.
 
     Attributes:
@@ -135,9 +136,9 @@ class Service:
             self._poller.register(socket, zmq.POLLIN)
         self._ended = threading.Event()
 
+    @abstractmethod
     def take(self, socket: Socket) -> None:
         """Take what has come to a socket; called on the thread."""
-        raise NotImplementedError
 
     def __enter__(self) -> Self:
         self._thread.start()

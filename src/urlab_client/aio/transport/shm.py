@@ -282,7 +282,8 @@ class ShmTransport:
             return error
         self._regions.connect_doorbell()
         self._used_at = now
-        log.info("shared memory in %s; doorbell: %s", paths[0].parent, self._regions.doorbell)
+        doorbell = "no" if self._regions.doorbell is None else "yes"
+        log.info("shared memory in %s; doorbell: %s", paths[0].parent, doorbell)
         return None
 
     def _put_off(self, error: Exception, now: float) -> None:
