@@ -20,7 +20,7 @@ from urlab_client.integrations.record.recorder import record
 from urlab_client.integrations.record.transitions import check_episodes
 from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
 from urlab_client.protocol.topics import articulation_filter, resolve_endpoint
-from urlab_client.randomise import Randomisation
+from urlab_client.randomise import Push, Randomisation, Vary
 from urlab_client.server import SimulatedServer, faults
 from urlab_client.simulation.joint_recording import decode_csv, decode_json
 from urlab_client.values.pictures import jpeg
@@ -57,6 +57,55 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
             ValueError,
             "actor_names must be 'model' or 'plugin', not 'both'",
         ),
+        (refused(SimulatedServer, dialect="gamma"), ValueError, "dialect must be alpha or beta, not 'gamma'"),
+        (
+            refused(SimulatedServer, camera_size=(0, 3)),
+            ValueError,
+            "camera_size must be a width and a height of at least",
+        ),
+        (
+            refused(SimulatedServer, user_channels={"lamp": 1.0}),
+            ValueError,
+            "user_channels: 'lamp' does not say ROBOT/",
+        ),
+        (
+            refused(SimulatedServer, user_channels={"scene/lamp": {"a": 1}}),
+            ValueError,
+            "user_channels: 'scene/lamp' cannot begin with {'a': 1}",
+        ),
+        (
+            refused(SimulatedServer, instance_index=-1),
+            ValueError,
+            "instance_index must be a number from 0 to 5000, not -1",
+        ),
+        (refused(SimulatedServer, instance_index=5001), ValueError, "instance_index must be a number from 0 to 5000"),
+        (
+            refused(SimulatedServer, state_port=65536),
+            ValueError,
+            "state_port must be a number from 0 to 65535, not 65536",
+        ),
+        (refused(SimulatedServer, render_quality="best"), ValueError, "render_quality must be "),
+        (
+            refused(SimulatedServer, "a.json", "b.json"),
+            ValueError,
+            "only one level can be open: a.json, b.json",
+        ),
+        (
+            refused(Vary, what="mass", add=(1.0, 2.0), distribution="log-uniform"),
+            ValueError,
+            "mass: log-uniform is for factors and values above 0",
+        ),
+        (
+            refused(Vary, what="mass", set=(0.0, 2.0), distribution="log-uniform"),
+            ValueError,
+            "mass: log-uniform is for factors and values above 0",
+        ),
+        (refused(Vary, what="mass", scale=(-0.5, 1.0)), ValueError, "mass: a factor is at least 0, not -0.5"),
+        (refused(Vary, what="mass"), ValueError, "mass needs one of scale, add and set, not none"),
+        (refused(Vary, what="kp", add=(1.0, 2.0)), ValueError, "kp takes scale, not add"),
+        (refused(Vary, what="gravity", on="arm/*", add=(0.0, 1.0)), ValueError, "gravity applies to the whole scene"),
+        (refused(Push, body="arm/hand", force=(0.0, 1.0), every=(3, 2)), ValueError, "push: every takes two numbers"),
+        (refused(Push, body="arm/hand", force=(0.0, 1.0), every=(1, 2), lasts=0), ValueError, "push: lasts must be at"),
         (refused(jpeg, BLACK, "real", 0), ValueError, "the quality of a JPEG is 1 to 100, got 0"),
         (refused(jpeg, BLACK, "real", 101), ValueError, "the quality of a JPEG is 1 to 100, got 101"),
         (refused(jpeg, BLACK, "real", max_size=0), ValueError, "max_size is at least 1 pixel, got 0"),

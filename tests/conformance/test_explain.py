@@ -129,3 +129,43 @@ async def test_the_generation_is_named(connect: Any, serve: Any, dialect: str) -
         await client.discover()
         (versions,) = (finding for finding in (await client.explain()).findings if finding.subject == "versions")
         assert f"({dialect}) with MuJoCo" in versions.text
+
+
+async def test_who_controls_a_robot(connect: Any, serve: Any, dialect: str) -> None:
+    """Only the beta has owners: the first write claims a robot, and another client's writes are refused."""
+
+    async def said(client: Any) -> str:
+        return next((one.text for one in (await client.explain()).findings if "control" in one.text.lower()), "")
+
+    with serve("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        if dialect == "alpha":
+            assert "This client does not control it yet." not in await said(client)
+            return
+        assert "The first write claims it." in await said(client)
+        await client.articulations["arm"].claim()
+        assert await said(client) == "This client controls it."
+        await client.articulations["arm"].release()
+        shy = connect(server, step_mode="direct", claim_control=False)
+        await shy.discover()
+        shy.articulations["arm"].set_ctrl({"elbow": 0.5})
+        assert "Call articulation.claim(), or leave claim_control on." in problems(await shy.explain())
+
+
+async def test_a_scene_without_robots(connect: Any, serve: Any) -> None:
+    with serve(play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert "Spawn a robot before sim.start()" in problems(await client.explain())
+
+
+async def test_set_points_beyond_their_range_are_a_note(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        client.articulations["arm"].set_ctrl({"elbow": 99.0})
+        await client.step()
+        (note,) = [one for one in (await client.explain()).findings if one.text.startswith("Set-points out of range")]
+        assert note.verdict is Verdict.NOTE
+        assert "elbow" in note.text

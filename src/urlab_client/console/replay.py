@@ -142,11 +142,11 @@ class Replay:
         """Show a recording from its start."""
         run, (start, end), names, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
         if not names:
-            raise URLabError(f"{file.name} holds no states of robots.")
+            raise ValueError(f"{file.name} holds no states of robots.")
         robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
         if not robots:
             there = ", ".join(self._client.articulations) or "none"
-            raise URLabError(f"{file.name} is a recording of other robots than the current ones ({there}).")
+            raise ValueError(f"{file.name} is a recording of other robots than the current ones ({there}).")
         await self.end()
         self._run, self._robots, self.cameras = run, robots, cameras
         self._start, self._seconds = start, end - start

@@ -1,0 +1,145 @@
+"""What viewers may not do, and what the console remembers of what they did: a robot that walks, beside a crate."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncGenerator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_recordings import Robot, write_recording
+from starlette.applications import Starlette
+from starlette.routing import Mount
+from starlette.testclient import TestClient
+
+from urlab_client.aio import URLabClient
+from urlab_client.server import SimulatedServer
+from urlab_client.web import app
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("quadruped", dialect="beta", play=True, camera_size=(32, 24)) as running:
+        yield running
+
+
+@pytest.fixture
+def http(server: SimulatedServer, tmp_path: Path) -> Iterator[TestClient]:
+    server.restore()
+    client = URLabClient(**server.client_options(), step_mode="direct")
+    inner = app(client, lease_seconds=600.0, recordings=tmp_path / "recordings")
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        async with client, inner.router.lifespan_context(inner):
+            yield
+
+    outer = Starlette(routes=[Mount("/", inner)], lifespan=lifespan)
+    with TestClient(outer, base_url="http://localhost") as http:
+        key = http.post("/api/session", json={"token": inner.state.access.invite()}).json()["key"]
+        http.headers["authorization"] = f"Bearer {key}"
+        with http.websocket_connect("ws://localhost/api/live") as live:
+            while not live.receive_json().get("world", {}).get("articulations"):
+                pass
+        assert http.post("/api/step", json={"n_steps": 1}).status_code == 200
+        yield http
+
+
+def refusal(answer: Any, status: int = 400) -> str:
+    assert answer.status_code == status, answer.text
+    return str(answer.json()["error"]["message"])
+
+
+def test_what_the_server_does_not_report_is_remembered(http: TestClient) -> None:
+    twist = {"articulation": "quadruped", "linear": [0.5, 0.25, 0.0], "angular": [0.0, 0.0, -1.0]}
+    assert http.post("/api/ops/set_twist", json=twist).status_code == 200
+    assert http.post("/api/ops/set_control_source", json={"source": "ui"}).status_code == 200
+    assert http.post("/api/ops/set_sim_speed", json={"percent": 50}).status_code == 200
+    status = http.get("/api/status").json()
+    assert status["twists"] == {"quadruped": [0.5, 0.25, -1.0]}
+    assert (status["source"], status["speed"]) == ("ui", 50.0)
+    http.post("/api/ops/set_control_source", json={"articulation": "quadruped", "source": "zmq"})
+    assert http.get("/api/status").json()["source"] == "ui", "of all robots, not of this one"
+
+
+def test_ops_that_the_client_must_know_of_go_through_it(http: TestClient) -> None:
+    camera = http.get("/api/world").json()["articulations"][0]["cameras"][0]["name"]
+    delayed = http.post("/api/ops/set_camera_delay", json={"cameras": {camera: 0.25}})
+    assert (delayed.status_code, delayed.json()["cameras"][camera]["delay_s"]) == (200, 0.25)
+    assert http.post("/api/ops/stop_pie", json={}).status_code == 200
+    assert http.get("/api/world").json()["articulations"] == []
+    assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
+    assert [one["key"] for one in http.get("/api/world").json()["articulations"]] == ["quadruped"]
+
+
+def test_rays_and_pushes_take_finite_numbers_and_bodies_of_robots(http: TestClient) -> None:
+    bodies = http.get("/api/bodies").json()["bodies"]
+    trunk = next(one for one in bodies if one["robot"] == "quadruped")
+    assert "direction other than zero" in refusal(
+        http.post("/api/pick", json={"origin": [0, 0, 3], "direction": [0, 0, 0]})
+    )
+    ground = {"body": 0, "local": [0, 0, 0], "target": [0, 0, 1]}
+    assert "there is no body 0: they are numbered from 1" in refusal(http.post("/api/push", json=ground))
+    infinite = f'{{"body": {trunk["id"]}, "local": [0, 0, 0], "target": [1e999, 0, 0]}}'
+    assert "$.target[0]" in refusal(http.post("/api/push", content=infinite))
+
+
+def test_in_puppet_mode_the_mouse_moves_a_robot_that_is_free(http: TestClient) -> None:
+    assert http.post("/api/ops/set_mode", json={"mode": "puppet"}).status_code == 200
+    before = http.get("/api/bodies").json()["bodies"]
+    trunk = next(one for one in before if one["robot"] == "quadruped")
+    there = [trunk["position"][0] + 0.5, trunk["position"][1], trunk["position"][2] + 1.0]
+    push = {"body": trunk["id"], "local": [0, 0, 0], "target": there}
+    assert http.post("/api/push", json=push).status_code == 200
+    assert http.get(f"/api/bodies/{trunk['id']}").json()["position"] == pytest.approx(there, abs=1e-3)
+
+
+def recording(folder: Path, name: str, robots: dict[str, int]) -> None:
+    """Write a recording of some robots, each with some joint positions, a second long."""
+    folder.mkdir(exist_ok=True)
+    samples = ({key: Robot([0.0] * size) for key, size in robots.items()} for _ in range(100))
+    write_recording(folder / name, ((robot, {}) for robot in samples))
+
+
+def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:
+    size = len(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"])
+    folder = tmp_path / "recordings"
+    recording(folder, "own.mcap", {"quadruped": size})
+    recording(folder, "other.mcap", {"humanoid": size})
+    recording(folder, "smaller.mcap", {"quadruped": size - 1})
+    recording(folder, "nobody.mcap", {})
+    assert "no states of robots" in refusal(http.post("/api/replay", json={"name": "nobody.mcap"}))
+    for other in ("other.mcap", "smaller.mcap"):
+        said = refusal(http.post("/api/replay", json={"name": other}))
+        assert said == f"{other} is a recording of other robots than the current ones (quadruped)."
+    assert "is converted to csv, mp4, npz, not 'gif'" in refusal(http.get("/api/recordings/own.mcap?as=gif"))
+    assert "must end in .mcap or .json" in refusal(http.put("/api/recordings/own.txt", content=b""))
+    content = (folder / "own.mcap").read_bytes()
+    assert "there is a recording 'own.mcap' already" in refusal(http.put("/api/recordings/own.mcap", content=content))
+    assert not list(folder.glob("*.part"))
+
+    assert "no recording is replayed" in refusal(http.get("/api/replay/states?seconds=1"))
+    assert http.post("/api/replay", json={"name": "own.mcap", "playing": False}).status_code == 200
+    for rate in (0.01, 50):
+        assert f"the pace must be from 0.05 to 20, not {rate}" in refusal(http.post("/api/replay", json={"rate": rate}))
+    trunk = next(one for one in http.get("/api/bodies").json()["bodies"] if one["robot"])
+    push = {"body": trunk["id"], "local": [0, 0, 0], "target": [0, 0, 1]}
+    assert "Go back to live to push" in refusal(http.post("/api/push", json=push))
+    assert http.delete("/api/replay").status_code == 200
+
+
+def test_curves_and_arrays_of_a_recording_are_files(http: TestClient, tmp_path: Path) -> None:
+    size = len(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"])
+    recording(tmp_path / "recordings", "own.mcap", {"quadruped": size})
+    (tmp_path / "own.npz").write_bytes(http.get("/api/recordings/own.mcap?as=npz").content)
+    with np.load(tmp_path / "own.npz") as arrays:
+        assert arrays["quadruped/qpos"].shape[1] == size
+    assert not [one.name for one in (tmp_path / "recordings").iterdir() if one.name != "own.mcap"]
+
+
+def test_an_outcome_needs_a_recording(http: TestClient) -> None:
+    said = refusal(http.post("/api/recording/outcome", json={"outcome": "success"}))
+    assert "no recording runs" in said
+    assert "no recording runs" in refusal(http.delete("/api/recording"))
