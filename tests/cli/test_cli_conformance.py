@@ -76,3 +76,27 @@ def test_what_cannot_be_tried(capsys: pytest.CaptureFixture[str]) -> None:
     assert "connection refused" in capsys.readouterr().err
     assert main(["conformance", "--statement", "Beta 320"]) == 2
     assert "'Beta 320' is not a statement. Did you mean" in capsys.readouterr().err
+
+
+def test_play_is_measured(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", address, "--play", "--statement", "32", "--json", "-"]) == 0
+    measured = json.loads(capsys.readouterr().out)["measurements"]
+    assert set(measured["steps_per_second"]) == {"1", "10", "100"}
+    assert min(measured["steps_per_second"].values()) > 0
+    live = measured["live"]
+    assert live["snapshots_per_second"] > 0
+    assert live["gap_ms"]["median"] <= live["gap_ms"]["max"]
+    assert live["real_time_factor"] > 0
+    (picture,) = measured["pictures"].values()
+    assert picture["step_to_picture_ms"]["count"] == 5
+    assert picture["per_second"] > 0
+    trips = measured["round_trip_ms"]["step"]
+    assert trips["min"] <= trips["median"] <= trips["max"]
+
+
+def test_a_server_of_its_own_is_checked_with_a_folder_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--author", "--only", "import", "--no-measurements", "--json", "-"]
+    assert main(["conformance", "sim://arm?dialect=beta", *options]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert {row["verdict"] for row in report["statements"]} == {"holds", "not_tried"}
+    assert next(row for row in report["statements"] if row["id"] == "Editor 3.1 import_xml")["verdict"] == "holds"
