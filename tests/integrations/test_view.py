@@ -8,8 +8,10 @@ import contextlib
 import importlib
 import io
 import json
+import sys
 import threading
 import time
+import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -234,6 +236,64 @@ def test_a_window_without_a_display_says_what_is_missing(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(urlab_client.URLabError, match="no display: neither DISPLAY"), window_view(client):
         pass
+
+
+class Window:
+    """What `mujoco.viewer.launch_passive` returns, without a screen."""
+
+    def __init__(self, model: Any, data: Any, **_: Any) -> None:
+        self.model, self.data, self.open = model, data, True
+        self.shown: list[tuple[float, list[float]]] = []
+
+    def is_running(self) -> bool:
+        return self.open
+
+    def lock(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def sync(self) -> None:
+        self.shown.append((self.data.time, self.data.qpos.tolist()))
+
+    def close(self) -> None:
+        self.open = False
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> list[Window]:
+    made: list[Window] = []
+
+    def launch(*arguments: Any, **options: Any) -> Window:
+        made.append(Window(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setitem(sys.modules, "mujoco.viewer", types.SimpleNamespace(launch_passive=launch))  # type: ignore[arg-type]
+    return made
+
+
+def test_a_window_shows_what_is_stepped_and_is_closed_at_the_end(
+    client: urlab_client.URLabClient, windows: list[Window]
+) -> None:
+    with window_view(client) as view:
+        client.articulations["arm"].set_ctrl({"elbow": 0.5})
+        client.step(n_steps=200)
+        qpos, now = client.data.qpos.tolist(), client.sim_time
+    (window,) = windows
+    assert view.error is None
+    assert window.shown[-1] == (pytest.approx(now), pytest.approx(qpos))
+    assert not window.open
+
+
+def test_a_view_ends_when_its_window_is_closed(client: urlab_client.URLabClient, windows: list[Window]) -> None:
+    with window_view(client) as view:
+        client.step()
+        eventually(lambda: bool(windows and windows[0].shown))
+        windows[0].open = False
+        eventually(lambda: view.closed)
+        before = len(windows[0].shown)
+        client.step(n_steps=5)
+    assert view.error is None
+    assert len(windows[0].shown) == before
 
 
 def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path: Path) -> None:

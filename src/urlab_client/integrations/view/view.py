@@ -250,7 +250,7 @@ class AsyncView:
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
                 log.warning("%s: closing the view failed: %s", self._name, error)
-        self._gone.set()
+            self._gone.set()
 
     def _fail(self, error: URLabError) -> None:
         self._error = error
