@@ -362,6 +362,19 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
         (HEAD | {"actors": [BOX | {"mesh": {"shape": "file"}}]}, "'file'"),
         (HEAD | {"actors": [BOX | {"mesh": {"shape": "plane", "size": [1, 1]}, "quick_convert": {}}]}, "static"),
         (HEAD | {"actors": [{"name": "m", "kind": "manager", "quick_convert": {}}]}, "only a static mesh"),
+        (HEAD | {"actors": [{"name": "m", "kind": "manager", "controller": "pd"}]}, "only an articulation can have a"),
+        (
+            HEAD | {"actors": [BOX | {"mesh": {"shape": "file", "file": "/etc/hostname"}}]},
+            "mesh /etc/hostname lies outside the folders that clients may read",
+        ),
+        (
+            HEAD
+            | {
+                "blueprints": {"robot": {"source": "robot.xml", "record": "/etc/hostname"}},
+                "actors": [{"name": "r", "kind": "articulation", "blueprint": "robot"}],
+            },
+            "blueprint 'robot': /etc/hostname lies outside the folders that clients may read",
+        ),
     ],
 )
 def test_a_level_that_makes_no_sense_is_refused_with_the_place(workspace: Workspace, level: object, text: str) -> None:
@@ -372,6 +385,39 @@ def test_a_level_that_makes_no_sense_is_refused_with_the_place(workspace: Worksp
     assert refused.code == "load_level_failed"
     assert text in refused.message
     assert workspace.world.levels.package == "/Game/Levels/lab"
+
+
+def stands(blueprint: str, source: str, **more: Any) -> dict[str, Any]:
+    """A level with one robot, and where it comes from."""
+    robot = {"name": "r", "kind": "articulation", "blueprint": blueprint}
+    return HEAD | {"blueprints": {blueprint: {"source": source, **more}}, "actors": [robot]}
+
+
+def test_the_model_of_a_level_must_be_the_one_it_names(
+    workspace: Workspace, world: EditorWorld, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = workspace.saved / "Levels" / "hand.json"
+    (file.parent / "bot.xml").write_text(BOT)
+    for level, said in (
+        (stands("robot", "bot.xml"), "blueprint 'robot' comes from bot.xml, which makes one called 'bot'"),
+        (stands("robot", "missing.xml"), "missing.xml"),
+    ):
+        file.write_text(json.dumps(level))
+        assert said in refusal(world.levels.load_file, file).message
+        assert "lies outside the folders" in refusal(world.levels.load, "hand").message  # which a client names
+    file.write_text(json.dumps(stands("bot", "bot.xml", digest="of another day")))
+    world.levels.load_file(file)
+    assert "bot.xml has changed since the level was saved; the new model is used" in caplog.text
+
+
+def test_a_model_that_is_imported_stands_in_for_one_that_is_gone(
+    workspace: Workspace, bot: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = workspace.saved / "Levels" / "hand.json"
+    file.write_text(json.dumps(stands("bot", "missing.xml", digest="of another day", record="gone.json")))
+    workspace.world.levels.load_file(file)
+    assert names(list(workspace.world.actors)) == ["r"]
+    assert "the imported 'bot' differs from the level's, which cannot be read" in caplog.text
 
 
 def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
