@@ -186,12 +186,15 @@ class _Session:
         paced: bool,
     ) -> None:
         model = client.model
-        if model is None or client.step_mode is not StepMode.DIRECT:
+        if model is None:
             raise URLabError(
-                f"Teleoperation steps physics itself, but the step mode is {client.step_mode}."
-                if model is not None
-                else "Teleoperation needs the local model, which this client does not have.",
-                hint="Make the client with step_mode='direct', and call discover() during play.",
+                "Teleoperation needs the local model, which this client does not have.",
+                hint="Make the client with local_model=True and call discover() during play.",
+            )
+        if client.step_mode is not StepMode.DIRECT:
+            raise URLabError(
+                f"Teleoperation steps physics itself, but the step mode is {client.step_mode}.",
+                hint="Make the client with step_mode='direct'.",
             )
         timestep = float(model.opt.timestep)
         if not 0 < hz <= 1.0 / timestep * (1.0 + 1e-9):
