@@ -661,6 +661,7 @@ async def test_json_end_to_end(plugin: Any, scripted: Any, connect: Any) -> None
     scripted.on("meta", as_json(lambda _: meta))
     async with connect(encoding="json") as client:
         await client.discover()
+        assert scripted.request("hello")["encoding"] == "json"
         await client.step(5)
         assert client.model is not None
         assert client.articulations["robot"].root_pos_w[2] < 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -76,6 +77,29 @@ async def test_a_recorded_session_is_replayed(generation: str, tmp_path: Path) -
         again = await program(replay.port, replay.state_port)
         assert replay.unknown == {}
     assert all(map(np.array_equal, live, again))
+
+
+async def test_a_client_of_a_replay_is_sent_to_its_ports(tmp_path: Path) -> None:
+    """The recorded server's own would lead past it."""
+    import zmq
+
+    with recorded(tmp_path, "beta") as relay:
+        await program(relay.port, relay.state_port)
+    session = read_session(tmp_path / "session.mcap")
+    hello = next(row for row in session if row.op == "hello")
+    recorded_ports = set(re.findall(rb"tcp://[^:]+:(\d+)", hello.reply))
+    with Replay(session, Ports("127.0.0.1", None)) as replay, zmq.Context() as context:
+        socket = context.socket(zmq.REQ)
+        socket.linger, socket.rcvtimeo = 0, 30_000
+        socket.connect(f"tcp://127.0.0.1:{replay.port}")
+        socket.send(hello.request)
+        reply = socket.recv()
+        socket.close()
+        told = msgspec.msgpack.decode(reply)
+        ports = set(re.findall(rb"tcp://[^:]+:(\d+)", reply))
+    assert ports
+    assert not ports & recorded_ports
+    assert not told.keys() & {"shm_session_dir", "shm_rpc"}
 
 
 async def test_the_session_in_the_repository_is_replayed() -> None:

@@ -158,3 +158,12 @@ def test_the_oldest_gives_way(caplog: pytest.LogCaptureFixture) -> None:
         drawings.add([line] * Limits.markers, ttl=-1.0, in_play=False)
     assert drawings.take_frame(in_play=False) == [line] * Limits.markers
     assert "clear_markers" in caplog.text
+
+
+@pytest.mark.parametrize("op", ["create_level", "load_level"])
+def test_another_level_has_no_drawings_of_the_one_before(wire: Wire, op: str) -> None:
+    name = f"next_{op}"
+    wire.ask("create_level", name=name, force_overwrite=True)
+    wire.ask("draw_marker", **VALID["draw_marker"], ttl=-1)
+    wire.ask(op, **({"name": name, "force_overwrite": True} if op == "create_level" else {"level_path": name}))
+    assert wire.core.drawings.take_frame(in_play=False) == []
