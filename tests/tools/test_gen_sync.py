@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+import gen_ops
 import gen_sync
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.errors import ClientClosed
@@ -420,8 +421,9 @@ class TestResult:
             gc.enable()
 
 
-def test_the_checked_in_facade_is_current(capsys: pytest.CaptureFixture[str]) -> None:
-    assert gen_sync.main(["--check"]) == 0, capsys.readouterr().err
+@pytest.mark.parametrize("generator", [gen_ops, gen_sync])
+def test_what_is_checked_in_is_current(generator: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generator.main(["--check"]) == 0, capsys.readouterr().err
 
 
 def test_the_base_class_that_the_facade_does_without_has_nothing_public() -> None:
