@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -143,3 +143,23 @@ def test_an_outcome_needs_a_recording(http: TestClient) -> None:
     said = refusal(http.post("/api/recording/outcome", json={"outcome": "success"}))
     assert "no recording runs" in said
     assert "no recording runs" in refusal(http.delete("/api/recording"))
+
+
+def test_the_pace_of_the_simulation_is_shown(http: TestClient) -> None:
+    """Simulation time per real time, over about a second; 0 while it stands still."""
+    http.post("/api/ops/set_mode", json={"mode": "live"})
+    http.post("/api/ops/set_sim_speed", json={"percent": 50})
+    with http.websocket_connect("ws://localhost/api/live") as live:
+
+        def told(wanted: Callable[[dict[str, Any]], bool]) -> None:
+            while True:
+                message = live.receive_json()
+                if message["type"] == "state":
+                    live.send_json({"type": "ack"})
+                if message["type"] == "status" and wanted(message):
+                    return
+
+        http.post("/api/run", json={"running": True})
+        told(lambda status: status["moving"] and 0.3 < status["rate"] < 0.7)
+        http.post("/api/run", json={"running": False})
+        told(lambda status: not status["moving"] and status["rate"] == 0.0)
