@@ -562,7 +562,7 @@ def test_what_a_file_declares_has_limits(kind: str, tmp_path: Path, monkeypatch:
         *((index, "_DECLARED_BYTES"), (index, "_MOST_WALKED"), (reader, "_MESSAGE_BYTES"), (reader, "_KEPT_BYTES")),
         *((reader, "_MOST_VALUES"), (reader, "_VALUES_PER_BYTE"), (reader, "_NAMES_CHARS")),
         *((joint_states, "_MOST_VALUES"), (recording, "_READ_BYTES")),
-        (recording, "_VALUE_CHARS"),
+        (recording, "_FRAME_BYTES"),
     ):
         monkeypatch.setattr(module, limit, getattr(module, limit) // (5000 if limit == "_MOST_WALKED" else 128))
     make, use, said = OVERSIZED[kind]

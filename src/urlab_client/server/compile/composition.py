@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -145,7 +146,7 @@ def add_static_mesh(spec: mujoco.MjSpec, actor: Actor, mesh: Mesh) -> tuple[str,
     if not convert.static and not convert.driven_by_unreal:
         joint = f"{actor.name}FreeJoint"
         body.add_freejoint(name=joint)
-    name = unique_name("Geom_0_0", {geom.name for geom in spec.geoms}, separator="_")
+    name = unique_name("Geom_0_0", {geom.name for geom in spec.geoms})
     settings = {"solref": [0.02, 1.0], "solimp": [0.9, 0.95, 0.001, 0.5, 2.0], "friction": convert.friction}
     if convert.complex_mesh and mesh.shape == "file":
         _add_parts(spec, body, actor, mesh, convert.coacd_threshold, name=name, **settings)
@@ -158,7 +159,7 @@ def _add_parts(
     spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, threshold: float, *, name: str, **settings: Any
 ) -> None:
     for vertices, faces in convex_parts(Path(mesh.file), threshold):
-        part = unique_name(name, {geom.name for geom in spec.geoms}, separator="_")
+        part = unique_name(name, {geom.name for geom in spec.geoms})
         asset = spec.add_mesh(
             name=f"{actor.prefix}{part}",
             uservert=vertices.ravel().tolist(),
@@ -192,14 +193,10 @@ def add_mesh(spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, *, name: 
     body.add_geom(name=name, rgba=mesh.rgba, **settings)
 
 
-def unique_name(name: str, taken: set[str], *, separator: str = "") -> str:
+def unique_name(name: str, taken: set[str]) -> str:
     """Return `name`, or its first numbered variant that is free."""
-    stem, dot, suffix = name.partition(".")
-    candidate, count = name, 0
-    while candidate in taken:
-        count += 1
-        candidate = f"{stem}{separator or '_'}{count}{dot}{suffix}"
-    return candidate
+    candidates = itertools.chain([name], (f"{name}_{count}" for count in itertools.count(1)))
+    return next(candidate for candidate in candidates if candidate not in taken)
 
 
 Floats = NDArray[np.float64]
