@@ -539,14 +539,14 @@ OVERSIZED: dict[str, tuple[Callable[[Path], Any], Callable[[Run], Any], str]] = 
     ),
     "joints": (lambda path: path.write_bytes(JOINTS), lambda run: run.table(), "bytes of memory"),
     "a frame of joints": (
-        lambda path: path.write_bytes(b'{"Frames": [[' + b"{}," * MIB + b"{}]]}"),
+        lambda path: path.write_bytes(b'{"Frames": [[' + b"[]," * MIB + b"[]]]}"),
         lambda run: run.table(),
-        "the value at character 12 is damaged, or has 16384 characters or more",
+        "a frame has more than 16384 bytes",
     ),
     "beside joints": (
         lambda path: path.write_bytes(b'{"Frames": [], "more": [' + b"{}," * MIB + b"{}]}"),
         lambda run: run.table(),
-        "the value at character 23 is damaged, or has 16384 characters or more",
+        "its frames take more than 8388608 bytes of memory",
     ),
     "missing joints": (
         lambda path: path.write_bytes(WIDE),
