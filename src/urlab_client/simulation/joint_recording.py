@@ -5,6 +5,7 @@ For the `recording` and `replay` handlers. The file format is the plugin's; play
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import logging
@@ -187,7 +188,7 @@ def decode_json(content: bytes) -> list[Frame]:
             memory than it may take: 16 times its size, at least 64 MiB and at most 1 GiB.
     """
     made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
-    text = _text(content).encode()
+    text = _utf8(content)
     most = min(_READ_BYTES, max(_SMALL_BYTES, _BYTES_PER_BYTE * len(content)))
     if text.count(b"{") * _RAW_BYTES > most:  # before even the frames' places in the text need that much
         raise ValueError(_TOO_MANY.format(most))
@@ -220,10 +221,11 @@ def _kept(frames: Iterable[Frame], most: int) -> list[Frame]:
     return kept
 
 
-def _text(content: bytes) -> str:
-    """Decode a text file: Unreal writes UTF-16 with a mark as soon as a name is not ASCII."""
-    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    return content.decode("utf-16" if wide else "utf-8-sig")
+def _utf8(content: bytes) -> bytes:
+    """Return a text file in UTF-8: Unreal writes UTF-16 with a mark as soon as a name is not ASCII."""
+    if content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return content.decode("utf-16").encode()
+    return content.removeprefix(codecs.BOM_UTF8)
 
 
 def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...], JointLayout]) -> Frame:
@@ -276,7 +278,7 @@ def decode_csv(content: bytes) -> list[Frame]:
         ValueError: It has no header, or a cell is not a number.
     """
     try:
-        return _kept(_from_table(row for row in csv.reader(io.StringIO(_text(content))) if row), _READ_BYTES)
+        return _kept(_from_table(row for row in csv.reader(io.StringIO(_utf8(content).decode())) if row), _READ_BYTES)
     except csv.Error as error:
         raise ValueError(f"it is not a table: {error}") from None
 
