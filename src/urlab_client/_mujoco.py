@@ -412,12 +412,24 @@ def mujoco_version() -> str:
     return mujoco.mj_versionString()
 
 
-def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
-    """Copy all options of another model; before 3.10 they must be copied one by one."""
-    for name in dir(options):
-        value = getattr(options, name)
-        if not name.startswith("_") and not callable(value):
-            setattr(model.opt, name, value)
+def saved_model(model: mujoco.MjModel) -> bytes:
+    """Return a model in MuJoCo's binary format."""
+    import mujoco
+
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def option_names(options: Any) -> list[str]:
+    """Return the names of the options of a model or spec."""
+    return [name for name in dir(options) if not name.startswith("_") and not callable(getattr(options, name))]
+
+
+def copy_options(source: Any, target: Any) -> None:
+    """Copy all options of a model or spec to another; before 3.10 they must be copied one by one."""
+    for name in option_names(source):
+        setattr(target, name, getattr(source, name))
 
 
 def batch_class() -> Any:

@@ -13,12 +13,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import MODEL_FILE, compiled_file, merge_assets
+from urlab_client._mujoco import MODEL_FILE, compiled_file, copy_options, merge_assets
 from urlab_client.server.assets.actors import Actor, Mesh
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.decomposition import convex_parts
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
+from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, ignored_options
 from urlab_client.server.refusal import CompileFailed
 from urlab_client.values.rotation import Vec3, rotate, wxyz
 

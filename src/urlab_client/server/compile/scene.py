@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import flat_model
+from urlab_client._mujoco import copy_options, flat_model, saved_model
 from urlab_client.server.assets.actors import Actor, scene_problem
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.importer import mujoco_messages, one_line
@@ -31,7 +31,7 @@ from urlab_client.server.compile.composition import (
     empty_scene,
     populate,
 )
-from urlab_client.server.compile.mjcf_options import OptionPolicy, copy_options
+from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.limits import Limits, options_problem
 from urlab_client.server.refusal import CompileFailed
@@ -157,13 +157,6 @@ class CompiledScene:
     def _flat(self) -> tuple[str, dict[str, bytes]]:
         with mujoco_messages():
             return flat_model(self.spec, compiled=True)
-
-
-def saved_model(model: mujoco.MjModel) -> bytes:
-    """Return a model in MuJoCo's binary format."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
 
 
 def compile_scene(
