@@ -277,7 +277,7 @@ class ContentRoot:
         try:
             written = write_snapshot(file, snapshot)
             folder, is_new = _put_in_place(snapshot, home)
-            return compile_snapshot(written, file, folder, self.limits)[0], folder, is_new
+            return compile_snapshot(*written, file, folder, self.limits)[0], folder, is_new
         except BaseException as error:
             if is_new:
                 shutil.rmtree(folder, ignore_errors=True)
