@@ -42,6 +42,26 @@ def spans(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -
     return first + np.arange(lengths.sum(), dtype=np.intp)
 
 
+_NAME_ADDRESSES = {
+    "body": "name_bodyadr",
+    "joint": "name_jntadr",
+    "actuator": "name_actuatoradr",
+    "sensor": "name_sensoradr",
+    "geom": "name_geomadr",
+    "site": "name_siteadr",
+    "camera": "name_camadr",
+    "light": "name_lightadr",
+    "key": "name_keyadr",
+}
+
+
+def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Return the compiled names of all elements of a kind, in id order; those without a name are empty."""
+    pool = model.names
+    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
+    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
+
+
 # Since 3.11 an actuator may have several controls and forces; before, `nu` counted both actuators and controls.
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from urlab_client._mujoco import forget_last_document, saved_model, without_newer_attributes
+from urlab_client._mujoco import forget_last_document, model_names, saved_model, without_newer_attributes
 from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
@@ -33,22 +33,6 @@ _CHOICES = {
 }
 _HEADER_BYTES = 20  # five 32-bit integers
 _NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
-_NAME_ADDRESSES = {
-    "body": "name_bodyadr",
-    "joint": "name_jntadr",
-    "actuator": "name_actuatoradr",
-    "sensor": "name_sensoradr",
-    "geom": "name_geomadr",
-    "site": "name_siteadr",
-    "key": "name_keyadr",
-}
-
-
-def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the compiled names of all bodies, joints, actuators, sensors, geoms, sites or keys, in id order."""
-    pool = model.names
-    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
-    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
 
 
 @cache
