@@ -91,7 +91,7 @@ def flatten_upload(argument: bytes) -> bytes:
         file = file.rename(_CONTENT / file.name)
     try:
         refuse_outside(file, _CONTENT)
-        return msgspec.msgpack.encode(flatten(file))
+        return msgspec.msgpack.encode(flatten(file, scratch=Path.cwd()))
     except ValueError as error:
         said = str(error).removeprefix("upload_model: ").replace(f"{_CONTENT.as_posix()}/", "")
         raise ValueError(said) from None
