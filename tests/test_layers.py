@@ -29,7 +29,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_installation": frozenset(),
     "aio": VALUES | {"_installation", "events", "_mujoco", "_platform", "_sandbox", "keys", "protocol"},
     "sync": VALUES | {"aio", "events", "protocol", "types"},
-    "randomise": VALUES | {"protocol"},
+    "randomise": VALUES | {"_mujoco", "protocol"},
     "simulation": VALUES | {"_mujoco", "_platform", "protocol", "randomise"},
     "server": VALUES
     | {"_installation", "_mujoco", "_platform", "_sandbox", "keys", "protocol", "randomise", "simulation"},

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
@@ -95,7 +94,7 @@ def test_a_scene_is_exported_with_the_files_of_all_its_robots(robot: Path, tmp_p
     _mujoco.merge_assets(scene, robots)
     model = scene.compile()
 
-    xml, files = _mujoco.export_model(scene)
+    xml, files = _mujoco.flat_model(scene, compiled=True)
 
     again = mujoco.MjModel.from_xml_string(xml, files)
     np.testing.assert_allclose(again.mesh_vert, model.mesh_vert, atol=1e-6)
@@ -243,11 +242,11 @@ def test_the_oldest_release_knows_all_that_a_server_writes(dialect: DialectName,
     assert_same_actuators(model, mujoco.MjModel.from_xml_path(str(servos)), copies=2)
 
 
-@pytest.mark.parametrize("write", [_mujoco.export_model, _mujoco.flat_model])
-def test_the_oldest_release_knows_all_that_is_sent(servos: Path, write: Callable[..., tuple[str, Any]]) -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_oldest_release_knows_all_that_is_sent(servos: Path, compiled: bool) -> None:
     spec = mujoco.MjSpec.from_file(str(servos))
     spec.compile()
-    xml, files = write(spec)
+    xml, files = _mujoco.flat_model(spec, compiled=compiled)
     assert newer({"document": xml}) == set()
     assert_same_actuators(mujoco.MjModel.from_xml_string(xml, files), mujoco.MjModel.from_xml_path(str(servos)))
 
@@ -282,32 +281,29 @@ def test_one_module_alone_uses_what_older_releases_lack() -> None:
 
 
 @pytest.mark.mujoco("3.16")
-def test_files_are_copied_to_where_an_archive_would_have_them(tmp_path: Path) -> None:
-    for part, names in {"meshes": ["a.obj", "b/a.obj", "one.obj", "B.OBJ"], "pictures": ["t.png", "side.png"]}.items():
-        for number, name in enumerate(names):
-            file = tmp_path / "robot" / part / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(PNG) if name.endswith("png") else file.write_text(OBJ.format(0.1 + number))
-    (tmp_path / "elsewhere.obj").write_text(OBJ.format(0.7))
+@pytest.mark.parametrize("compiled", [False, True])
+def test_parts_that_are_attached_bring_their_own_files(tmp_path: Path, compiled: bool) -> None:
+    for folder, size in (("robot/meshes", 0.1), ("robot/hand/meshes", 0.9)):  # of one name, with different content
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a&b.obj").write_text(OBJ.format(size))
+        (tmp_path / folder / "side.png").write_bytes(PNG)
     sides = " ".join(f'file{side}="side.png"' for side in ("right", "left", "up", "down", "front", "back"))
-    (tmp_path / "robot" / "robot.xml").write_text(
-        '<mujoco><compiler meshdir="meshes" texturedir="pictures"/><asset>'
-        '<mesh file="a.obj"/><mesh name="deeper" file="b/a.obj"/><mesh file="one.obj"/>'
-        '<mesh name="again" file="one.obj"/>'
-        f'<mesh file="B.OBJ"/><mesh file="{tmp_path}/elsewhere.obj"/>'
-        f'<texture name="t" type="2d" file="t.png"/><texture name="c" type="cube" {sides}/></asset>'
-        "<worldbody><geom type='mesh' mesh='a'/></worldbody></mujoco>"
+    assets = (
+        '<compiler meshdir="meshes" texturedir="meshes"/><asset><mesh name="m" file="a&amp;b.obj"/>'
+        f'<texture name="c" type="cube" {sides}/>{{}}</asset>'
     )
-    spec = mujoco.MjSpec.from_file(str(tmp_path / "robot" / "robot.xml"))
-    spec.compiler.savecompiled = False
-    spec.encode(str(tmp_path / "robot.mjz"))
-    shutil.unpack_archive(tmp_path / "robot.mjz", tmp_path / "unpacked", "zip")
+    body = '<worldbody><body name="b"><geom type="mesh" mesh="m"/>{}</body></worldbody>'
+    (tmp_path / "robot" / "hand" / "hand.xml").write_text(f"<mujoco>{assets.format('')}{body.format('')}</mujoco>")
+    hand = '<model name="hand" file="hand/hand.xml"/>'
+    attached = '<attach model="hand" body="b" prefix="hand_"/>'
+    robot = tmp_path / "robot" / "robot.xml"
+    robot.write_text(f"<mujoco>{assets.format(hand)}{body.format(attached)}</mujoco>")
+    spec = mujoco.MjSpec.from_file(str(robot))
+    original = spec.compile()
 
-    _mujoco.write_model(spec, tmp_path / "copied")
+    xml, files = _mujoco.flat_model(spec, compiled=compiled)
 
-    def content(folder: Path) -> dict[Path, bytes]:
-        return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
-
-    assert content(tmp_path / "copied") == content(tmp_path / "unpacked")
-    plain = {Path(file) for file in _mujoco._plain_files(spec)}  # MuJoCo may spell an absolute path in its own way
-    assert plain == {*map(Path, ("one.obj", "B.OBJ", "t.png", "side.png")), tmp_path / "elsewhere.obj"}
+    again = mujoco.MjModel.from_xml_string(xml, files)
+    np.testing.assert_allclose(again.mesh_vert, original.mesh_vert, atol=1e-6)
+    assert again.ntex == 2
+    assert sorted(name.partition("-")[2] for name in files) == ["a_b.obj", "a_b_0.obj", "side.png", "side_0.png"]

@@ -13,9 +13,7 @@ import errno
 import hashlib
 import importlib
 import re
-import shutil
 import tempfile
-import uuid
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
@@ -31,8 +29,6 @@ T = TypeVar("T")
 Indices = NDArray[np.int32]
 
 MODEL_FILE = "model.xml"
-_ARCHIVE = "model.mjz"  # its stem is the name of the model inside
-_MARK_BYTES = 64  # larger than any placeholder
 
 
 QPOS_WIDTH = np.array([7, 4, 1, 1])  # by mjtJoint: free, ball, slide, hinge
@@ -44,6 +40,26 @@ def spans(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -
     lengths = lengths.astype(np.intp)
     first = np.repeat(starts.astype(np.intp) - (np.cumsum(lengths) - lengths), lengths)
     return first + np.arange(lengths.sum(), dtype=np.intp)
+
+
+_NAME_ADDRESSES = {
+    "body": "name_bodyadr",
+    "joint": "name_jntadr",
+    "actuator": "name_actuatoradr",
+    "sensor": "name_sensoradr",
+    "geom": "name_geomadr",
+    "site": "name_siteadr",
+    "camera": "name_camadr",
+    "light": "name_lightadr",
+    "key": "name_keyadr",
+}
+
+
+def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Return the compiled names of all elements of a kind, in id order; those without a name are empty."""
+    pool = model.names
+    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
+    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
 
 
 # Since 3.11 an actuator may have several controls and forces; before, `nu` counted both actuators and controls.
@@ -193,44 +209,38 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
         ValueError: One of its files is not where this MuJoCo searches for it; see `check_copy`.
         OSError: The disk is full.
     """
-    compiler: Any = spec.compiler
-    if _writes_archives(spec):
-        compiler.savecompiled = False
-        if not _write_without_packing(spec, folder):
-            # Beside the folder, because a confined process cannot write elsewhere.
-            with _archive(spec, folder.with_name(_ARCHIVE)) as content:
-                content.extractall(folder)
-        document = folder / MODEL_FILE
-        document.write_bytes(_for_older_releases(spec, document.read_bytes()))
-        return
-    spec.to_xml()  # raises if it cannot be written, before anything is changed
-    text, files = _written_by_hand(spec)
+    text, files = flat_model(spec, scratch=folder.parent)
     folder.mkdir(parents=True)
     for name, data in files.items():
         (folder / name).write_bytes(data)
     (folder / MODEL_FILE).write_text(text, "utf-8")
 
 
-def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Return a compiled spec as MJCF, and the contents of the files that it names, by those names."""
-    if not _writes_archives(spec):
-        return _written_by_hand(spec.copy())
-    with tempfile.TemporaryDirectory() as folder, _archive(spec, Path(folder, _ARCHIVE)) as content:
-        files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-    return _for_older_releases(spec, files.pop(MODEL_FILE)).decode(), files
+def flat_model(
+    spec: mujoco.MjSpec, *, compiled: bool = False, scratch: Path | None = None
+) -> tuple[str, dict[str, bytes]]:
+    """Return a spec as MJCF whose files all have bare names, and their contents by those names.
 
-
-def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Return a compiled spec as MJCF whose files all have bare names, and their contents by those names.
+    Args:
+        compiled: Whether the numbers are those of the compiled model; before 3.16 they always are.
+        scratch: Folder in which files may be written meanwhile; None for the system's temporary one.
 
     Raises:
+        mujoco.FatalError: The spec must be compiled first, as always if it has attached parts.
         ValueError: One of its files is not where this MuJoCo searches for it; see `check_copy`.
     """
     copied = spec.copy()
-    compiler: Any = copied.compiler
-    if _writes_archives(copied):
-        compiler.savecompiled = False
-    return _written_by_hand(copied)
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        if _writes_archives(copied):
+            compiler: Any = copied.compiler
+            compiler.savecompiled = compiled
+            assets: list[Any] = [*copied.meshes, *copied.hfields, *copied.textures, *copied.skins]
+            if copied.strippath or any(asset.compiler is not compiler for asset in assets):
+                copied = _gathered(copied, Path(folder))
+        else:
+            copied.to_xml()  # raises if it cannot be written, before its files are read
+        files = _give_bare_names(copied)
+        return _for_older_releases(spec, _text(copied, files, Path(folder))), files
 
 
 def _writes_archives(spec: mujoco.MjSpec) -> bool:
@@ -238,65 +248,21 @@ def _writes_archives(spec: mujoco.MjSpec) -> bool:
     return hasattr(spec.compiler, "savecompiled")
 
 
-def _write_without_packing(spec: mujoco.MjSpec, folder: Path) -> bool:
-    """Write the content of a spec's archive without packing its files, which takes as long as compiling them.
-
-    A placeholder in MuJoCo's virtual file system marks each file, which is copied to the place of the placeholder in
-    the archive.
-
-    Returns:
-        False if a file is ambiguous or anything fails; then nothing is written.
-    """
+def _gathered(spec: mujoco.MjSpec, folder: Path) -> mujoco.MjSpec:
+    """Return a spec with all its files in a folder, also those of attached parts, whose places only MuJoCo knows."""
     import mujoco
 
-    sources = _plain_files(spec)
-    mark = uuid.uuid4().hex
-    marks = {f"{mark}{number}".encode(): source for number, source in enumerate(sources.values())}
-    marked = spec.copy()
-    marked.assets = dict(zip(sources, marks, strict=True))
-    try:
-        with _archive(marked, folder.with_name(_ARCHIVE)) as content:
-            found = {
-                entry: marks[content.read(entry)]
-                for entry in content.infolist()
-                if entry.file_size < _MARK_BYTES and content.read(entry) in marks
-            }
-            if len(found) != len(sources):
-                return False
-            for entry in content.infolist():
-                target = Path(content.extract(entry, folder))
-                if entry in found:
-                    shutil.copyfile(found[entry], target)
-    except (mujoco.FatalError, OSError):
-        shutil.rmtree(folder, ignore_errors=True)
-        return False
-    return True
-
-
-def _plain_files(spec: mujoco.MjSpec) -> dict[str, Path]:
-    """Return the names and paths of a spec's files, except those that are ambiguous."""
-    if spec.strippath or spec.assets:
-        return {}
-    elements = [(asset.file, asset.compiler.meshdir) for asset in (*spec.meshes, *spec.hfields, *spec.skins)]
-    for texture in spec.textures:
-        directory = texture.compiler.texturedir
-        elements += [(texture.file, directory), *((file, directory) for file in texture.cubefiles)]
-    # MuJoCo also finds placeholders by the last part of the path.
-    places: dict[str, set[tuple[str, str]]] = {}
-    for file, directory in elements:
-        if file:
-            places.setdefault(Path(file).name.casefold(), set()).add((file, directory))
-    sources = {
-        file: Path(spec.modelfiledir, directory, file)
-        for alike in places.values()
-        if len(alike) == 1
-        for file, directory in alike
-    }
-    return {file: source for file, source in sources.items() if source.is_file()}
+    with _archive(spec, folder) as content:
+        content.extractall(folder)
+    gathered = mujoco.MjSpec.from_file(str(folder / MODEL_FILE))
+    compiler: Any = gathered.compiler
+    compiler.savecompiled = False  # the numbers are what they should be
+    return gathered
 
 
 @contextlib.contextmanager
-def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
+def _archive(spec: mujoco.MjSpec, folder: Path) -> Generator[zipfile.ZipFile]:
+    path = folder / "model.mjz"  # its stem is the name of the model inside
     spec.encode(str(path))
     try:
         content = zipfile.ZipFile(path)
@@ -304,13 +270,12 @@ def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
         raise OSError(errno.ENOSPC, "MuJoCo could not write the whole file; is the disk full?", str(path)) from None
     with content:
         yield content
-    path.unlink()
 
 
-def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
-    """Give a spec's files unique names, and return the contents that the archive would have."""
+def _give_bare_names(spec: mujoco.MjSpec) -> dict[str, bytes]:
+    """Give the files of a spec names of their own without folders, and return their contents by these."""
     files: dict[str, bytes] = {}
-    compilers: list[Any] = [spec.compiler]  # and those of attached models
+    compilers: list[Any] = [spec.compiler]  # and those of attached parts
 
     def renamed(file: str, directory: str) -> str:
         data = spec.assets.get(file)
@@ -320,7 +285,7 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
             except OSError:
                 raise _unwritable() from None
         digest = hashlib.sha256(data).hexdigest()[:16]
-        name = Path(file).name
+        name = re.sub(r"[^\w.-]", "_", Path(file).name, flags=re.ASCII)  # others MuJoCo changes in an archive
         name = name if name.startswith(digest) else f"{digest}-{name}"
         files[name] = data
         return name
@@ -337,17 +302,25 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
         compilers.append(texture.compiler)
     for compiler in compilers:
         compiler.meshdir = compiler.texturedir = ""
+    return files
+
+
+def _text(spec: mujoco.MjSpec, files: Mapping[str, bytes], folder: Path) -> str:
+    """Return a spec as MJCF, after `_give_bare_names`."""
+    if _writes_archives(spec):
+        spec.assets = dict.fromkeys(files, b"-")  # because packing the files would take as long as compiling them
+        with _archive(spec, folder) as content:
+            return content.read(MODEL_FILE).decode()
+    # The compiler records the content type of files that its cache does not have. Assigning the given type undoes
+    # that: a model is then always written in the same way, so that a server recognises it by its digest.
     spec.assets = {**spec.assets, **files}
-    if not _writes_archives(spec):
-        # The compiler records the content type of files that its cache does not have. Assigning the given type undoes
-        # that: a model is then always written in the same way, so that a server recognises it by its digest.
-        spec.compile()
-        for asset in (*spec.meshes, *spec.hfields, *spec.textures):
-            asset.content_type = str(asset.content_type)
-    return _for_older_releases(spec, spec.to_xml().encode()).decode(), files
+    spec.compile()
+    for asset in (*spec.meshes, *spec.hfields, *spec.textures):
+        asset.content_type = str(asset.content_type)
+    return spec.to_xml()
 
 
-def _for_older_releases(spec: mujoco.MjSpec, text: bytes) -> bytes:
+def _for_older_releases(spec: mujoco.MjSpec, text: str) -> str:
     """Return the MJCF of a spec without the attribute that MuJoCo adds to servos, and that older releases refuse.
 
     From 3.16 on MuJoCo writes a `position` as a `general` with `input="pos"`, and `velocity`, `intvelocity` and
@@ -359,11 +332,11 @@ def _for_older_releases(spec: mujoco.MjSpec, text: bytes) -> bytes:
         for actuator in spec.actuators
     ):
         return text
-    return _INPUT.sub(rb"\1", text)
+    return _INPUT.sub(r"\1", text)
 
 
 _ONE_CONTROL = {"FIXED", "AFFINE"}
-_INPUT = re.compile(rb'(<general\b[^<>]*?) input="[^"]*"')
+_INPUT = re.compile(r'(<general\b[^<>]*?) input="[^"]*"')
 
 
 def check_copy(original: Path, copy: mujoco.MjModel) -> None:
@@ -459,12 +432,24 @@ def mujoco_version() -> str:
     return mujoco.mj_versionString()
 
 
-def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
-    """Copy all options of another model; before 3.10 they must be copied one by one."""
-    for name in dir(options):
-        value = getattr(options, name)
-        if not name.startswith("_") and not callable(value):
-            setattr(model.opt, name, value)
+def saved_model(model: mujoco.MjModel) -> bytes:
+    """Return a model in MuJoCo's binary format."""
+    import mujoco
+
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def option_names(options: Any) -> list[str]:
+    """Return the names of the options of a model or spec."""
+    return [name for name in dir(options) if not name.startswith("_") and not callable(getattr(options, name))]
+
+
+def copy_options(source: Any, target: Any) -> None:
+    """Copy all options of a model or spec to another; before 3.10 they must be copied one by one."""
+    for name in option_names(source):
+        setattr(target, name, getattr(source, name))
 
 
 def batch_class() -> Any:

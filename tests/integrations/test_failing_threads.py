@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import mujoco
+import numpy as np
 import pytest
 from waiting import DEADLINE_S, eventually, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.aio.background import background_thread
 from urlab_client.errors import ConnectionLost, URLabError
 from urlab_client.integrations._feed.follower import Follower
-from urlab_client.integrations.gym import pictures as drawing
 from urlab_client.integrations.gym import vector
 from urlab_client.integrations.record import RecordingError, read_run, record
 from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.view.view import AsyncView, ViewOptions
 from urlab_client.server import SimulatedServer
+from urlab_client.simulation.opengl import RenderingUnavailable
+from urlab_client.simulation.painting import Painter, Visible
 
 
 def die(*_: Any, **__: Any) -> Any:
@@ -117,29 +121,24 @@ async def test_the_tasks_that_feed_a_view(client: URLabClient, monkeypatch: pyte
         await until(lambda: display.closed)  # although the block goes on
 
 
-def test_the_thread_that_draws_for_a_batch(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_thread_that_draws_for_a_batch(caplog: pytest.LogCaptureFixture) -> None:
     begun: Future[None] = Future()
 
-    class Stuck(Future[Any]):
-        def set_running_or_notify_cancel(self) -> bool:
-            begun.result(DEADLINE_S)
-            raise MemoryError("none left")
+    def find_backend() -> None:
+        begun.result(DEADLINE_S)
+        raise SystemExit("enough")
 
-    scene: Any = None
-    thread = drawing._Thread(scene, scene)
-    visible: Any = None
-    monkeypatch.setattr(drawing, "Future", Stuck)
-    thread.submit([], visible)
-    monkeypatch.setattr(drawing, "Future", Future)
-    waiting = thread.submit([], visible)
+    model, stage = mujoco.MjModel.from_xml_string("<mujoco/>"), cast("Any", None)
+    painter = Painter(model, find_backend, stage, lambda run: background_thread("urlab-pictures", run))
+    visible = Visible(np.empty(0), {})
+    waiting = painter.submit(lambda *_: None, visible)
     begun.set_result(None)
-    eventually(lambda: not thread._thread.is_alive())
-    for drawn in (lambda: waiting, lambda: thread.submit([], visible)):
-        with pytest.raises(URLabError, match="urlab-pictures ended unexpectedly: MemoryError") as caught:
+    for drawn in (lambda: waiting, lambda: painter.submit(lambda *_: None, visible)):
+        with pytest.raises(RenderingUnavailable, match=r"nothing more is drawn: SystemExit\('enough'\)") as caught:
             drawn().result(DEADLINE_S)
-        assert isinstance(caught.value.__cause__, MemoryError)
-    assert logged(caplog, "urlab-pictures")
-    thread.close()
+        assert isinstance(caught.value.__cause__, SystemExit)
+    eventually(lambda: logged(caplog, "urlab-pictures"))
+    assert painter.close()
 
 
 def test_the_restart_of_an_environment(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -539,14 +539,14 @@ OVERSIZED: dict[str, tuple[Callable[[Path], Any], Callable[[Run], Any], str]] = 
     ),
     "joints": (lambda path: path.write_bytes(JOINTS), lambda run: run.table(), "bytes of memory"),
     "a frame of joints": (
-        lambda path: path.write_bytes(b'{"Frames": [[' + b"{}," * MIB + b"{}]]}"),
+        lambda path: path.write_bytes(b'{"Frames": [[' + b"[]," * MIB + b"[]]]}"),
         lambda run: run.table(),
-        "the value at character 12 is damaged, or has 16384 characters or more",
+        "a frame has more than 16384 bytes",
     ),
     "beside joints": (
         lambda path: path.write_bytes(b'{"Frames": [], "more": [' + b"{}," * MIB + b"{}]}"),
         lambda run: run.table(),
-        "the value at character 23 is damaged, or has 16384 characters or more",
+        "its frames take more than 8388608 bytes of memory",
     ),
     "missing joints": (
         lambda path: path.write_bytes(WIDE),
@@ -562,7 +562,7 @@ def test_what_a_file_declares_has_limits(kind: str, tmp_path: Path, monkeypatch:
         *((index, "_DECLARED_BYTES"), (index, "_MOST_WALKED"), (reader, "_MESSAGE_BYTES"), (reader, "_KEPT_BYTES")),
         *((reader, "_MOST_VALUES"), (reader, "_VALUES_PER_BYTE"), (reader, "_NAMES_CHARS")),
         *((joint_states, "_MOST_VALUES"), (recording, "_READ_BYTES")),
-        (recording, "_VALUE_CHARS"),
+        (recording, "_FRAME_BYTES"),
     ):
         monkeypatch.setattr(module, limit, getattr(module, limit) // (5000 if limit == "_MOST_WALKED" else 128))
     make, use, said = OVERSIZED[kind]

@@ -260,7 +260,7 @@ def test_a_step_waits_for_pictures_only_as_long_as_it_says(
         assert {key: frame["frame_id"] for key, frame in reply["cameras"].items()} == {"arm_a/cam": first["frame_id"]}
         assert reply["frame_id"] > first["frame_id"]
     drawing.set()
-    eventually(lambda: not playing.core.play.current.cameras._pending)
+    eventually(lambda: not playing.core.play.current.cameras._made_painter()._pending)
     reply = playing.step(include_cameras=cameras, **wait)
     assert {frame["frame_id"] for frame in reply["cameras"].values()} == {reply["frame_id"]}
 

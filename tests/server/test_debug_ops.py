@@ -11,7 +11,7 @@ import pytest
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.editor.markers import DebugLine, Drawings, Sphere
+from urlab_client.server.editor.markers import Drawings, Primitive, line, sphere
 from urlab_client.server.handlers.viewport import _color
 from urlab_client.server.limits import Limits
 
@@ -72,7 +72,7 @@ def test_malformed_vectors(wire: Wire, op: str, field: str, value: object) -> No
 def test_malformed_colors_are_replaced_or_cut(wire: Wire, color: object, drawn: tuple[float, float, float]) -> None:
     wire.ask("clear_markers")
     wire.ask("draw_marker", location=[0, 0, 0], color=color, ttl=-1)
-    assert wire.core.drawings.take_frame(in_play=False) == [Sphere(center=(0.0, 0.0, 0.0), color=drawn)]
+    assert wire.core.drawings.take_frame(in_play=False) == [sphere((0.0, 0.0, 0.0), drawn)]
 
 
 @pytest.mark.parametrize("op", ["draw_box", "draw_axes"])
@@ -108,31 +108,31 @@ def test_colors_are_bytes_cut_off() -> None:
     assert _color((0.5, 2.0, -1.0)) == (127 / 255, 1.0, 0.0)
 
 
-def sphere(x: float) -> Sphere:
-    return Sphere(center=(x, 0.0, 0.0), color=(1.0, 0.0, 0.0))
+def ball(x: float) -> Primitive:
+    return sphere((x, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 def test_time_to_live() -> None:
     clock = Clock()
     drawings = Drawings(clock)
-    drawings.add([sphere(0)], ttl=0.0, in_play=False)
-    drawings.add([sphere(1)], ttl=2.0, in_play=False)
-    drawings.add([sphere(2)], ttl=-1.0, in_play=False)
-    assert drawings.take_frame(in_play=False) == [sphere(0), sphere(1), sphere(2)]
-    assert drawings.take_frame(in_play=False) == [sphere(1), sphere(2)]
+    drawings.add([ball(0)], ttl=0.0, in_play=False)
+    drawings.add([ball(1)], ttl=2.0, in_play=False)
+    drawings.add([ball(2)], ttl=-1.0, in_play=False)
+    assert drawings.take_frame(in_play=False) == [ball(0), ball(1), ball(2)]
+    assert drawings.take_frame(in_play=False) == [ball(1), ball(2)]
     clock.now = 2.0
-    assert drawings.take_frame(in_play=False) == [sphere(2)]
+    assert drawings.take_frame(in_play=False) == [ball(2)]
     drawings.clear(in_play=False)
     assert drawings.take_frame(in_play=False) == []
 
 
 def test_worlds_are_apart() -> None:
     drawings = Drawings(Clock())
-    drawings.add([sphere(0)], ttl=-1.0, in_play=False)
-    drawings.add([sphere(1)], ttl=-1.0, in_play=True)
+    drawings.add([ball(0)], ttl=-1.0, in_play=False)
+    drawings.add([ball(1)], ttl=-1.0, in_play=True)
     drawings.clear(in_play=True)
     assert drawings.take_frame(in_play=True) == []
-    assert drawings.take_frame(in_play=False) == [sphere(0)]
+    assert drawings.take_frame(in_play=False) == [ball(0)]
 
 
 def test_overlay_lasts_ten_seconds() -> None:
@@ -152,11 +152,11 @@ def test_overlay_lasts_ten_seconds() -> None:
 
 def test_the_oldest_gives_way(caplog: pytest.LogCaptureFixture) -> None:
     drawings = Drawings(Clock())
-    line = DebugLine(start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), color=(1.0, 1.0, 1.0))
-    drawings.add([sphere(0)], ttl=-1.0, in_play=False)
+    drawn = line((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    drawings.add([ball(0)], ttl=-1.0, in_play=False)
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
-        drawings.add([line] * Limits.markers, ttl=-1.0, in_play=False)
-    assert drawings.take_frame(in_play=False) == [line] * Limits.markers
+        drawings.add([drawn] * Limits.markers, ttl=-1.0, in_play=False)
+    assert drawings.take_frame(in_play=False) == [drawn] * Limits.markers
     assert "clear_markers" in caplog.text
 
 

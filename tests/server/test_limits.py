@@ -162,7 +162,7 @@ def test_drawings_give_way(restored: bool, models: Path) -> None:
             for x in range(10):
                 wire.ask("draw_marker", location=[x, 0, 0], color=[1, 0, 0], ttl=-1)
             kept = wire.core.drawings.take_frame(in_play=False)
-    assert [marker.center[0] for marker in kept] == [7, 8, 9], "the newest stay"
+    assert [stroke.at[0] for (stroke,) in kept] == [7, 8, 9], "the newest stay"
 
 
 def test_a_frame_beyond_all_limits_costs_its_sender_the_connection(small: Wire) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterator
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from scenes import ASSETS, BALL, BOT, make_scene
 
 from urlab_client.enums import ObservationLevel, StepMode
@@ -190,10 +190,8 @@ def test_wall_clock_is_utc_now_in_steps_of_100_ns() -> None:
 def test_entities_have_coordinates_only_with_a_free_joint() -> None:
     sphere = Mesh(shape="sphere", size=(0.1,))
     free = Actor(name="Prop", label="Prop", kind=ActorKind.STATIC_MESH, location=(1.0, 2.0, 3.0), mesh=sphere)
-    fixed = dataclasses.replace(
-        free, name="Wall", location=(4.0, 5.0, 6.0), quick_convert=ConversionSettings(static=True)
-    )
-    scene = make_scene(dataclasses.replace(free, quick_convert=ConversionSettings()), fixed, bot=BOT)
+    fixed = structs.replace(free, name="Wall", location=(4.0, 5.0, 6.0), quick_convert=ConversionSettings(static=True))
+    scene = make_scene(structs.replace(free, quick_convert=ConversionSettings()), fixed, bot=BOT)
     with Engine(scene) as engine:
         engine.set_mode(StepMode.DIRECT)
         entities = engine.step(Step(n_steps=10), lambda mode: Observer(scene, engine.articulations.controls).entities())

@@ -21,8 +21,7 @@ import pytest
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.render import camera_renderer
-from urlab_client.simulation import drawing, opengl
+from urlab_client.simulation import drawing, opengl, painting
 from urlab_client.simulation.appearance import APPEARANCE_TEXT, Appearance, tint
 from urlab_client.simulation.drawing import NO_HIT_CM
 from urlab_client.simulation.opengl import Backend, find_backend, free_context, make_context, search_backend
@@ -343,7 +342,7 @@ def fail(*arguments: object) -> None:
 @pytest.mark.opengl
 def test_a_frame_that_cannot_be_drawn_is_left_out_alone(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
     wire = play("drop")
-    for _ in range(camera_renderer.MAX_FAILED):
+    for _ in range(painting.MAX_FAILED):
         with monkeypatch.context() as patch:
             patch.setattr(drawing.Stage, "draw", fail)
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
@@ -357,7 +356,7 @@ def test_drawing_that_fails_again_and_again_is_given_up(
     wire = play("drop")
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR, logger="urlab_client.server"):
         patch.setattr(drawing.Stage, "draw", fail)
-        for _ in range(camera_renderer.MAX_FAILED + 1):
+        for _ in range(painting.MAX_FAILED + 1):
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     assert caplog.text.count("drawing failed") == 1
     assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
+from urlab_client._mujoco import saved_model
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client_types import ClientConfig, ClientObserver, ServerInfo
-from urlab_client.aio.model.mirror import binary_model
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
@@ -208,7 +208,7 @@ class ClientState(PublicDir):
         if hello is None:
             raise NoSession("handshake: discover() was not called.")
         with mirror.lock:
-            model = None if mirror.model is None or mirror.approximate else binary_model(mirror.model)
+            model = None if mirror.model is None or mirror.approximate else saved_model(mirror.model)
         shared = replace(hello, session_id="", mjb=model, mjb_base64=NOT_SENT, shm_session_dir=None)
         return encode_message(shared)
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import model_names
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Vary
 from urlab_client.values.names import spellings
@@ -53,15 +54,6 @@ DERIVED_FROM: Final = frozenset(
 )
 """Fields from which `mj_setConst` computes others."""
 
-_OBJECTS: Final = {
-    "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
-    "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-    "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-    "free joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
-    "light": (mujoco.mjtObj.mjOBJ_LIGHT, "nlight"),
-    "camera": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
-}
 _FIXED, _AFFINE, _NO_BIAS = 0, 1, 0  # mjGAIN_FIXED, mjGAIN_AFFINE and mjBIAS_AFFINE, mjBIAS_NONE
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -84,7 +76,7 @@ def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int], p
     if vary.what == "gravity":
         return Elements(np.zeros(1, dtype=np.intp), ("scene",))
     kind, _ = QUANTITIES[vary.what]
-    names = _names(model, kind)
+    names = model_names(model, kind.removeprefix("free "))
     aliases = _aliases(model, kind, names)
     written = [list(itertools.chain(*spellings(each, prefixes))) for each in aliases]
     having = [i for i in range(len(names)) if _has(vary.what, model, i, controlled)]
@@ -184,20 +176,12 @@ def _has(what: Quantity, model: mujoco.MjModel, i: int, controlled: frozenset[in
             return True
 
 
-def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    objects, count = _OBJECTS[kind]
-    number = getattr(model, count, None)
-    if number is None:
-        number = model.nu  # a MuJoCo release without actuators with several controls
-    return [mujoco.mj_id2name(model, objects, i) or "" for i in range(number)]
-
-
 def _aliases(model: mujoco.MjModel, kind: str, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the possible names of each element; a geom or free joint also has that of its body."""
     owners = {"geom": "geom_bodyid", "free joint": "jnt_bodyid"}.get(kind)
     if owners is None:
         return [(name,) for name in names]
-    bodies = _names(model, "body")
+    bodies = model_names(model, "body")
     return [(name, bodies[body]) for name, body in zip(names, getattr(model, owners), strict=True)]
 
 

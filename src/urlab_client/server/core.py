@@ -291,7 +291,7 @@ class ServerCore:
         if running is not None and not running.close(timeout):
             return False
         model = compiled.scene.model
-        copy_options(compiled.options, model)
+        copy_options(compiled.options, model.opt)
 
         def build() -> Running:
             data = mujoco.MjData(model)

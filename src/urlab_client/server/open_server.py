@@ -422,17 +422,17 @@ def take_snapshot(
         try:
             if running is not None:
                 with running.engine.lock:
-                    job = running.cameras.capture_viewport(picture)
+                    visible = running.cameras.capture_viewport()
                 renderer = running.cameras
             else:
                 renderer = server.authored_renderer()
-                job = renderer.capture_viewport(picture)
+                visible = renderer.capture_viewport()
         except Refusal as refusal:
             raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
         except CompileFailed as error:
             raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
     try:
-        return renderer.paint(job)
+        return renderer.paint(visible, picture)
     finally:
         if running is None:
             renderer.close()

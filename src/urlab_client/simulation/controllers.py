@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Final, cast
 
 import mujoco
 import numpy as np
@@ -15,6 +16,9 @@ from numpy.typing import NDArray
 from urlab_client._mujoco import control_counts
 from urlab_client.enums import ControllerKind
 from urlab_client.simulation.controller_config import GAINS, ControllerConfig
+
+_SCALAR_JOINTS: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_JOINT_TRANSMISSIONS: Final = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
@@ -60,44 +64,25 @@ class _Binding:
     upper: Float32s
 
 
-def first_controls(model: mujoco.MjModel, actuators: NDArray[Any]) -> list[int]:
+def first_controls(model: mujoco.MjModel, actuators: NDArray[Any]) -> NDArray[np.intp]:
     """Position of each actuator's first control among those of all of them."""
-    starts: list[int] = []
-    total = 0
-    counts = control_counts(model)
-    for actuator in actuators:
-        starts.append(total)
-        total += int(counts[actuator])
-    return starts
+    counts = control_counts(model)[actuators].astype(np.intp)
+    return np.cumsum(counts) - counts
 
 
 def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
-    scalar_joints = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    joint_transmissions = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    names: list[str] = []
-    ids: list[int] = []
-    places: list[int] = []
-    joints: list[int] = []
-    starts = first_controls(model, articulation.actuators)
-    counts = control_counts(model)
-    for actuator, name, place in zip(articulation.actuators, articulation.actuator_names, starts, strict=True):
-        if int(model.actuator_trntype[actuator]) not in joint_transmissions or counts[actuator] != 1:
-            continue
-        joint = int(model.actuator_trnid[actuator, 0])
-        if int(model.jnt_type[joint]) in scalar_joints:
-            names.append(name)
-            ids.append(int(actuator))
-            places.append(place)
-            joints.append(joint)
-    where = np.array(places, dtype=np.intp)
-    which = np.array(joints, dtype=np.intp)
+    ids = np.asarray(articulation.actuators, dtype=np.intp)
+    joints = model.actuator_trnid[ids, 0]
+    bound = np.isin(model.actuator_trntype[ids], _JOINT_TRANSMISSIONS) & (control_counts(model)[ids] == 1)
+    bound[bound] = np.isin(model.jnt_type[joints[bound]], _SCALAR_JOINTS)
+    places, which = first_controls(model, ids)[bound], joints[bound].astype(np.intp)
     limited = model.jnt_limited[which].astype(bool)
     ranges = float32_array(model.jnt_range[which])
     return _Binding(
-        names=tuple(names),
-        ids=np.array(ids, dtype=np.intp),
-        places=where,
-        ctrl_adr=articulation.ctrl_adr[where].astype(np.intp),
+        names=tuple(itertools.compress(articulation.actuator_names, bound)),
+        ids=ids[bound],
+        places=places,
+        ctrl_adr=articulation.ctrl_adr[places].astype(np.intp),
         qpos_adr=model.jnt_qposadr[which].astype(np.intp),
         qvel_adr=model.jnt_dofadr[which].astype(np.intp),
         lower=np.where(limited, ranges[:, 0], np.float32(-np.inf)),

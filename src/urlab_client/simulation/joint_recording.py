@@ -5,14 +5,13 @@ For the `recording` and `replay` handlers. The file format is the plugin's; play
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
-import json
 import logging
 import math
-import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -35,10 +34,11 @@ CSV_PERIOD_S: Final = 0.002
 _READ_BYTES: Final = 1 << 30
 _SMALL_BYTES: Final = 64 << 20
 _BYTES_PER_BYTE: Final = 16  # a frame of one joint takes 8 times as much memory as its text
-_VALUE_CHARS: Final = 2 << 20  # as text; decoded, a value takes up to 70 times as much memory
+_FRAME_BYTES: Final = 2 << 20  # as text; decoded, a frame takes up to 70 times as much memory
+_RAW_BYTES: Final = 64  # about what a frame takes that is found, but not decoded
+_TOO_MANY: Final = "its frames take more than {} bytes of memory"
 _LAYOUT_OVERHEAD: Final = 600  # about the bytes of a joint in a layout
 _NAME_CHARS: Final = 4096
-_SPACE: Final = re.compile(r"[ \t\n\r]*")
 
 
 @dataclass(frozen=True)
@@ -184,72 +184,26 @@ def decode_json(content: bytes) -> list[Frame]:
     """Read a recording file: keys in any case, missing ones at their defaults, unknown ones ignored.
 
     Raises:
-        ValueError: It is not JSON, has no list of frames, has a value of 2 MiB or more, or its frames take more memory
-            than it may take: 16 times its size, at least 64 MiB and at most 1 GiB.
+        ValueError: It is not JSON, has no list of frames, has a frame of more than 2 MiB, or its frames take more
+            memory than it may take: 16 times its size, at least 64 MiB and at most 1 GiB.
     """
     made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
+    text = _utf8(content)
     most = min(_READ_BYTES, max(_SMALL_BYTES, _BYTES_PER_BYTE * len(content)))
+    if text.count(b"{") * _RAW_BYTES > most:  # before even the frames' places in the text need that much
+        raise ValueError(_TOO_MANY.format(most))
     try:
-        return _kept((_from_file(_read(frame), made) for frame in _frames(_text(content))), most)
+        return _kept((_from_file(_read(frame), made) for frame in _frames(text)), most)
     except (RecursionError, OverflowError) as error:
         raise ValueError(f"it is not a recording: {error}") from None
 
 
-def _frames(text: str) -> Iterator[object]:
-    """Yield the frames of a file one at a time, because decoded they take much more memory than as text."""
-    decode = _value_decoder(text)
-
-    def space(at: int) -> int:
-        return cast("re.Match[str]", _SPACE.match(text, at)).end()
-
-    def after(at: int, expected: str) -> int:
-        """Return where the next token, one of some characters, ends."""
-        at = space(at)
-        if text[at : at + 1] not in tuple(expected):
-            raise ValueError(f"it is not a recording: character {at} is not {' or '.join(expected)}")
-        return at + 1
-
-    found, at = False, after(0, "{")
-    while text[at - 1] != "}":
-        key, at = decode(space(at))
-        at = space(after(at, ":"))
-        if isinstance(key, str) and key.casefold() == "frames" and text[at : at + 1] == "[":
-            found, at = True, space(at + 1)
-            while text[at : at + 1] != "]":
-                frame, at = decode(at)
-                yield frame
-                at = after(at, ",]")
-                at = at - 1 if text[at - 1] == "]" else space(at)
-            at += 1
-        else:
-            at = decode(at)[1]
-        at = after(at, ",}")
-    if not found:
-        raise ValueError("the list 'Frames' is missing")
-
-
-def _value_decoder(text: str) -> Callable[[int], tuple[object, int]]:
-    """Return a function that decodes the value at a character and returns it and its end.
-
-    It looks at a part of the text at a time, so that no value can take more memory than such a part.
-    """
-    scan, part, start = json.JSONDecoder().raw_decode, "", 0
-
-    def decode(at: int) -> tuple[object, int]:
-        nonlocal part, start
-        if start + len(part) < min(at + _VALUE_CHARS, len(text)):
-            part, start = text[at : at + 2 * _VALUE_CHARS], at
-        try:
-            value, end = scan(part, at - start)
-        except json.JSONDecodeError as error:
-            if start + len(part) == len(text):
-                raise json.JSONDecodeError(error.msg, text, start + error.pos) from None
-            value, end = None, len(part)  # damaged, or cut off
-        if start + end - at >= _VALUE_CHARS:
-            raise ValueError(f"the value at character {at} is damaged, or has {_VALUE_CHARS} characters or more")
-        return value, start + end
-
-    return decode
+def _frames(text: bytes) -> list[msgspec.Raw]:
+    """Return the text of each frame: decoded, all of them would take much more memory."""
+    for key, value in msgspec.json.decode(text, type=dict[str, msgspec.Raw]).items():
+        if key.casefold() == "frames":
+            return msgspec.json.decode(value, type=list[msgspec.Raw])
+    raise ValueError("the list 'Frames' is missing")
 
 
 def _kept(frames: Iterable[Frame], most: int) -> list[Frame]:
@@ -262,15 +216,16 @@ def _kept(frames: Iterable[Frame], most: int) -> list[Frame]:
             layouts.add(id(frame.layout))
             size += _LAYOUT_OVERHEAD * len(frame.layout.joints)
         if size > most:
-            raise ValueError(f"its frames take more than {most} bytes of memory")
+            raise ValueError(_TOO_MANY.format(most))
         kept.append(frame)
     return kept
 
 
-def _text(content: bytes) -> str:
-    """Decode a text file: Unreal writes UTF-16 with a mark as soon as a name is not ASCII."""
-    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    return content.decode("utf-16" if wide else "utf-8-sig")
+def _utf8(content: bytes) -> bytes:
+    """Return a text file in UTF-8: Unreal writes UTF-16 with a mark as soon as a name is not ASCII."""
+    if content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return content.decode("utf-16").encode()
+    return content.removeprefix(codecs.BOM_UTF8)
 
 
 def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...], JointLayout]) -> Frame:
@@ -286,11 +241,13 @@ def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...
     return Frame(frame.timestamp, layout, np.array(qpos, dtype=np.float64), np.array(qvel, dtype=np.float64))
 
 
-def _read(frame: object) -> _RecordedFrame:
+def _read(frame: msgspec.Raw) -> _RecordedFrame:
+    if len(memoryview(frame)) > _FRAME_BYTES:
+        raise ValueError(f"a frame has more than {_FRAME_BYTES} bytes")
     try:
-        return msgspec.convert(frame, _RecordedFrame)
+        return msgspec.json.decode(frame, type=_RecordedFrame)
     except msgspec.ValidationError:
-        fields = _folded(frame)
+        fields = _folded(msgspec.json.decode(frame))
     stamp, states = fields.get("timestamp"), fields.get("jointstates")
     joints: dict[str, _Joint] = {}
     for name, state in cast("dict[str, object]", states if isinstance(states, dict) else {}).items():
@@ -321,7 +278,7 @@ def decode_csv(content: bytes) -> list[Frame]:
         ValueError: It has no header, or a cell is not a number.
     """
     try:
-        return _kept(_from_table(row for row in csv.reader(io.StringIO(_text(content))) if row), _READ_BYTES)
+        return _kept(_from_table(row for row in csv.reader(io.StringIO(_utf8(content).decode())) if row), _READ_BYTES)
     except csv.Error as error:
         raise ValueError(f"it is not a table: {error}") from None
 

@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from urlab_client._mujoco import saved_model
 from urlab_client._sandbox.confinement import forbid_opening
 from urlab_client._sandbox.process import Job, ProcessLimits, run_confined
 from urlab_client._sandbox.references import refuse_local_files, refuse_outside
@@ -70,16 +71,13 @@ def flatten_confined(file: Path, progress: Callable[[int], object] = lambda _: N
 def compile_model(argument: bytes) -> bytes:
     """Do the work of `compile_confined` in the confined process."""
     import mujoco
-    import numpy as np
 
     job = msgspec.msgpack.decode(argument, type=_Model)
     refuse_local_files(job.xml, job.assets)
     forbid_opening()  # all input is here, so MuJoCo does not need to open any file
     compiled = mujoco.MjModel.from_xml_string(job.xml, dict(job.assets))
     mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # the client calls it first, and it may never return
-    buffer = np.zeros(mujoco.mj_sizeModel(compiled), dtype=np.uint8)
-    mujoco.mj_saveModel(compiled, None, buffer)
-    return buffer.tobytes()
+    return saved_model(compiled)
 
 
 def flatten_upload(argument: bytes) -> bytes:
@@ -93,7 +91,7 @@ def flatten_upload(argument: bytes) -> bytes:
         file = file.rename(_CONTENT / file.name)
     try:
         refuse_outside(file, _CONTENT)
-        return msgspec.msgpack.encode(flatten(file))
+        return msgspec.msgpack.encode(flatten(file, scratch=Path.cwd()))
     except ValueError as error:
         said = str(error).removeprefix("upload_model: ").replace(f"{_CONTENT.as_posix()}/", "")
         raise ValueError(said) from None

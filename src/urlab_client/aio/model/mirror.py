@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from urlab_client._mujoco import forget_last_document, without_newer_attributes
+from urlab_client._mujoco import forget_last_document, model_names, saved_model, without_newer_attributes
 from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
@@ -33,31 +33,6 @@ _CHOICES = {
 }
 _HEADER_BYTES = 20  # five 32-bit integers
 _NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
-_NAME_ADDRESSES = {
-    "body": "name_bodyadr",
-    "joint": "name_jntadr",
-    "actuator": "name_actuatoradr",
-    "sensor": "name_sensoradr",
-    "geom": "name_geomadr",
-    "site": "name_siteadr",
-    "key": "name_keyadr",
-}
-
-
-def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the compiled names of all bodies, joints, actuators, sensors, geoms, sites or keys, in id order."""
-    pool = model.names
-    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
-    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
-
-
-def binary_model(model: mujoco.MjModel) -> bytes:
-    """Return a model in MuJoCo's binary format."""
-    import mujoco
-
-    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
 
 
 @cache
@@ -65,7 +40,7 @@ def _mjb_header() -> bytes:
     """Return the header of every model saved by this MuJoCo: magic, number size, layout and version."""
     import mujoco
 
-    return binary_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
+    return saved_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
 
 
 def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:

@@ -68,8 +68,12 @@ class FlatModel:
         )
 
 
-def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
+def flatten(model: str | os.PathLike[str] | mujoco.MjSpec, *, scratch: Path | None = None) -> FlatModel:
     """Read a model and everything it includes, check it and convert it to the form in which it is sent. Blocks.
+
+    Args:
+        model: The model.
+        scratch: Folder in which files may be written meanwhile; None for the system's temporary one.
 
     Raises:
         TypeError: The model is neither a path nor a spec.
@@ -90,7 +94,7 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     try:
         spec: mujoco.MjSpec = given.copy() if path is None else mujoco.MjSpec.from_file(source)
         spec.compile()
-        xml, files = flat_model(spec)
+        xml, files = flat_model(spec, scratch=scratch)
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(f"upload_model: MuJoCo rejects {source}: {' '.join(str(error).split())}") from None
     flat = FlatModel(xml.encode(), files)

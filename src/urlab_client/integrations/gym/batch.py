@@ -21,7 +21,7 @@ from urlab_client.enums import ControllerKind
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
 from urlab_client.integrations.gym.episode import rendered_camera, space_mapping
-from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
+from urlab_client.integrations.gym.pictures import BatchPictures, PictureScene
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
 from urlab_client.integrations.gym.spaces import Field, Observation, with_cameras
 from urlab_client.integrations.gym.task import States, add_observed, with_task
@@ -30,6 +30,7 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
 from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
+from urlab_client.simulation.painting import VISIBLE, Visible
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import element_ids

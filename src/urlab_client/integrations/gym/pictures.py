@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
-import contextlib
-import copy
-import queue
 import weakref
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient
@@ -30,38 +23,14 @@ from urlab_client.simulation.appearance import Appearance, Tints
 from urlab_client.simulation.cameras import Instant, Latency, SceneCamera
 from urlab_client.simulation.drawing import Stage
 from urlab_client.simulation.opengl import Backend, need_backend
+from urlab_client.simulation.painting import Painter, Visible
 from urlab_client.values.names import cleaned_name
 from urlab_client.values.pictures import Pixels, decode_camera, observed_pixels
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the previous one. The first picture includes creating the context."""
-
-_JOIN_S: Final = 1.0
-
 _UNSEEN: Final = 0
 """Snapshot number; unused here."""
-
-VISIBLE: Final = ("qpos", "mocap_pos", "mocap_quat")
-"""Fields of the state that pictures depend on, in MuJoCo's order."""
-
-_STATE: Final = (
-    mujoco.mjtState.mjSTATE_QPOS.value
-    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
-    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
-)
-
-
-@dataclass(frozen=True)
-class Visible:
-    """What pictures of one copy depend on.
-
-    Attributes:
-        state: The fields `VISIBLE` of `MjData`, flattened and concatenated.
-        look: Fields that differ from the compiled model; the same fields each time.
-    """
-
-    state: Floats
-    look: Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +65,20 @@ class PictureScene:
         """Return the space of a camera's pictures."""
         return camera_space(self.mode(camera), self.cameras[camera].resolution)
 
+    def stage(self, model: mujoco.MjModel, backend: Backend) -> Stage:
+        """Return what draws a model of the scene, in the thread that draws."""
+        appearance = Appearance.of(model)
+        return Stage(model, backend, Tints(model, appearance.classes, self.owners), appearance.quality)
+
+    def paint(self, stage: Stage, data: mujoco.MjData, cameras: Sequence[str]) -> list[Pixels]:
+        """Draw what some cameras see, in that thread."""
+        return [self._picture(stage, data, name) for name in cameras]
+
+    def _picture(self, stage: Stage, data: mujoco.MjData, name: str) -> Pixels:
+        camera, mode = self.cameras[name], self.mode(name)
+        pixels = np.ascontiguousarray(stage.pixels(data, camera, mode))
+        return decode_camera(pixels.data.cast("B"), mode, *camera.resolution, where=name).pixels
+
 
 class BatchPictures:
     """The cameras of a batch. Draws given states with the same code, and so the same pixels, as their server.
@@ -120,9 +103,9 @@ class BatchPictures:
         }
         self._latencies: dict[tuple[str, int], Latency] = {}
         self._shown: dict[tuple[str, int], Floats] = {}
-        self._thread: _Thread | None = None
+        self._painter: Painter[Stage] | None = None
         if observed:
-            self._drawing()
+            self._made_painter()
 
     def begin(self, i: int, seed: int, visible: Visible) -> None:
         """Begin an episode of copy `i`. Delayed cameras show its start without delay; `seed` is that of the jitter."""
@@ -153,7 +136,8 @@ class BatchPictures:
         """
         if not cameras:
             return {}
-        drawn = [self._drawing().submit(cameras, visible) for visible in copies]
+        painter, scene = self._made_painter(), self._scene
+        drawn = [painter.submit(lambda stage, data: scene.paint(stage, data, cameras), visible) for visible in copies]
         try:
             pictures = [picture.result(_DEADLINE_S) for picture in drawn]
         except TimeoutError:
@@ -165,16 +149,22 @@ class BatchPictures:
 
     def close(self) -> None:
         """Free the context, until something is drawn again."""
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.close()
+        painter, self._painter = self._painter, None
+        if painter is not None:
+            painter.close()
 
-    def _drawing(self) -> _Thread:
-        if self._thread is None:
-            self._thread = _Thread(self._scene, need_backend())
-            finalizer = weakref.finalize(self, self._thread.stop)
-            finalizer.atexit = False  # the thread registers its own exit hook, which must run before the driver's
-        return self._thread
+    def _made_painter(self) -> Painter[Stage]:
+        if self._painter is None:
+            need_backend()
+            self._painter = Painter(
+                self._scene.model,
+                need_backend,
+                self._scene.stage,
+                lambda run: background_thread("urlab-pictures", run),
+            )
+            finalizer = weakref.finalize(self, self._painter.close)
+            finalizer.atexit = False  # the painter has an exit hook of its own, which must run before the driver's
+        return self._painter
 
     def _revealed(self, name: str, i: int, time: float, visible: Visible) -> Floats:
         """Record the state of a copy for a delayed camera, and return the state that the camera shows now."""
@@ -187,86 +177,6 @@ class BatchPictures:
         if seen is not None:
             self._shown[name, i] = seen.state
         return self._shown[name, i]
-
-
-class _Thread:
-    """The thread that draws one copy after another."""
-
-    def __init__(self, scene: PictureScene, backend: Backend) -> None:
-        self._scene = scene
-        self._backend = backend
-        self._jobs: queue.SimpleQueue[tuple[Sequence[str], Visible, Future[list[Pixels]]] | None] = queue.SimpleQueue()
-        self._failure: BaseException | None = None
-        self._thread = background_thread("urlab-pictures", self._run, failed=self._die)
-        self._thread.start()
-
-    def submit(self, cameras: Sequence[str], visible: Visible) -> Future[list[Pixels]]:
-        """Begin to draw one copy."""
-        drawn: Future[list[Pixels]] = Future()
-        self._jobs.put((cameras, visible, drawn))
-        if self._failure is not None:
-            self._fail_waiting(self._failure)
-        return drawn
-
-    def stop(self) -> None:
-        """Tell the thread to free its context and exit."""
-        atexit.unregister(self.close)
-        self._jobs.put(None)
-
-    def close(self) -> None:
-        """Stop the thread and wait for a limited time until it exits."""
-        self.stop()
-        self._thread.join(_JOIN_S)
-
-    def _die(self, error: URLabError) -> None:
-        self._failure = error
-        self._fail_waiting(error)
-
-    def _fail_waiting(self, error: BaseException) -> None:
-        with contextlib.suppress(queue.Empty):
-            while True:
-                job = self._jobs.get_nowait()
-                if job is not None and job[2].set_running_or_notify_cancel():
-                    job[2].set_exception(error)
-
-    def _run(self) -> None:
-        with ExitStack() as context:
-            painter: _Painter | None = None
-            while (job := self._jobs.get()) is not None:
-                cameras, visible, drawn = job
-                if not drawn.set_running_or_notify_cancel():
-                    continue
-                try:
-                    if painter is None:
-                        painter = _Painter(self._scene, self._backend, context)
-                        atexit.register(self.close)  # registered after the driver's hook, so it runs before it
-                    drawn.set_result(painter.paint(cameras, visible))
-                except BaseException as error:  # noqa: BLE001 - the future raises it in the caller
-                    drawn.set_exception(error)
-
-
-class _Painter:
-    """Draws pictures in one thread."""
-
-    def __init__(self, scene: PictureScene, backend: Backend, context: ExitStack) -> None:
-        appearance = Appearance.of(scene.model)
-        self._scene = scene
-        self._model = copy.copy(scene.model)  # drawing adjusts its visual settings
-        self._data = mujoco.MjData(self._model)
-        tints = Tints(self._model, appearance.classes, scene.owners)
-        self._stage = context.enter_context(Stage(self._model, backend, tints, appearance.quality))
-
-    def paint(self, cameras: Sequence[str], visible: Visible) -> list[Pixels]:
-        for name, values in visible.look.items():
-            getattr(self._model, name)[...] = values
-        mujoco.mj_setState(self._model, self._data, visible.state, _STATE)
-        self._stage.prepare(self._data)
-        return [self._picture(name) for name in cameras]
-
-    def _picture(self, name: str) -> Pixels:
-        camera, mode = self._scene.cameras[name], self._scene.mode(name)
-        pixels = np.ascontiguousarray(self._stage.pixels(self._data, camera, mode))
-        return decode_camera(pixels.data.cast("B"), mode, *camera.resolution, where=name).pixels
 
 
 def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamera:

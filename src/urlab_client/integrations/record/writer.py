@@ -20,8 +20,8 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
+from urlab_client._mujoco import saved_model
 from urlab_client.aio.background import background_thread
-from urlab_client.aio.model.mirror import binary_model
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.geometry import scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
@@ -414,7 +414,7 @@ class _Sink:
         if scene.model is None:
             return
         self._writer.flush()  # attachments are outside of chunks
-        self._writer.add_attachment(wall_ns, now, MODEL_NAME, MODEL_TYPE, zlib.compress(binary_model(scene.model)))
+        self._writer.add_attachment(wall_ns, now, MODEL_NAME, MODEL_TYPE, zlib.compress(saved_model(scene.model)))
         if self.options.pose_ns > 0:
             self._simulation = Simulation(scene, scene.model)
             shapes = shapes_of(scene.model, self._simulation.bodies)

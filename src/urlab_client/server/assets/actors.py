@@ -7,7 +7,6 @@ are metres and rotations quaternions (x, y, z, w), both in MuJoCo's world frame.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Literal
 
@@ -81,37 +80,44 @@ _LIGHT_CLASSES: Final = {"directional": "DirectionalLight", "point": "PointLight
 _ID_TAG: Final = "URLab.ActorId="
 
 
-@dataclass(frozen=True, kw_only=True)
-class Actor:
-    """One actor of a level.
+class ActorSettings(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What an actor and its entry in a level file have in common.
 
     Attributes:
         name: Object name, unique in the level; an articulation's key.
         actor_id: Stable id given by the client; may be empty.
         location: Position, metres.
-        rotation: Unit quaternion (x, y, z, w).
         scale: Factors; 1 for articulations.
-        own_tags: Tags besides the one that carries the id.
-        blueprint: What an articulation is an instance of.
         quick_convert: Settings that make a static mesh a body, or None.
         parent: Name of the actor this one is attached to; may be empty.
         controller: An articulation's controller as text, `pd,kp=80`; empty for that of its MJCF.
     """
 
     name: str
-    label: str
     kind: ActorKind
+    label: str = ""
     actor_id: str = ""
     location: Vec3 = ORIGIN
-    rotation: Quat = IDENTITY
     scale: Vec3 = UNIT_SCALE
-    own_tags: tuple[str, ...] = ()
-    blueprint: Blueprint | None = None
     light: Light | None = None
     mesh: Mesh | None = None
     quick_convert: ConversionSettings | None = None
     parent: str = ""
     controller: str = ""
+
+
+class Actor(ActorSettings, frozen=True, kw_only=True):
+    """One actor of a level.
+
+    Attributes:
+        rotation: Unit quaternion (x, y, z, w).
+        own_tags: Tags besides the one that carries the id.
+        blueprint: What an articulation is an instance of.
+    """
+
+    rotation: Quat = IDENTITY
+    own_tags: tuple[str, ...] = ()
+    blueprint: Blueprint | None = None
 
     @property
     def prefix(self) -> str:

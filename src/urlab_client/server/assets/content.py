@@ -38,7 +38,7 @@ from urlab_client.server.assets.blueprint import (
     sanitized,
 )
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
-from urlab_client.server.assets.importer import Compiled, build_confined, compile_snapshot, one_line, write_snapshot
+from urlab_client.server.assets.importer import build_confined, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
@@ -247,43 +247,41 @@ class ContentRoot:
         with (
             working_in(self.root / IMPORTS),
             tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+            contextlib.ExitStack() as undo,
         ):
             snapshot = Path(temporary_folder) / "snapshot"
-            if roots is None or file.is_relative_to(bundled_root()):
-                compiled, folder, is_new = self._build(file, snapshot, home)
-            else:
-                compiled = build_confined(file, snapshot, roots, self.limits)
-                folder, is_new = _put_in_place(snapshot, home)
+
+            def put_in_place() -> Path:
+                """Move the snapshot to the folder that its content names, unless that is as it was written."""
+                folder = home / _digest(snapshot)
+                if not _is_sound(folder):
+                    undo.callback(shutil.rmtree, folder, ignore_errors=True)
+                    _replace(snapshot, folder)
+                return folder
+
+            try:
+                if roots is None or file.is_relative_to(bundled_root()):
+                    written = write_snapshot(file, snapshot)
+                    folder = put_in_place()
+                    compiled = compile_snapshot(*written, file, folder, self.limits)[0]
+                else:
+                    compiled = build_confined(file, snapshot, roots, self.limits)
+                    folder = put_in_place()
+            except (ValueError, mujoco.FatalError) as error:
+                raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
             for message in compiled.messages:
                 logger.warning("%s: %s", file, one_line(message))
-        record = BlueprintRecord(
-            stem=stem,
-            source=source,
-            source_digest=source_digest,
-            imported_at=datetime.now(UTC),
-            digest=folder.name,
-            **compiled.facts(),
-        )
-        try:
-            return self._register(home, folder, record)
-        except OSError:
-            if is_new:
-                shutil.rmtree(folder, ignore_errors=True)
-            raise
-
-    def _build(self, file: Path, snapshot: Path, home: Path) -> tuple[Compiled, Path, bool]:
-        """Compile a file in this process; return its properties, its folder, and whether that is new."""
-        folder, is_new = home, False
-        try:
-            written = write_snapshot(file, snapshot)
-            folder, is_new = _put_in_place(snapshot, home)
-            return compile_snapshot(written, file, folder, self.limits)[0], folder, is_new
-        except BaseException as error:
-            if is_new:
-                shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, (ValueError, mujoco.FatalError)):
-                raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
-            raise
+            record = BlueprintRecord(
+                stem=stem,
+                source=source,
+                source_digest=source_digest,
+                imported_at=datetime.now(UTC),
+                digest=folder.name,
+                **compiled.facts(),
+            )
+            blueprint = self._register(home, folder, record)
+            undo.pop_all()
+        return blueprint
 
     def _register(self, home: Path, folder: Path, record: BlueprintRecord) -> Blueprint:
         known = self._blueprints.get(record.stem)
@@ -322,16 +320,6 @@ def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
             source,
             known.imported_at.isoformat(timespec="seconds"),
         )
-
-
-def _put_in_place(snapshot: Path, home: Path) -> tuple[Path, bool]:
-    """Move a snapshot to the folder that its content names, unless that is there and as it was written; return it, and
-    whether it is new."""
-    folder = home / _digest(snapshot)
-    if _is_sound(folder):
-        return folder, False
-    _replace(snapshot, folder)
-    return folder, True
 
 
 def _is_sound(folder: Path) -> bool:

@@ -10,7 +10,6 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,23 +89,6 @@ class Compiled(ModelFacts, frozen=True, kw_only=True):
         return {name: getattr(self, name) for name in ModelFacts.__struct_fields__}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Written:
-    """Properties of a written snapshot.
-
-    Attributes:
-        model_name: The MJCF's `model` attribute; empty if it gives none.
-        actuator_types: See `Blueprint`.
-        n_memory: Size of the arena in its `<size>`, bytes; 0 if it gives none.
-        messages: MuJoCo's warnings.
-    """
-
-    model_name: str
-    actuator_types: dict[str, str]
-    n_memory: int
-    messages: list[str]
-
-
 class _Order(msgspec.Struct):
     """What a confined process is to import; the snapshot is a folder that does not exist yet."""
 
@@ -148,7 +130,7 @@ def build_order(argument: bytes) -> bytes:
     try:
         check_references(file, tuple(map(Path, order.roots)), *most)
         stage = f"cannot store the snapshot of {file}"
-        compiled, model = compile_snapshot(write_snapshot(file, snapshot), file, snapshot, limits)
+        compiled, model = compile_snapshot(*write_snapshot(file, snapshot), file, snapshot, limits)
         check_references(snapshot / MODEL_FILE, (snapshot,), *most)  # the server reads it without restrictions
         exceeded = _exceeded(compiled, limits)
         if not exceeded:
@@ -186,8 +168,8 @@ def _exceeded(compiled: Compiled, limits: Limits) -> str:
     return compiled.options_problem
 
 
-def write_snapshot(file: Path, snapshot: Path) -> Written:
-    """Write the snapshot of an MJCF file.
+def write_snapshot(file: Path, snapshot: Path) -> tuple[mujoco.MjSpec, list[str]]:
+    """Write the snapshot of an MJCF file; return the spec that it was written from, and MuJoCo's warnings.
 
     Args:
         snapshot: Folder to write, which must not exist.
@@ -200,24 +182,20 @@ def write_snapshot(file: Path, snapshot: Path) -> Written:
         if spec.compiler.settotalmass > 0.0 or any(len(key.mpos) or len(key.mquat) for key in spec.keys):
             compiled_file(file)  # for MuJoCo's warnings about what the snapshot omits
         prepared = _prepared(spec)
-        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
         _write_snapshot(prepared, snapshot, messages)
-    return Written(
-        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
-        actuator_types=kinds,
-        n_memory=max(prepared.memory, 0),
-        messages=messages,
-    )
+    return prepared, messages
 
 
-def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
+def compile_snapshot(
+    prepared: mujoco.MjSpec, warnings: list[str], file: Path, snapshot: Path, limits: Limits
+) -> tuple[Compiled, mujoco.MjModel]:
     """Compile the snapshot of an MJCF file, and return its properties and the model.
 
     MuJoCo keeps compiled meshes by the paths of their files, so a snapshot compiled where it stays is compiled quickly
     from then on.
 
     Args:
-        written: Result of `write_snapshot`.
+        prepared: The first result of `write_snapshot`; the other one is `warnings`.
         limits: For the ranges of its options; nothing is refused here.
 
     Raises:
@@ -228,16 +206,16 @@ def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limit
         data = mujoco.MjData(model)
         check_copy(file, model)
     compiled = Compiled(
-        model_name=written.model_name,
+        model_name="" if prepared.modelname in DEFAULT_MODEL_NAMES else prepared.modelname,
         joints=_names(model.njnt, model.joint),
         actuators=_names(actuator_count(model), model.actuator),
-        actuator_types=written.actuator_types,
+        actuator_types={actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators},
         sensors=_names(model.nsensor, model.sensor),
         cameras=_names(model.ncam, model.camera),
-        messages=tuple(dict.fromkeys((*written.messages, *messages))),
+        messages=tuple(dict.fromkeys((*warnings, *messages))),
         n_bytes=mujoco.mj_sizeModel(model),
         n_asset_bytes=asset_bytes(model),
-        n_data_bytes=data.nbuffer + written.n_memory,
+        n_data_bytes=data.nbuffer + max(prepared.memory, 0),
         n_arena_bytes=data.narena,
         n_sensor_values=model.nsensordata,
         options_problem=options_problem(model.opt, limits),

@@ -17,14 +17,14 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client._platform.files import write_whole
-from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
+from urlab_client.server.assets.actors import UNIT_SCALE, Actor, ActorKind, ActorSettings, ConversionSettings, Mesh
 from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
 from urlab_client.simulation.controller_config import ControllerConfig
-from urlab_client.values.rotation import IDENTITY, Quat, Vec3, normalized
+from urlab_client.values.rotation import IDENTITY, Quat, normalized
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -51,21 +51,10 @@ class _Blueprint(Struct, forbid_unknown_fields=True, omit_defaults=True):
     record: str = ""
 
 
-class _Actor(Struct, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    name: str
-    kind: ActorKind
-    label: str = ""
-    actor_id: str = ""
-    location: Vec3 = ORIGIN
+class _Actor(ActorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rotation_quat: Quat = IDENTITY
-    scale: Vec3 = UNIT_SCALE
     tags: tuple[str, ...] = ()
     blueprint: str = ""
-    light: Light | None = None
-    mesh: Mesh | None = None
-    quick_convert: ConversionSettings | None = None
-    parent: str = ""
-    controller: str = ""
 
 
 class _Level(Struct, forbid_unknown_fields=True):
@@ -100,11 +89,10 @@ def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> No
             mesh = msgspec.structs.replace(mesh, file=_relative(mesh.file, folder))
         entries.append(
             _Actor(
-                **_shared(actor),
+                **_shared(actor, mesh=mesh),
                 rotation_quat=actor.rotation,
                 tags=actor.own_tags,
                 blueprint=blueprint.stem if blueprint is not None else "",
-                mesh=mesh,
             )
         )
     level = _Level(format=FORMAT, version=VERSION, blueprints=blueprints, actors=entries)
@@ -154,10 +142,8 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     return actors
 
 
-def _shared(source: Actor | _Actor) -> dict[str, Any]:
-    """Return what an entry and its actor share."""
-    names = ("name", "kind", "label", "actor_id", "location", "scale", "light", "quick_convert", "parent", "controller")
-    return {name: getattr(source, name) for name in names}
+def _shared(source: ActorSettings, **changed: Any) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in ActorSettings.__struct_fields__} | changed
 
 
 def _relative(target: str, folder: Path) -> str:
@@ -230,14 +216,11 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
             if confined_to is not None and not confined_to.open_to_clients(file):
                 raise ValueError(f"mesh {file} lies outside the folders that clients may read")
             mesh = msgspec.structs.replace(mesh, file=str(file))
-    shared = _shared(entry)
-    shared["label"] = entry.label or entry.name
     return Actor(
-        **shared,
+        **_shared(entry, mesh=mesh, label=entry.label or entry.name),
         rotation=normalized(entry.rotation_quat),
         own_tags=entry.tags,
         blueprint=blueprints[entry.blueprint] if entry.blueprint else None,
-        mesh=mesh,
     )
 
 

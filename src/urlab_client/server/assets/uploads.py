@@ -55,14 +55,6 @@ class _File:
     sha256: str
     size: int | None
     received: int = 0
-    partial: Path | None = None
-
-    def drop(self) -> None:
-        """Forget what was received."""
-        if self.partial is not None:
-            with contextlib.suppress(OSError):
-                self.partial.unlink()
-        self.partial, self.received = None, 0
 
 
 @dataclass
@@ -176,6 +168,7 @@ class Uploads:
             )
         upload = self._find(chunk.upload_id)
         label, file = upload.file(kind, chunk.name)
+        partial = upload.folder / (DOCUMENT if kind == "xml" else chunk.name)
         if file.size is not None and total != file.size:
             raise Refusal("bad_request", f"'{label}' has {file.size} bytes in the manifest, not {total}")
         if self._cached(file):
@@ -183,19 +176,16 @@ class Uploads:
         try:
             with _storing(f"'{label}'"):
                 self._make_room(len(data))
-                if file.partial is None:
-                    handle, partial = tempfile.mkstemp(dir=upload.folder)
-                    os.close(handle)
-                    file.partial = Path(partial)
-                with file.partial.open("r+b") as stream:
+                with partial.open("r+b" if file.received else "wb") as stream:
                     stream.seek(offset)
                     stream.write(data)
                 file.received += len(data)
                 if file.received < total:
                     return label, file.received, False
-                self._complete(label, file, total)
+                self._complete(label, file, partial)
         except Refusal:
-            file.drop()
+            partial.unlink(missing_ok=True)
+            file.received = 0
             raise
         return label, total, True
 
@@ -267,15 +257,13 @@ class Uploads:
             return False
         return self._cached(file)
 
-    def _complete(self, label: str, file: _File, total: int) -> None:
+    def _complete(self, label: str, file: _File, partial: Path) -> None:
         """Move a complete file into the cache if its hash is right."""
-        partial = file.partial
-        assert partial is not None  # noqa: S101 - what was received is in it
         found, size = _hash_of(partial), partial.stat().st_size
-        if found != file.sha256 or size != total:
+        if found != file.sha256:
             raise Refusal("hash_mismatch", f"'{label}' has the hash {found}, the manifest says {file.sha256}")
         os.replace(partial, self._cache / file.sha256)
-        file.drop()
+        file.received = 0
         self._held += size
 
     def _make_room(self, n_bytes: int) -> None:

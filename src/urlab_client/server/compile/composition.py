@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,12 +13,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import MODEL_FILE, compiled_file, merge_assets
+from urlab_client._mujoco import MODEL_FILE, compiled_file, copy_options, merge_assets
 from urlab_client.server.assets.actors import Actor, Mesh
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.decomposition import convex_parts
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
+from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, ignored_options
 from urlab_client.server.refusal import CompileFailed
 from urlab_client.values.rotation import Vec3, rotate, wxyz
 
@@ -145,7 +146,7 @@ def add_static_mesh(spec: mujoco.MjSpec, actor: Actor, mesh: Mesh) -> tuple[str,
     if not convert.static and not convert.driven_by_unreal:
         joint = f"{actor.name}FreeJoint"
         body.add_freejoint(name=joint)
-    name = unique_name("Geom_0_0", {geom.name for geom in spec.geoms}, separator="_")
+    name = unique_name("Geom_0_0", {geom.name for geom in spec.geoms})
     settings = {"solref": [0.02, 1.0], "solimp": [0.9, 0.95, 0.001, 0.5, 2.0], "friction": convert.friction}
     if convert.complex_mesh and mesh.shape == "file":
         _add_parts(spec, body, actor, mesh, convert.coacd_threshold, name=name, **settings)
@@ -158,7 +159,7 @@ def _add_parts(
     spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, threshold: float, *, name: str, **settings: Any
 ) -> None:
     for vertices, faces in convex_parts(Path(mesh.file), threshold):
-        part = unique_name(name, {geom.name for geom in spec.geoms}, separator="_")
+        part = unique_name(name, {geom.name for geom in spec.geoms})
         asset = spec.add_mesh(
             name=f"{actor.prefix}{part}",
             uservert=vertices.ravel().tolist(),
@@ -192,14 +193,10 @@ def add_mesh(spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, *, name: 
     body.add_geom(name=name, rgba=mesh.rgba, **settings)
 
 
-def unique_name(name: str, taken: set[str], *, separator: str = "") -> str:
+def unique_name(name: str, taken: set[str]) -> str:
     """Return `name`, or its first numbered variant that is free."""
-    stem, dot, suffix = name.partition(".")
-    candidate, count = name, 0
-    while candidate in taken:
-        count += 1
-        candidate = f"{stem}{separator or '_'}{count}{dot}{suffix}"
-    return candidate
+    candidates = itertools.chain([name], (f"{name}_{count}" for count in itertools.count(1)))
+    return next(candidate for candidate in candidates if candidate not in taken)
 
 
 Floats = NDArray[np.float64]

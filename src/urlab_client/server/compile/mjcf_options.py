@@ -6,12 +6,12 @@ Merges options as `MjSpec.attach` does since MuJoCo 3.11.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cache
 from typing import Any, Final, Literal, TypeAlias
 
 import mujoco
 import numpy as np
 
+from urlab_client._mujoco import copy_options, option_names
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.refusal import CompileFailed
@@ -26,24 +26,6 @@ _LARGEST: Final = frozenset({"iterations", "sdf_initpoints"}) | {
     f"{kind}_iterations" for kind in ("ls", "noslip", "ccd", "sdf")
 }
 _UNITED: Final = frozenset({"disableflags", "enableflags", "disableactuator"})
-
-
-@cache
-def _option_names() -> tuple[str, ...]:
-    return tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_"))
-
-
-def copy_options(source: Any, target: Any) -> None:
-    """Copy the options of one spec to another."""
-    for name in _option_names():
-        _write(target, name, getattr(source, name))
-
-
-def _write(option: Any, name: str, value: Any) -> None:
-    if isinstance(value, np.ndarray):
-        getattr(option, name)[:] = value
-    else:
-        setattr(option, name, value)
 
 
 def adopt_options(spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], policy: OptionPolicy) -> None:
@@ -64,12 +46,12 @@ def adopt_options(spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blue
             first, before = wanted.get(name, (blueprint.stem, value))
             wanted[name] = first, _merged(name, (first, before), (blueprint.stem, value))
     for name, (_, value) in wanted.items():
-        _write(spec.option, name, value)
+        setattr(spec.option, name, value)
 
 
 def _authored(blueprint: Blueprint) -> list[str]:
     own, default = blueprint.spec.option, mujoco.MjSpec().option
-    return [name for name in _option_names() if not np.array_equal(getattr(own, name), getattr(default, name))]
+    return [name for name in option_names(own) if not np.array_equal(getattr(own, name), getattr(default, name))]
 
 
 def _merged(name: str, one: tuple[str, Any], other: tuple[str, Any]) -> Any:

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import export_model, flat_model
+from urlab_client._mujoco import copy_options, flat_model, saved_model
 from urlab_client.server.assets.actors import Actor, scene_problem
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.importer import mujoco_messages, one_line
@@ -30,9 +30,8 @@ from urlab_client.server.compile.composition import (
     compose,
     empty_scene,
     populate,
-    unique_name,
 )
-from urlab_client.server.compile.mjcf_options import OptionPolicy, copy_options
+from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.limits import Limits, options_problem
 from urlab_client.server.refusal import CompileFailed
@@ -157,23 +156,7 @@ class CompiledScene:
     @cached_property
     def _flat(self) -> tuple[str, dict[str, bytes]]:
         with mujoco_messages():
-            xml, files = export_model(self.spec)
-        names: dict[str, str] = {}
-        for path in sorted(files):
-            names[path] = unique_name(path.rpartition("/")[2], set(names.values()))
-        return (
-            re.sub(
-                r'\b(file\w*)="([^"]*)"', lambda match: f'{match[1]}="{names.get(match[2], Path(match[2]).name)}"', xml
-            ),
-            {names[path]: data for path, data in files.items()},
-        )
-
-
-def saved_model(model: mujoco.MjModel) -> bytes:
-    """Return a model in MuJoCo's binary format."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
+            return flat_model(self.spec, compiled=True)
 
 
 def compile_scene(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from typing import Literal
+
+from msgspec.structs import replace
 
 from urlab_client.server.assets.actors import UNIT_SCALE, Actor, ActorKind
 from urlab_client.server.assets.blueprint import Blueprint, sanitized

@@ -7,6 +7,7 @@ MuJoCo's frame; colours are red, green and blue in 0..1, in steps of 1/255.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
@@ -16,64 +17,82 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
 from urlab_client.server.limits import Limits
-from urlab_client.values.rotation import Quat, Vec3
+from urlab_client.values.rotation import IDENTITY, Quat, Vec3
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MARKER_RADIUS_M: Final = 0.05
 OVERLAY_S: Final = 10.0
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sphere:
-    """A sphere of `MARKER_RADIUS_M`."""
-
-    center: Vec3
-    color: Vec3
+_HEAD_SPREAD: Final = 0.45
+"""Half the width of an arrow's head, as a share of its length."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Text:
-    """A label in the world."""
+class Stroke:
+    """One geom of debug drawing; a line, if it has an end.
 
+    Attributes:
+        size: As MuJoCo has it for this kind; of lines their width, where 1 is the usual thickness.
+    """
+
+    kind: mujoco.mjtGeom
     at: Vec3
-    text: str
     color: Vec3
+    size: Vec3 = (0.0, 0.0, 0.0)
+    rotation: Quat = IDENTITY
+    end: Vec3 | None = None
+    text: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DebugLine:
-    """A line segment; its usual thickness is 1."""
-
-    start: Vec3
-    end: Vec3
-    color: Vec3
-    thickness: float = 1.0
+Primitive: TypeAlias = tuple[Stroke, ...]
+"""What one op draws; several count as one."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Box:
-    """A box of lines."""
-
-    center: Vec3
-    half_extents: Vec3
-    rotation: Quat
-    color: Vec3
+def sphere(at: Vec3, color: Vec3) -> Primitive:
+    """Return a sphere of `MARKER_RADIUS_M`."""
+    size = (MARKER_RADIUS_M, MARKER_RADIUS_M, MARKER_RADIUS_M)
+    return (Stroke(kind=mujoco.mjtGeom.mjGEOM_SPHERE, at=at, color=color, size=size),)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arrow:
-    """An arrow from start to end, with a head of this length, metres, and lines of this thickness; 1 is the usual."""
-
-    start: Vec3
-    end: Vec3
-    color: Vec3
-    head: float
-    thickness: float = 1.0
+def label(at: Vec3, text: str, color: Vec3) -> Primitive:
+    """Return a text in the world."""
+    return (Stroke(kind=mujoco.mjtGeom.mjGEOM_LABEL, at=at, color=color, size=(0.1, 0.1, 0.1), text=text),)
 
 
-Primitive: TypeAlias = Sphere | Text | DebugLine | Box | Arrow
+def line(start: Vec3, end: Vec3, color: Vec3, thickness: float = 1.0) -> Primitive:
+    """Return a line segment; its usual thickness is 1."""
+    size = (thickness, thickness, thickness)
+    return (Stroke(kind=mujoco.mjtGeom.mjGEOM_LINE, at=start, end=end, color=color, size=size),)
+
+
+def box(center: Vec3, half_extents: Vec3, rotation: Quat, color: Vec3) -> Primitive:
+    """Return a box of lines."""
+    kind = mujoco.mjtGeom.mjGEOM_LINEBOX
+    return (Stroke(kind=kind, at=center, color=color, size=half_extents, rotation=rotation),)
+
+
+def arrow(start: Vec3, end: Vec3, color: Vec3, head: float, thickness: float = 1.0) -> Primitive:
+    """Return an arrow: its shaft, and the four edges of its head, which has this length, metres."""
+    tail: NDArray[np.float64] = np.array(start)
+    tip: NDArray[np.float64] = np.array(end)
+    length = float(np.linalg.norm(tip - tail))
+    shaft = line(start, end, color, thickness)
+    if length == 0.0:
+        return shaft
+    along = (tip - tail) / length
+    least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(along))]
+    side: NDArray[np.float64] = np.cross(along, least)
+    side /= float(np.linalg.norm(side))
+    other: NDArray[np.float64] = np.cross(along, side)
+    barbs = [tip - head * (along - _HEAD_SPREAD * out) for out in (side, -side, other, -other)]
+    edges = [line(end, (x, y, z), color, thickness) for x, y, z in np.array(barbs).tolist()]
+    return (*shaft, *itertools.chain.from_iterable(edges))
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's wo
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import replace
 
 from urlab_client.server.assets.actors import (
     ORIGIN,
@@ -96,7 +95,7 @@ class EditorWorld:
         manager = self.actors.first(ActorKind.MANAGER)
         if manager is not None:
             return manager, True
-        return self.actors.add(Actor(name=self.actors.numbered("AMjManager"), label="", kind=ActorKind.MANAGER)), False
+        return self.actors.add(Actor(name=self.actors.numbered("AMjManager"), kind=ActorKind.MANAGER)), False
 
     @property
     def has_manager(self) -> bool:
@@ -186,7 +185,7 @@ class EditorWorld:
         self._make_room(1, None, code)
         red, green, blue = (float32(channel) for channel in color)
         light = Light(kind=name, intensity=float32(intensity), color=(red, green, blue))
-        draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
+        draft = Actor(name="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
         return self.actors.add(
             replace(draft, name=self.actors.numbered(draft.class_name), location=at, rotation=rotation)
         )
@@ -238,7 +237,7 @@ class EditorWorld:
                 else self.actors.numbered(source.class_name)
             )
             copy = self.actors.add(
-                replace(source, name=name, label="", actor_id=new_actor_id, location=at, rotation=rotation, parent="")
+                replace(source, name=name, actor_id=new_actor_id, location=at, rotation=rotation, parent="")
             )
         return Placed(copy, rotation, existing is not None)
 
@@ -324,7 +323,7 @@ class EditorWorld:
         limits = self.content.limits
         if len(self.actors) + count > limits.actors:
             raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
-        more = [Actor(name="", label="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
+        more = [Actor(name="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
         problem = scene_problem((*self.actors, *more), limits)
         if problem:
             raise Refusal(code, problem)
@@ -354,7 +353,7 @@ class EditorWorld:
                 actor = self.actors.put(replace(before, location=at, rotation=turned))
             else:
                 name = self.actors.articulation_name(blueprint)
-                draft = Actor(name=name, label="", kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
+                draft = Actor(name=name, kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
                 actor = self.actors.add(replace(draft, location=at, rotation=turned))
             placed.append(Placed(actor, rotation, before is not None))
         return placed
@@ -383,7 +382,7 @@ class QuickConvert:
             raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
         threshold = settings.coacd_threshold
         refuse_infinite((threshold, *settings.friction), "coacd_threshold and friction", code)
-        kept = msgspec.structs.replace(settings, coacd_threshold=float32(threshold))
+        kept = replace(settings, coacd_threshold=float32(threshold))
         return self._actors.put(replace(actor, quick_convert=kept))
 
     def remove(self, target: str) -> Actor:

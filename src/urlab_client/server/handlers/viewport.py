@@ -12,7 +12,7 @@ from urlab_client.protocol.messages import debug, viewport
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.compile.composition import actor_bounds
 from urlab_client.server.core import ServerCore
-from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
+from urlab_client.server.editor.markers import Primitive, arrow, box, label, line, sphere
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
 from urlab_client.server.refusal import CompileFailed, Refusal
 from urlab_client.server.rpc.dispatch import handles
@@ -162,22 +162,17 @@ class RotatedBox(debug.DrawBox, tag="draw_box", kw_only=True):
 @handles(debug.DrawMarker)
 def draw_marker(server: ServerCore, request: debug.DrawMarker) -> debug.DrawMarkerOk:
     at, color = need_point(request, request.location, "location"), _color(request.color)
-    _draw(server, [Sphere(center=at, color=color)], request.ttl)
+    _draw(server, [sphere(at, color)], request.ttl)
     if request.label:
         # As in the plugin, text without a time to live is permanent.
-        _draw(server, [Text(at=at, text=request.label, color=color)], request.ttl if request.ttl > 0.0 else -1.0)
+        _draw(server, [label(at, request.label, color)], request.ttl if request.ttl > 0.0 else -1.0)
     return debug.DrawMarkerOk()
 
 
 @handles(debug.DrawLine)
 def draw_line(server: ServerCore, request: debug.DrawLine) -> debug.DrawLineOk:
-    line = DebugLine(
-        start=need_point(request, request.from_, "from"),
-        end=need_point(request, request.to, "to"),
-        color=_color(request.color),
-        thickness=_size(request.thickness, 1.0),
-    )
-    _draw(server, [line], request.ttl)
+    start, end = need_point(request, request.from_, "from"), need_point(request, request.to, "to")
+    _draw(server, [line(start, end, _color(request.color), _size(request.thickness, 1.0))], request.ttl)
     return debug.DrawLineOk()
 
 
@@ -185,28 +180,16 @@ def draw_line(server: ServerCore, request: debug.DrawLine) -> debug.DrawLineOk:
 def draw_box(server: ServerCore, request: RotatedBox) -> debug.DrawBoxOk:
     center = need_point(request, request.center, "center")
     x, y, z = need_point(request, request.half_extents, "half_extents")
-    box = Box(
-        center=center,
-        half_extents=(abs(x), abs(y), abs(z)),
-        rotation=_rotation(request, request.rotation_quat, request.rotation_euler),
-        color=_color(request.color),
-    )
-    _draw(server, [box], request.ttl)
+    rotation = _rotation(request, request.rotation_quat, request.rotation_euler)
+    _draw(server, [box(center, (abs(x), abs(y), abs(z)), rotation, _color(request.color))], request.ttl)
     return debug.DrawBoxOk()
 
 
 @handles(debug.DrawArrow)
 def draw_arrow(server: ServerCore, request: debug.DrawArrow) -> debug.DrawArrowOk:
-    start = need_point(request, request.from_, "from")
-    end = need_point(request, request.to, "to")
-    arrow = Arrow(
-        start=start,
-        end=end,
-        color=_color(request.color),
-        head=_size(request.arrow_size, _HEAD * math.dist(start, end)),
-        thickness=_size(request.thickness, 1.0),
-    )
-    _draw(server, [arrow], request.ttl)
+    start, end = need_point(request, request.from_, "from"), need_point(request, request.to, "to")
+    head = _size(request.arrow_size, _HEAD * math.dist(start, end))
+    _draw(server, [arrow(start, end, _color(request.color), head, _size(request.thickness, 1.0))], request.ttl)
     return debug.DrawArrowOk()
 
 
@@ -220,7 +203,7 @@ def draw_axes(server: ServerCore, request: debug.DrawAxes) -> debug.DrawAxesOk:
     for axis, color in (((length, 0.0, 0.0), _RED), ((0.0, -length, 0.0), _GREEN), ((0.0, 0.0, length), _BLUE)):
         dx, dy, dz = rotate(rotation, axis)
         x, y, z = origin
-        arrows.append(Arrow(start=origin, end=(x + dx, y + dy, z + dz), color=color, head=_HEAD * length))
+        arrows.append(arrow(origin, (x + dx, y + dy, z + dz), color, _HEAD * length))
     _draw(server, arrows, request.ttl)
     return debug.DrawAxesOk()
 

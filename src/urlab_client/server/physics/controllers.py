@@ -162,7 +162,7 @@ class ArticulationControl:
         """
         self.index = index
         places: dict[str, int] = {}
-        for name, place in zip(index.actuator_names, first_controls(model, index.actuators), strict=True):
+        for name, place in zip(index.actuator_names, first_controls(model, index.actuators).tolist(), strict=True):
             places[f"{index.prefix}{name}"] = place
         places.update({name: places[f"{index.prefix}{name}"] for name in index.actuator_names})
         self._ctrl_places = _contiguous(index.ctrl_adr.astype(np.intp))

@@ -8,9 +8,10 @@ from functools import partial
 import mujoco
 import numpy as np
 
+from urlab_client._mujoco import saved_model
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
-from urlab_client.server.compile.scene import CompiledScene, saved_model
+from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.simulation.controllers import PDController
 

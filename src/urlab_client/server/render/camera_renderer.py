@@ -7,14 +7,11 @@ everything else works.
 
 from __future__ import annotations
 
-import atexit
-import copy
 import logging
-import queue
-import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import CancelledError, Future, wait
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -28,16 +25,16 @@ from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.render.viewport_picture import ViewportPicture, ViewportStage
-from urlab_client.server.system.threads import Health, ended
+from urlab_client.server.system.threads import Health
 from urlab_client.simulation.appearance import Appearance, RenderQuality, Tints
 from urlab_client.simulation.cameras import Instant, Latency, Past, SceneCamera
-from urlab_client.simulation.opengl import RenderingUnavailable, need_backend, search_backend
+from urlab_client.simulation.drawing import Stage
+from urlab_client.simulation.opengl import Backend, RenderingUnavailable, need_backend, search_backend
+from urlab_client.simulation.painting import Painter, Visible, visible_state
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]
-Look = Mapping[str, NDArray[Any]]
-"""Names of the model fields that pictures depend on."""
 
 LATEST_S: Final = 1.0 / 30.0
 """Age up to which a frame counts as the latest."""
@@ -45,18 +42,8 @@ LATEST_S: Final = 1.0 / 30.0
 FRAMES_DEADLINE_S: Final = 30.0
 """Longest wait for the frames of a step; the first ones include the search for OpenGL."""
 
-_VISIBLE: Final = (
-    mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
-    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
-)
-"""The parts of a state that pictures depend on."""
-
 GIVEN_UP: Final = 8
 """Maximum number of abandoned states in the queue; beyond it, older frames are returned."""
-
-MAX_FAILED: Final = 3
-"""After so many failures in a row drawing is given up until the next play session."""
 
 
 @dataclass(eq=False)
@@ -91,7 +78,7 @@ class Shot:
     older: bool = False
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Exposure:
     """A state to be drawn, and the cameras to draw.
 
@@ -99,17 +86,24 @@ class Exposure:
         taken_at: Time of the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not carry it.
         past: Receiver of the delayed frame, if the camera has a latency.
-        look: Values of the model fields that vary.
-        done: Set when the cameras have their frames, or never will.
     """
 
     cameras: Sequence[_Camera]
-    data: mujoco.MjData
+    visible: Visible
     taken_at: float
     frame_id: int | None = None
     past: Past | None = None
-    look: Look | None = None
-    done: threading.Event = field(default_factory=threading.Event)
+
+    def draw(self, stage: Stage, data: mujoco.MjData) -> None:
+        """Give the cameras, or the past state, their frames. For the thread that draws."""
+        for camera in self.cameras:
+            frame = stage.draw(data, camera.info, camera.mode)
+            if self.frame_id is not None:
+                frame.frame_id, frame.sim_time = self.frame_id, float(data.time)
+            if self.past is not None:
+                self.past.frame = frame
+            else:
+                camera.frame, camera.drawn_at = frame, self.taken_at
 
 
 @dataclass(frozen=True)
@@ -152,23 +146,6 @@ class Film:
         return self.captured if past is None else past.captured
 
 
-@dataclass(eq=False)
-class Painting:
-    """A state to be drawn as a picture of the viewport.
-
-    Attributes:
-        look: Values of the model fields that vary.
-        pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
-        done: Set when it is drawn, or never will be.
-    """
-
-    picture: ViewportPicture
-    data: mujoco.MjData
-    look: Look | None = None
-    pixels: Bytes | None = None
-    done: threading.Event = field(default_factory=threading.Event)
-
-
 class CameraRenderer:
     """Draws the cameras of one scene; all share one OpenGL context, which belongs to a separate thread."""
 
@@ -206,16 +183,8 @@ class CameraRenderer:
                 self._bare[dialect.camera_key(robot, info.name)] = camera  # the last of several
         self._varied = tuple(varied)
         self._episode = 0
-        self._model: mujoco.MjModel | None = None
-        self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
-        self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
-        self._pending: set[Exposure | Painting] = set()
-        self._given_up: list[Exposure] = []
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-        self._drawing = False
-        self._ready = threading.Event()
-        self._broken = False
+        self._painter: Painter[ViewportStage] | None = None
+        self._given_up: list[Future[None]] = []
         self._closed = False
 
     @property
@@ -281,9 +250,7 @@ class CameraRenderer:
         late = [late for camera in self._by_name.values() if (late := _late(camera)) and not late.skips(now)]
         if not late:
             return
-        model, data = self._scene.model, self._scene.data
-        state = np.empty(mujoco.mj_stateSize(model, _VISIBLE))
-        mujoco.mj_getState(model, data, state, _VISIBLE)
+        state = visible_state(self._scene.model, self._scene.data)
         captured = time.time()
         for latency in late:
             latency.see(frame_id, now, captured, state)
@@ -306,8 +273,8 @@ class CameraRenderer:
         Returns:
             The argument for `frames`.
         """
-        self._given_up = [job for job in self._given_up if not job.done.is_set()]
-        now, draw = self._now(), draw and not self._broken and len(self._given_up) < GIVEN_UP
+        self._given_up = [drawn for drawn in self._given_up if not drawn.done()]
+        now, draw = self._now(), draw and not self._made_painter().ended and len(self._given_up) < GIVEN_UP
         look = self._copy_look()
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}
@@ -319,10 +286,11 @@ class CameraRenderer:
             elif shot.late not in past and (seen := shot.late.revealed(now)) is not None:
                 past[shot.late] = seen
                 if seen.frame is None and draw:
-                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen, look))
+                    jobs.append(Exposure([shot.camera], Visible(seen.state, look), now.wall, seen.frame_id, seen))
         if cameras and draw:
             number = frame_id if self._stamped else None
-            jobs.append(Exposure(cameras, self._copy_state(), now.wall, number, look=look))
+            state = visible_state(self._scene.model, self._scene.data)
+            jobs.append(Exposure(cameras, Visible(state, look), now.wall, number))
         return Film(now.wall, time.time(), frame_id, jobs, past)
 
     def frames(
@@ -336,21 +304,22 @@ class CameraRenderer:
             wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
                 is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
-        drawing = [job for job in film.jobs if self._submit(job)]
+        painter = self._made_painter()
+        drawing = [painter.submit(job.draw, job.visible) for job in film.jobs]
         if drawing:
-            self._ready.wait(FRAMES_DEADLINE_S)
-        deadline = time.monotonic() + wait_s
-        if not all(job.done.wait(max(0.0, deadline - time.monotonic())) for job in drawing):
+            painter.ready.wait(FRAMES_DEADLINE_S)
+        if wait(drawing, max(0.0, wait_s)).not_done:
             self._given_up.extend(drawing)
             if wait_s >= FRAMES_DEADLINE_S:
                 logger.warning("no camera images within %g s; continuing without them", wait_s)
         return {shot.key: frame for shot in shots if (frame := film.frame(shot)) is not None} or None
 
-    def capture_viewport(self, picture: ViewportPicture) -> Painting:
+    def capture_viewport(self) -> Visible:
         """Copy the state that `paint` draws; the caller holds the engine's lock."""
-        return Painting(picture, self._copy_state(), self._copy_look())
+        self._made_painter()
+        return Visible(visible_state(self._scene.model, self._scene.data), self._copy_look())
 
-    def paint(self, job: Painting) -> Bytes:
+    def paint(self, visible: Visible, picture: ViewportPicture) -> Bytes:
         """Draw a picture of the viewport.
 
         Returns:
@@ -360,15 +329,15 @@ class CameraRenderer:
             RenderingUnavailable: The picture cannot be drawn.
         """
         need_backend()
-        if not self._submit(job):
-            raise RenderingUnavailable(
-                "play ended before the picture was drawn" if self._closed else "drawing failed; see the log"
-            )
-        if not job.done.wait(FRAMES_DEADLINE_S):
-            raise RenderingUnavailable(f"no picture within {FRAMES_DEADLINE_S:g} s")
-        if job.pixels is None:
-            raise RenderingUnavailable("the picture was not drawn; see the log if play has not ended")
-        return job.pixels
+        drawn = self._made_painter().submit(lambda stage, data: stage.paint(data, picture), visible)
+        try:
+            return drawn.result(FRAMES_DEADLINE_S)
+        except CancelledError:
+            raise RenderingUnavailable("play ended before the picture was drawn") from None
+        except TimeoutError:
+            raise RenderingUnavailable(f"no picture within {FRAMES_DEADLINE_S:g} s") from None
+        except Exception as error:
+            raise RenderingUnavailable("the picture was not drawn; see the log") from error
 
     def close(self, timeout: float = 1.0) -> bool:
         """Stop drawing and release waiting callers. Idempotent.
@@ -376,113 +345,36 @@ class CameraRenderer:
         Returns:
             False if it was still drawing then.
         """
-        with self._lock:
-            self._closed = True
-            self._ready.set()
-            self._release()
-            thread = self._thread
-            drawing = self._drawing
-        if thread is None or not drawing:  # a search for OpenGL under way ends by itself, and touches nothing here
-            return True
-        atexit.unregister(self.close)
-        self._queue.put(None)
-        return ended(thread, timeout)
+        self._closed = True
+        return self._painter is None or self._painter.close(timeout)
 
-    def _copy_state(self) -> mujoco.MjData:
-        if self._model is None:
-            self._model = copy.copy(self._scene.model)  # its own visual settings, and no eye on changing options
-        try:
-            data = self._spare.pop()
-        except IndexError:
-            data = mujoco.MjData(self._model)
-        mujoco.mj_copyData(data, self._model, self._scene.data)
-        return data
+    def _made_painter(self) -> Painter[ViewportStage]:
+        if self._painter is None:
+            tints, quality = self._tints, self._quality
+            self._painter = Painter(
+                self._scene.model,
+                _found_backend,
+                lambda model, backend: ViewportStage(model, backend, tints, quality),
+                lambda run: self._health.thread("urlab-render", run),
+            )
+            if self._closed:
+                self._painter.close()
+        return self._painter
 
-    def _copy_look(self) -> Look | None:
-        model = self._scene.model
-        return {name: np.array(getattr(model, name)) for name in self._varied} if self._varied else None
-
-    def _past_state(self, past: Past) -> mujoco.MjData:
-        data = self._copy_state()  # whatever the past does not hold is as it is now
-        mujoco.mj_setState(self._scene.model, data, past.state, _VISIBLE)
-        return data
+    def _copy_look(self) -> dict[str, NDArray[Any]]:
+        return {name: np.array(getattr(self._scene.model, name)) for name in self._varied}
 
     def _now(self) -> Instant:
         return Instant(float(self._scene.data.time), time.monotonic())
 
-    def _submit(self, job: Exposure | Painting) -> bool:
-        with self._lock:
-            if self._closed or self._broken:
-                return False
-            self._pending.add(job)
-            self._queue.put(job)
-            if self._thread is None:
-                self._thread = self._health.thread("urlab-render", self._run)
-                self._thread.start()
-        return True
-
-    def _release(self) -> None:
-        while self._pending:
-            self._pending.pop().done.set()
-
-    def _run(self) -> None:
-        try:
-            backend = search_backend()
-            if isinstance(backend, str):
-                logger.warning("camera images are left out: %s", backend)
-                return
-            with self._lock:
-                self._drawing = not self._closed
-            if self._drawing and self._model is not None:
-                with ViewportStage(self._model, backend, self._tints, self._quality) as stage:
-                    atexit.register(self.close)  # after the driver's own hook, so before it at the end
-                    self._ready.set()
-                    self._draw(stage)
-        except Exception:
-            logger.exception("camera images are left out from now on: drawing failed")
-        finally:
-            with self._lock:
-                self._broken = True
-                self._ready.set()
-                self._release()
-
-    def _draw(self, stage: ViewportStage) -> None:
-        failed = 0
-        while (job := self._queue.get()) is not None:
-            try:
-                for name, values in (job.look or {}).items():
-                    getattr(self._model, name)[...] = values
-                stage.prepare(job.data)
-                self._draw_job(stage, job)
-                failed = 0
-            except Exception:
-                failed += 1
-                if failed == MAX_FAILED:
-                    raise
-                logger.exception("an image is left out: it could not be drawn")
-            if self._closed:
-                return
-            self._spare.append(job.data)
-            with self._lock:
-                self._pending.discard(job)
-            job.done.set()
-
-    def _draw_job(self, stage: ViewportStage, job: Exposure | Painting) -> None:
-        if isinstance(job, Painting):
-            job.pixels = stage.paint(job.data, job.picture)
-            return
-        for camera in job.cameras:
-            if self._closed:
-                return
-            frame = stage.draw(job.data, camera.info, camera.mode)
-            if job.frame_id is not None:
-                frame.frame_id, frame.sim_time = job.frame_id, float(job.data.time)
-            if job.past is not None:
-                job.past.frame = frame
-                continue
-            camera.frame = frame
-            camera.drawn_at = job.taken_at
-
 
 def _late(camera: _Camera) -> Latency | None:
     return camera.latency if camera.latency is not None and camera.latency.withholds else None
+
+
+def _found_backend() -> Backend | None:
+    backend = search_backend()
+    if isinstance(backend, Backend):
+        return backend
+    logger.warning("camera images are left out: %s", backend)
+    return None

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.server.compile.composition import box_around
-from urlab_client.server.editor.markers import MARKER_RADIUS_M, Arrow, Box, DebugLine, Primitive, Sphere, Text
+from urlab_client.server.editor.markers import Primitive, Stroke, box
 from urlab_client.server.editor.viewport import ViewMode, ViewportCamera
 from urlab_client.simulation.drawing import Bytes, Stage, follow_subject
-from urlab_client.values.rotation import IDENTITY, Quat, Vec3, rotate
+from urlab_client.values.rotation import IDENTITY, Vec3, rotate
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -33,9 +33,6 @@ Bounds: TypeAlias = tuple[Vec3, Vec3]
 
 _LINE_PIXELS: Final = 2.0
 """Width of a line of thickness 1, pixels."""
-
-_HEAD_SPREAD: Final = 0.45
-"""Half the width of an arrow's head, as a share of its length."""
 
 _LABEL_BYTES: Final = 99
 _HIDDEN_GROUP: Final = 5
@@ -116,102 +113,38 @@ def bounds_of(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool
     return _point(low), _point(high)
 
 
-def outline(bounds: Bounds) -> Box:
+def outline(bounds: Bounds) -> Primitive:
     """Return the box around the selected actor."""
     low, high = np.array(bounds)
-    return Box(
-        center=_point((low + high) / 2.0), half_extents=_point((high - low) / 2.0), rotation=IDENTITY, color=SELECTED
-    )
+    return box(_point((low + high) / 2.0), _point((high - low) / 2.0), IDENTITY, SELECTED)
 
 
 def add_primitives(scene: mujoco.MjvScene, primitives: Sequence[Primitive]) -> None:
     """Add debug drawing to a scene; geoms that do not fit are omitted with a warning."""
-    geoms = itertools.chain.from_iterable(map(_strokes, primitives))
-    for stroke in geoms:
+    for stroke in itertools.chain.from_iterable(primitives):
         if scene.ngeom >= scene.maxgeom:
             logger.warning("debug drawing is left out of a picture: more than %d geoms", scene.maxgeom)
             return
-        stroke.put(scene.geoms[scene.ngeom])
+        _put(stroke, scene.geoms[scene.ngeom])
         scene.ngeom += 1
+
+
+def _put(stroke: Stroke, geom: Any) -> None:
+    axes = [rotate(stroke.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+    turn = np.array(axes).T.ravel()
+    rgba = np.array([*stroke.color, 1.0], np.float32)
+    mujoco.mjv_initGeom(geom, stroke.kind, np.array(stroke.size), np.array(stroke.at), turn, rgba)
+    if stroke.end is not None:
+        width = max(1.0, _LINE_PIXELS * stroke.size[0])
+        mujoco.mjv_connector(geom, stroke.kind, width, np.array(stroke.at), np.array(stroke.end))
+    geom.emission, geom.specular = 0.6, 0.0  # about its own colour, whatever the lights
+    geom.label = ascii_text(stroke.text)[:_LABEL_BYTES]
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
 
 
 def ascii_text(text: str) -> str:
     """Return the text in the characters of MuJoCo's font, others as question marks."""
     return "".join(letter if " " <= letter <= "~" or letter == "\n" else "?" for letter in text)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stroke:
-    """One geom of debug drawing; a line, if it has an end."""
-
-    kind: int
-    at: Vec3
-    color: Vec3
-    size: Vec3 = (0.0, 0.0, 0.0)
-    rotation: Quat = IDENTITY
-    end: Vec3 | None = None
-    text: str = ""
-
-    def put(self, geom: Any) -> None:
-        axes = [rotate(self.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
-        turn = np.array(axes).T.ravel()
-        rgba = np.array([*self.color, 1.0], np.float32)
-        mujoco.mjv_initGeom(geom, self.kind, np.array(self.size), np.array(self.at), turn, rgba)
-        if self.end is not None:
-            mujoco.mjv_connector(geom, self.kind, self.size[0], np.array(self.at), np.array(self.end))
-        geom.emission, geom.specular = 0.6, 0.0  # about its own colour, whatever the lights
-        geom.label = self.text
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-
-
-def _strokes(primitive: Primitive) -> list[_Stroke]:
-    kinds = mujoco.mjtGeom
-    color = primitive.color
-    match primitive:
-        case Sphere():
-            size = (MARKER_RADIUS_M, MARKER_RADIUS_M, MARKER_RADIUS_M)
-            return [_Stroke(kind=kinds.mjGEOM_SPHERE, at=primitive.center, color=color, size=size)]
-        case Text():
-            text = ascii_text(primitive.text)[:_LABEL_BYTES]
-            return [_Stroke(kind=kinds.mjGEOM_LABEL, at=primitive.at, color=color, size=(0.1, 0.1, 0.1), text=text)]
-        case DebugLine():
-            return [_line(primitive.start, primitive.end, color, primitive.thickness)]
-        case Box():
-            return [
-                _Stroke(
-                    kind=kinds.mjGEOM_LINEBOX,
-                    at=primitive.center,
-                    color=color,
-                    size=primitive.half_extents,
-                    rotation=primitive.rotation,
-                )
-            ]
-        case Arrow():
-            return _arrow(primitive)
-
-
-def _line(start: Vec3, end: Vec3, color: Vec3, thickness: float) -> _Stroke:
-    width = max(1.0, _LINE_PIXELS * thickness)
-    return _Stroke(kind=mujoco.mjtGeom.mjGEOM_LINE, at=start, end=end, color=color, size=(width, width, width))
-
-
-def _arrow(arrow: Arrow) -> list[_Stroke]:
-    """Return the shaft and the four edges of the head."""
-    tail: NDArray[np.float64] = np.array(arrow.start)
-    tip: NDArray[np.float64] = np.array(arrow.end)
-    length = float(np.linalg.norm(tip - tail))
-    strokes = [_line(arrow.start, arrow.end, arrow.color, arrow.thickness)]
-    if length == 0.0:
-        return strokes
-    along = (tip - tail) / length
-    least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(along))]
-    side: NDArray[np.float64] = np.cross(along, least)
-    side /= float(np.linalg.norm(side))
-    other: NDArray[np.float64] = np.cross(along, side)
-    for out in (side, -side, other, -other):
-        barb: NDArray[np.float64] = tip - arrow.head * (along - _HEAD_SPREAD * out)
-        strokes.append(_line(arrow.end, _point(barb), arrow.color, arrow.thickness))
-    return strokes
 
 
 def _point(values: NDArray[np.float64]) -> Vec3:
