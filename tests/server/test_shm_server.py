@@ -26,8 +26,7 @@ from waiting import eventually
 from urlab_client.server import SimulatedServer
 from urlab_client.server.system.temporary_folder import TemporaryFolder
 from urlab_client.server.system.threads import Health
-from urlab_client.server.transport.region_files import RegionFile
-from urlab_client.server.transport.shared_memory import MAX_LISTENERS, SharedMemoryServer
+from urlab_client.server.transport.shared_memory import MAX_LISTENERS, RegionFile, SharedMemoryServer
 
 Rpc = Callable[..., dict[str, Any]]
 
@@ -391,14 +390,15 @@ def test_servers_that_start_at_once_leave_each_other_alone(base: Path) -> None:
 
 
 def test_a_server_for_which_there_is_no_room_keeps_nothing(base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
+    made, reserve = list[int](), os.posix_fallocate
 
     def allocate(descriptor: int, offset: int, size: int) -> None:
         made.append(descriptor)
         if len(made) % 2 == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        reserve(descriptor, offset, size)
 
-    monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
+    monkeypatch.setattr(os, "posix_fallocate", allocate)
     before = os.listdir("/dev/fd")
     with pytest.raises(OSError, match="No space left"):
         SharedMemoryServer(base, Health())

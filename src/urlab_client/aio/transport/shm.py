@@ -16,12 +16,11 @@ import logging
 import time
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Final
 
 from urlab_client.aio.transport.base import LateReply, RequestTransport, SentRequest, TransportStats, lost, no_reply
-from urlab_client.aio.transport.shm_channel import RegionChannel, answers, envelope_of, succeeded
-from urlab_client.aio.transport.shm_regions import RegionInUse, ServerRegions
+from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of, succeeded
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
 from urlab_client.errors import (
     ClientClosed,
@@ -33,7 +32,7 @@ from urlab_client.errors import (
 from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages.session import HelloOk, StateReply
-from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, Ring
+from urlab_client.protocol.shm import RegionNotReady, Ring
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
@@ -47,8 +46,6 @@ _SETTLE_LOOK_S = 1e-3
 # No request over shared memory takes this long, so nothing reads these regions any more.
 _DEAD_S = 30.0
 _IDLE_S = 0.5
-# Look for the reply at this interval in any case, so that a lost ring delays it no longer.
-_LOOK_S = 0.05
 
 # Time to poll on the loop before it sleeps.
 _SPIN_S = 400e-6
@@ -86,16 +83,11 @@ class ShmTransport:
         self._inner = inner
         self._regions = regions
         inner.on_event = self._on_event
-        regions.on_ring[Ring.REPLY].append(self._on_news)
+        regions.on_look.append(self._on_look)
         self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
-        self._used_at = 0.0
         self._pending: SentRequest | None = None
-        # One for all requests: most replies arrive long before, and creating and cancelling a timer takes a tenth of
-        # the time of a step.
-        self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
@@ -132,7 +124,7 @@ class ShmTransport:
         moved = self._regions.follow(hello)
         self._largest_state = 0
         self._refused.clear()
-        if self._channel is not None and (moved or not self._channel.intact() or self._channel.replaced()):
+        if self._channel is not None and (moved or not self._channel.intact() or self._channel.replies.moved()):
             self._drop("the server moved")
         if self._regions.directory is None:
             self._obstacle = "play has not begun"
@@ -154,7 +146,6 @@ class ShmTransport:
         channel = self._channel
         if channel is None:
             return
-        self._regions.connect_doorbell()
         give_up = loop.time() + _SETTLE_S
         while loop.time() < give_up and self._channel is channel and self._pending is None:
             if self._is_clean(channel):
@@ -203,8 +194,6 @@ class ShmTransport:
         closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
         self._fail(lambda _: closed)
         self._drop("closed")
-        if self._timer is not None:
-            self._timer.cancel()
         await self._inner.aclose()
 
     # Routing
@@ -215,23 +204,20 @@ class ShmTransport:
             self._obstacle = "busy"
             return None
         channel = self._channel
-        doubtful = channel is not None and (channel.dirty or now - self._used_at > _IDLE_S)
-        if channel is not None and (not channel.intact() or (doubtful and channel.replaced())):
-            self._drop("the regions were replaced")
-            channel = None
-        if channel is None:
+        if channel is not None:
+            doubtful = channel.dirty or now - channel.replies.changed_at > _IDLE_S
+            if not channel.intact() or (doubtful and channel.replies.moved()):
+                self._drop("the regions were replaced")
+        if self._channel is None:
             if self._regions.directory is None or now < self._retry_at or not self._inner.connected:
                 return None
             self._try_to_open(now)
-            channel = self._channel
-            if channel is None:
-                return None
-        self._used_at = now
-        if channel.dirty and not self._is_clean(channel):
-            if self._channel is not None:
-                self._obstacle = "waiting for an old reply"
-            return None
-        return channel
+        channel = self._channel
+        if channel is None or not channel.dirty or self._is_clean(channel):
+            return channel
+        if self._channel is not None:
+            self._obstacle = "waiting for an old reply"
+        return None
 
     async def _let_it_end(self, op: Op, deadline: float | None) -> None:
         """Wait until the server is done with the request whose caller gave up.
@@ -257,33 +243,24 @@ class ShmTransport:
                 await asyncio.sleep(_SETTLE_LOOK_S)
 
     def _is_clean(self, channel: RegionChannel) -> bool:
+        now = asyncio.get_running_loop().time()
         try:
-            waits = channel.dirty and channel.intact() and not channel.synchronised()
-            if waits and channel.ask_for_sync(asyncio.get_running_loop().time()):
+            if channel.dirty and channel.intact() and not channel.synchronised() and channel.ask_for_sync(now):
                 self._ring()
         except ProtocolError as error:
             self._drop("")
-            self._put_off(error, asyncio.get_running_loop().time())
+            self._put_off(error, now)
         return not channel.dirty
 
     def _try_to_open(self, now: float) -> Exception | None:
         """Open the regions. Return why they cannot be used."""
         try:
-            paths: list[Path] = []
-            for file in (REQUEST_FILE, REPLY_FILE):
-                path = self._regions.find(file)
-                if path is None:
-                    paths_tried = ", ".join(map(str, self._regions.candidates(file)))
-                    raise FileNotFoundError(f"there is no {paths_tried}")
-                paths.append(path)
-            self._channel = RegionChannel(paths[0], paths[1], self._regions.events(paths[0]))
+            channel = self._channel = RegionChannel(self._regions, on_news=self._on_news, on_lost=self._on_lost)
         except (OSError, ProtocolError) as error:
             self._put_off(error, now)
             return error
-        self._regions.connect_doorbell()
-        self._used_at = now
         doorbell = "no" if self._regions.doorbell is None else "yes"
-        log.info("shared memory in %s; doorbell: %s", paths[0].parent, doorbell)
+        log.info("shared memory in %s; doorbell: %s", channel.replies.file.path.parent, doorbell)
         return None
 
     def _put_off(self, error: Exception, now: float) -> None:
@@ -311,31 +288,29 @@ class ShmTransport:
     async def _over_shm(
         self, channel: RegionChannel, frame: bytes, pending: SentRequest, loop: asyncio.AbstractEventLoop
     ) -> bytes:
-        op, reply, deadline = pending.op, pending.reply, pending.deadline
+        op, reply = pending.op, pending.reply
         self._pending = pending
         # If the wait ends without the reply, that reply is still outstanding.
-        channel.dirty = True
+        channel.dirty = channel.replies.waits = True
         try:
             channel.publish(frame)
             sent = time.perf_counter()
             self.stats.sent += 1
             self.stats.over_shm += 1
             self._ring()
-            if self._timer is None or (deadline is not None and deadline < self._due):
-                self._look_at(loop, deadline)
+            self._regions.look_by(pending.deadline)
             awake = self._busy_poll.pays(op.name)
             if awake:
-                await self._busy_poll.look(op.name, reply, self._look)
+                await self._busy_poll.look(op.name, reply, channel.replies.check)
             if not reply.done() and self._regions.doorbell is None:
-                self._on_news()
+                channel.replies.look()
             answer = await reply
         except BaseException:
             channel.abandoned_at = loop.time()
             raise
         finally:
-            channel.ignore()
+            channel.replies.ignore()
             self._pending = None
-            self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
         self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
@@ -346,76 +321,54 @@ class ShmTransport:
             self._regions.doorbell.ring(Ring.REQUEST)
 
     def _on_news(self) -> None:
-        """Deliver the reply if it has arrived; otherwise wait for the next news."""
-        self._look()
-        waits = self._pending is not None and not self._pending.reply.done()
-        if waits and self._regions.doorbell is None and self._channel is not None:
-            self._channel.expect(self._on_news, self._regions.tell)
-
-    def _look(self) -> None:
         """Deliver the reply if it has arrived."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.reply.done() or channel is None:
             return
-        if not channel.replies.intact():
-            self._drop("the reply region was cut off")
-            return
+        replies = channel.replies
         try:
-            found = channel.replies.region.read_latest(channel.seen)
+            found = replies.region.read_latest(replies.seen)
         except ProtocolError as error:
             pending.reply.set_exception(
-                ProtocolError(f"{pending.op.name}: {channel.replies.path}: {error.args[0]}", op=pending.op.name)
+                ProtocolError(f"{pending.op.name}: {replies.file.path}: {error.args[0]}", op=pending.op.name)
             )
             self._drop("the reply region is damaged")
             return
-        if found is None:
-            sequence = channel.replies.region.sequence
-            if sequence == 0:  # reinitialised: it counts from one again
-                channel.seen = 0
-            if sequence != channel.seen:  # it kept changing while it was read
-                asyncio.get_running_loop().call_soon(self._look)
+        if found is None:  # it kept changing while it was read
+            asyncio.get_running_loop().call_soon(replies.look)
             return
-        channel.seen = found.sequence
+        replies.seen = found.sequence
         if answers(found.payload, pending.op):
             pending.reply.set_result(found.payload)
         else:
             self.stats.late += 1
-            log.debug("%s: dropped a reply to another request", channel.replies.path)
+            log.debug("%s: dropped a reply to another request", replies.file.path)
 
-    def _look_at(self, loop: asyncio.AbstractEventLoop, deadline: float | None) -> None:
-        """Look for the reply after a pause, or at the deadline."""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._due = loop.time() + _LOOK_S
-        if deadline is not None:
-            self._due = min(self._due, deadline)
-        self._timer = loop.call_at(self._due, self._on_timer, loop)
-
-    def _on_timer(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._timer = None
-        pending = self._pending
+    def _on_look(self, due: float) -> None:
+        """Keep looking until the deadline, and give up then."""
+        pending, channel = self._pending, self._channel
         if pending is None:
             return
-        # Not compared to the current time: the loop may be early by its resolution.
-        expired = pending.deadline is not None and pending.deadline <= self._due
+        expired = pending.deadline is not None and pending.deadline <= due
         if not expired:
-            self._look_at(loop, pending.deadline)  # first, whatever happens below
-        self._on_news()
-        if pending.reply.done():
-            return
-        if expired:
-            pending.reply.set_exception(no_reply(pending.op, "in shared memory", self._due - pending.at))
-        elif self._channel is not None and self._channel.replaced():
-            self._drop("the regions were replaced")
+            self._regions.look_by(pending.deadline)
+        elif channel is not None:
+            channel.replies.check()
+            if not pending.reply.done():
+                pending.reply.set_exception(no_reply(pending.op, "in shared memory", due - pending.at))
 
     # When the server goes
 
     def _on_event(self, event: ClientEvent) -> None:
         if isinstance(event, ServerLost):
-            self._look()
+            if self._channel is not None:
+                self._channel.replies.check()
             self._drop("the server was lost")
         if self.on_event is not None:
             self.on_event(event)
+
+    def _on_lost(self) -> None:
+        self._drop("the regions were replaced")
 
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
