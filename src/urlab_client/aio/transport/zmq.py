@@ -182,19 +182,25 @@ class ZmqTransport:
             return
         self._closed = True
         self.connected = False
-        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
+        closed = self._was_closed()
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
         if self._timer is not None:
             self._timer.cancel()
-        if self._open is not None:
-            opened, self._open = self._open, None
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        opened, self._open = self._open, None
+        if opened is not None:
             opened.connection.close()
             give_back_context(opened.context)
 
+    def _was_closed(self) -> ClientClosed:
+        return ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
+
     def _connect(self) -> _Open:
         if self._closed:
-            raise ClientClosed(f"The client of {self.endpoint} is closed.", hint="Create a new client.")
+            raise self._was_closed()
         loop = running_loop(None if self._open is None else self._open.loop)
         context = borrow_context()
         socket = context.socket(zmq.DEALER)
