@@ -29,8 +29,10 @@ from msgspec import Struct
 
 from urlab_client._platform.children import APART
 from urlab_client.aio.background import Tell, background_thread
-from urlab_client.aio.transport.base import LateReply, RequestTransport
+from urlab_client.aio.transport.base import LateReply
 from urlab_client.aio.transport.connection import ClientKeys
+from urlab_client.aio.transport.shm import ShmRequests
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import ServerUnreachable, URLabError
 from urlab_client.events import ClientEvent
@@ -183,10 +185,10 @@ class LaunchedTransport(ZmqTransport):
         self._process: _ServerProcess | None = None
         self.scene_warnings: tuple[str, ...] = ()
 
-    async def request(
+    async def send(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`. The first request also starts the server, which its deadline does not cover.
+        """See `ZmqTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         If the server has died, a handshake starts another one; the new server would refuse any other request.
         """
@@ -200,10 +202,10 @@ class LaunchedTransport(ZmqTransport):
             took = loop.time() - before
             deadline = None if deadline is None else deadline + took
             connect_by = None if connect_by is None else connect_by + took
-        return await super().request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+        return await super().send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
 
     async def aclose(self) -> None:
-        """See `RequestTransport.aclose`. Waits a bounded time for the server to end."""
+        """See `ZmqTransport.aclose`. Waits a bounded time for the server to end."""
         await super().aclose()
         process, self._process = self._process, None
         if process is None:
@@ -391,12 +393,21 @@ _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
 _LAST_PORT = 65535
 
 
-def transport_to(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
-    """Return the transport to a server at an address.
+def transport_to(
+    address: str, step_port: int, keys: ClientKeys | None, memory: ServerRegions | None = None
+) -> ZmqTransport:
+    """Return the transport to a server at an address, with requests over shared memory if there is `memory`.
 
     Raises:
         ValueError: The address is malformed.
     """
+    transport = _over_zmq(address, step_port, keys, shm=memory is not None)
+    if memory is not None:
+        transport.shared = ShmRequests(transport, memory)
+    return transport
+
+
+def _over_zmq(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> ZmqTransport:
     if address.startswith(SCHEME):
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")

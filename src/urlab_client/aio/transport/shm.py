@@ -18,10 +18,11 @@ from collections.abc import Callable
 from functools import cache
 from typing import Final
 
-from urlab_client.aio.transport.base import LateReply, RequestTransport, SentRequest, TransportStats, lost, no_reply
+from urlab_client.aio.transport.base import LateReply, SentRequest, lost, no_reply
 from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of, succeeded
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
+from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import (
     ClientClosed,
     ProtocolError,
@@ -29,7 +30,6 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.protocol.shm import RegionNotReady, Ring
@@ -69,20 +69,18 @@ def _always_over_zmq(op: Op) -> str:
     return ""
 
 
-class ShmTransport:
-    """Transport over shared memory for requests that fit, and over another transport for the rest.
+class ShmRequests:
+    """Requests over shared memory if they fit, and over ZeroMQ if not.
 
     Args:
-        inner: The other transport, which also detects whether the server is alive.
+        over_zmq: The transport that they belong to, which also detects whether the server is alive.
         regions: Location of the server's regions.
     """
 
-    def __init__(self, inner: RequestTransport, regions: ServerRegions) -> None:
-        self.on_event: Callable[[ClientEvent], None] | None = None
-        self.stats: TransportStats = inner.stats
-        self._inner = inner
+    def __init__(self, over_zmq: ZmqTransport, regions: ServerRegions) -> None:
+        self._over_zmq = over_zmq
+        self._stats = over_zmq.stats
         self._regions = regions
-        inner.on_event = self._on_event
         regions.on_look.append(self._on_look)
         self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
@@ -92,26 +90,6 @@ class ShmTransport:
         self._refused: dict[str, str] = {}
         self._largest_state = 0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
-
-    @property
-    def state_port(self) -> int | None:
-        """See `RequestTransport.state_port`."""
-        return self._inner.state_port
-
-    @property
-    def endpoint(self) -> str:
-        """The server's RPC endpoint."""
-        return self._inner.endpoint
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is connected."""
-        return self._inner.connected
-
-    @property
-    def owed(self) -> bool:
-        """See `RequestTransport.owed`."""
-        return self._inner.owed or (self._channel is not None and self._channel.abandoned_at is not None)
 
     async def follow(self, hello: HelloOk) -> None:
         """Open the regions that a handshake names.
@@ -155,13 +133,13 @@ class ShmTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
+        """See `ZmqTransport.request`."""
         if self._channel is not None and self._channel.abandoned_at is not None:
             await self._let_it_end(op, deadline)
         pictures = op.name == "step" and b"include_cameras" in frame
         has_state = issubclass(op.reply, StateReply)  # whose size is nearly constant
         why_zmq = _always_over_zmq(op) or ("pictures" if pictures else self._refused.get(op.name, ""))
-        if not why_zmq and self._inner.owed:
+        if not why_zmq and self._over_zmq.owed:
             why_zmq = "behind an abandoned request"
         if not why_zmq:
             loop = asyncio.get_running_loop()
@@ -182,19 +160,23 @@ class ShmTransport:
                     if has_state and len(answer) > self._largest_state:
                         self._largest_state = len(answer)
                     return answer
-        self.stats.over_zmq[why_zmq] = self.stats.over_zmq.get(why_zmq, 0) + 1
-        answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+        self._stats.over_zmq[why_zmq] = self._stats.over_zmq.get(why_zmq, 0) + 1
+        answer = await self._over_zmq.send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
         if has_state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
-    async def aclose(self) -> None:
-        """See `RequestTransport.aclose`."""
+    def on_server_lost(self) -> None:
+        """Fail the pending request, unless its reply has arrived."""
+        if self._channel is not None:
+            self._channel.replies.check()
+        self._drop("the server was lost")
+
+    def close(self, error: ClientClosed) -> None:
+        """Fail the pending request and release the regions. Idempotent."""
         self._closed = True
-        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
-        self._fail(lambda _: closed)
+        self._fail(lambda _: error)
         self._drop("closed")
-        await self._inner.aclose()
 
     # Routing
 
@@ -209,7 +191,7 @@ class ShmTransport:
             if not channel.intact() or (doubtful and channel.replies.moved()):
                 self._drop("the regions were replaced")
         if self._channel is None:
-            if self._regions.directory is None or now < self._retry_at or not self._inner.connected:
+            if self._regions.directory is None or now < self._retry_at or not self._over_zmq.connected:
                 return None
             self._try_to_open(now)
         channel = self._channel
@@ -295,8 +277,8 @@ class ShmTransport:
         try:
             channel.publish(frame)
             sent = time.perf_counter()
-            self.stats.sent += 1
-            self.stats.over_shm += 1
+            self._stats.sent += 1
+            self._stats.over_shm += 1
             self._ring()
             self._regions.look_by(pending.deadline)
             awake = self._busy_poll.pays(op.name)
@@ -312,7 +294,7 @@ class ShmTransport:
             channel.replies.ignore()
             self._pending = None
         channel.dirty = False
-        self.stats.received += 1
+        self._stats.received += 1
         self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
         return answer
 
@@ -341,7 +323,7 @@ class ShmTransport:
         if answers(found.payload, pending.op):
             pending.reply.set_result(found.payload)
         else:
-            self.stats.late += 1
+            self._stats.late += 1
             log.debug("%s: dropped a reply to another request", replies.file.path)
 
     def _on_look(self, due: float) -> None:
@@ -359,20 +341,12 @@ class ShmTransport:
 
     # When the server goes
 
-    def _on_event(self, event: ClientEvent) -> None:
-        if isinstance(event, ServerLost):
-            if self._channel is not None:
-                self._channel.replies.check()
-            self._drop("the server was lost")
-        if self.on_event is not None:
-            self.on_event(event)
-
     def _on_lost(self) -> None:
         self._drop("the regions were replaced")
 
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
-        self._fail(lambda op: lost(op, f"the server at {self.endpoint}"))
+        self._fail(lambda op: lost(op, f"the server at {self._over_zmq.endpoint}"))
         if self._channel is not None:
             self._channel.close()
             self._channel = None
