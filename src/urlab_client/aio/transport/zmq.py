@@ -24,8 +24,7 @@ from urlab_client.aio.transport.connection import (
     ClientKeys,
     Connection,
     Context,
-    borrow_context,
-    give_back_context,
+    shared_context,
 )
 from urlab_client.aio.transport.waiting import BusyPoll, Watch
 from urlab_client.errors import (
@@ -232,7 +231,7 @@ class ZmqTransport:
         opened, self._open = self._open, None
         if opened is not None:
             opened.connection.close()
-            give_back_context(opened.context)
+            shared_context.give_back(opened.context)
 
     def _was_closed(self) -> ClientClosed:
         return ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
@@ -241,13 +240,13 @@ class ZmqTransport:
         if self._closed:
             raise self._was_closed()
         loop = running_loop(None if self._open is None else self._open.loop)
-        context = borrow_context()
+        context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
         try:
             connection = Connection(loop, socket, self.endpoint, self._keys, self._note, tell=self._tell)
         except ValueError:
-            give_back_context(context)
+            shared_context.give_back(context)
             raise
         replies = connection.watch(self._on_readable, on_demand=True)
         send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
