@@ -19,7 +19,7 @@ from functools import cache
 from typing import Final
 
 from urlab_client.aio.transport.base import LateReply, SentRequest, lost, no_reply
-from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of, succeeded
+from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
 from urlab_client.aio.transport.zmq import ZmqTransport
@@ -85,6 +85,7 @@ class ShmRequests:
         self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
+        self._used_at = 0.0
         self._pending: SentRequest | None = None
         self._closed = False
         self._refused: dict[str, str] = {}
@@ -162,7 +163,9 @@ class ShmRequests:
                     return answer
         self._stats.over_zmq[why_zmq] = self._stats.over_zmq.get(why_zmq, 0) + 1
         answer = await self._over_zmq.send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if has_state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
+        if (
+            has_state and not pictures and envelope_of(answer, op).op == op.reply_name
+        ):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
@@ -187,13 +190,14 @@ class ShmRequests:
             return None
         channel = self._channel
         if channel is not None:
-            doubtful = channel.dirty or now - channel.replies.changed_at > _IDLE_S
+            doubtful = channel.dirty or now - self._used_at > _IDLE_S
             if not channel.intact() or (doubtful and channel.replies.moved()):
                 self._drop("the regions were replaced")
         if self._channel is None:
             if self._regions.directory is None or now < self._retry_at or not self._over_zmq.connected:
                 return None
             self._try_to_open(now)
+        self._used_at = now
         channel = self._channel
         if channel is None or not channel.dirty or self._is_clean(channel):
             return channel
@@ -254,16 +258,16 @@ class ShmRequests:
 
     def _refusal(self, answer: bytes, op: Op) -> str:
         """Return why a reply requires sending the request over ZMQ; empty if the reply is final."""
-        if succeeded(answer, op):
-            return ""
-        code = envelope_of(answer).code
+        code = envelope_of(answer, op).code
         if code == "wrong_transport":  # the server did not execute the request
             self._refused[op.name] = "refused by the server"
         elif code == "reply_too_large":
             self._refused[op.name] = "reply too large"
             if op.effect is not Effect.READ:
                 return ""
-        return self._refused.get(op.name, "")
+        else:
+            return ""
+        return self._refused[op.name]
 
     # Over shared memory
 

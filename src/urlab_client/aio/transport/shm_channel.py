@@ -38,8 +38,10 @@ _MSGPACK = msgspec.msgpack.Decoder(Envelope)
 _JSON = msgspec.json.Decoder(Envelope)
 
 
-def envelope_of(reply: bytes) -> Envelope:
-    """Return the identifying fields of a reply; empty if the bytes are not a reply."""
+def envelope_of(reply: bytes, op: Op | None = None) -> Envelope:
+    """Return the identifying fields of a reply, which is probably one to `op`; empty if the bytes are not a reply."""
+    if op is not None and reply.startswith(_opening_of(op), 1):
+        return Envelope(op.reply_name)  # without looking at the rest, which takes as long as it is
     try:
         return (_JSON if reply[:1] == b"{" else _MSGPACK).decode(reply)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -52,16 +54,9 @@ def _opening_of(op: Op) -> bytes:
     return msgspec.msgpack.encode({"op": op.reply_name})[1:]
 
 
-def succeeded(reply: bytes, op: Op) -> bool:
-    """Return whether a reply is that of a successful `op`."""
-    return reply.startswith(_opening_of(op), 1) or envelope_of(reply).op == op.reply_name
-
-
 def answers(reply: bytes, op: Op) -> bool:
     """Return whether a reply may be the one to `op`."""
-    if reply.startswith(_opening_of(op), 1):
-        return True
-    found = envelope_of(reply)
+    found = envelope_of(reply, op)
     if found.op == "error":
         return not (found.code == "session_expired" and _SYNC_PREFIX in found.message)
     return found.op in ("", op.reply_name)  # without an op, decoding it raises, instead of waiting in vain

@@ -63,7 +63,7 @@ class RegionReader:
     Attributes:
         waits: Whether somebody waits for news.
         seen: Sequence of the last publication that was dealt with.
-        changed_at: Loop time at which news was last found.
+        quiet: Looks of the loop since there was news.
         block: Sleeps until the server signals news, for at most the given seconds; None without signals.
 
     Raises:
@@ -89,7 +89,7 @@ class RegionReader:
         self.region: Region = attached(self.file)
         self.waits: bool = True
         self.seen: int = 0
-        self.changed_at: float = location.loop.time()
+        self.quiet: int = 0
         self.block: Callable[[float], object] | None = None
         self._location = location
         self._on_news = on_news
@@ -115,7 +115,7 @@ class RegionReader:
             if self.region.begun_anew(self.seen):
                 self._on_lost()
             else:
-                self.changed_at = self._location.loop.time()
+                self.quiet = 0
                 self._on_news()
 
     def look(self) -> None:
@@ -149,8 +149,9 @@ class RegionReader:
 
     def supervise(self) -> None:
         """Look, and check the file if nothing has come since the last time."""
+        self.quiet += 1
         self.look()
-        if not self.closed and self._location.loop.time() - self.changed_at >= _LOOK_S and self.moved():
+        if not self.closed and self.quiet > 1 and self.moved():
             self._on_lost()
 
     def read(self, take: Callable[[memoryview], T]) -> Publication[T]:

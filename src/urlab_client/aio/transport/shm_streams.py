@@ -24,7 +24,7 @@ log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T")
 
-_SILENT_S = 1.0
+_SILENT = 20  # looks without news, about a second
 _FASTEST_POLL_S = 250e-6
 
 
@@ -239,13 +239,13 @@ class Regions:
         reader.handlers.clear()
         reader.close()
 
-    def _supervise(self, due: float) -> None:
+    def _supervise(self, _: float) -> None:
         if not self._wanted:
             return
         self._location.look_by()
         for reader in tuple(self._readers.values()):
             # While play runs, snapshots keep coming. One that exceeds its slot arrives only by socket.
-            if reader.ring == Ring.STATE and due - reader.changed_at > _SILENT_S and not reader.has_news():
+            if reader.ring == Ring.STATE and reader.quiet > _SILENT and not reader.has_news():
                 self._silent[reader.place.file] = reader.region.sequence
                 self.lose(reader)
         self._return_to_regions()

@@ -69,8 +69,7 @@ PICTURE_PERIOD_S: Final = 10.0
 BLIND_PICTURE_PERIOD_S: Final = 0.5
 """How often pictures are published while no client has a doorbell: a region does not know its readers."""
 
-MAX_LISTENERS: Final = 32
-
+_BACKLOG: Final = 32
 _SELECTOR_STEP_S: Final = 1e-3
 """`epoll` rounds shorter waits up to this."""
 
@@ -442,7 +441,7 @@ class _Doorbell:
         try:
             listener.bind(os.fspath(path))
             path.chmod(0o600)
-            listener.listen(MAX_LISTENERS)
+            listener.listen(_BACKLOG)
             listener.setblocking(False)
         except OSError as error:
             listener.close()
@@ -481,9 +480,6 @@ class _Doorbell:
         except OSError as error:  # no descriptor left: retrying would be a busy loop
             logger.warning("no doorbell any more: %s; further clients poll", error)
             self._stop_listening()
-            return
-        if len(self._subscriptions) >= MAX_LISTENERS:
-            client.close()
             return
         client.setblocking(False)
         self._selector.register(client, selectors.EVENT_READ)
