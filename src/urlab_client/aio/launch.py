@@ -142,17 +142,21 @@ def start_seconds(address: str) -> float:
     return seconds
 
 
-def with_start_timeout(address: str, seconds: float) -> str:
-    """Return a `sim://` address with a start timeout, unless it already has one. Other addresses do not change."""
-    _, _, query = address.partition("?")
-    if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
+def with_option(address: str, name: str, value: str = "", *, default: bool = False) -> str:
+    """Return a `sim://` address with a further option for its server. Other addresses do not change.
+
+    Args:
+        address: The address.
+        name: Name of the option.
+        value: Its value; empty for a switch.
+        default: Only if the address does not set the option itself, nor its opposite.
+    """
+    _, separator, query = address.partition("?")
+    named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
+    if not address.startswith(SCHEME) or (default and named & {name, f"no-{name}"}):
         return address
-    return f"{address}{'&' if query else '?'}{_START_TIMEOUT}={seconds:g}"
-
-
-def with_option(address: str, name: str, value: str) -> str:
-    """Return a `sim://` address with a further option for its server."""
-    return f"{address}{'&' if '?' in address else '?'}{urlencode({name: value})}"
+    item = urlencode({name: value}) if value else name
+    return f"{address}{'&' if query else '' if separator else '?'}{item}"
 
 
 def with_model_options(address: str) -> str:
@@ -161,11 +165,7 @@ def with_model_options(address: str) -> str:
     Environments and policies use it, to train and evaluate the model as its author wrote it. A plain `sim://` address
     behaves like the plugin, which ignores the options.
     """
-    model, _, query = address.partition("?")
-    named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
-    if not address.startswith(SCHEME) or named & {"mjcf-options", "no-mjcf-options"}:
-        return address
-    return f"{model}?{query}{'&' if query else ''}mjcf-options"
+    return with_option(address, "mjcf-options", default=True)
 
 
 class LaunchedTransport(ZmqTransport):
