@@ -68,7 +68,7 @@ def _region(path: Path, stride: int) -> shm.Region:
         file.truncate(shm.region_size(stride))
         file.write(struct.pack("<IIIIQI36x", shm.MAGIC, shm.VERSION, stride, 2, 0, 0))
         file.flush()
-        return shm.attach(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=lambda: None)
+        return shm.Region(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), fence=lambda: None)
 
 
 def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:

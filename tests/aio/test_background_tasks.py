@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from bare_loop import run_bare
@@ -15,7 +15,6 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio import launch as launching
-from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.aio.session.control import Control
 from urlab_client.aio.state import connection_monitor
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
@@ -128,48 +127,28 @@ async def test_the_switching_of_cameras(caplog: pytest.LogCaptureFixture, monkey
                 assert switch.is_on(view.info)
 
 
-async def test_the_log_and_the_end_of_a_started_server(
+async def test_the_thread_that_logs_what_a_started_server_prints(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launching, "_log_lines", fail)
-    monkeypatch.setattr(LaunchedTransport, "_tell_end", fail)
-    async with URLabClient("sim://arm", step_mode="direct") as client, client.events() as events:
-        await client.discover()
-        await is_told(events, caplog, "urlab-server-log")
-        await is_told(events, caplog, "urlab-server-end")
-        assert (await client.step()).step == 1
+    def close_and_die(pipe: IO[bytes], *_: Any) -> None:
+        pipe.close()
+        die()
 
-
-@pytest.fixture
-def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An event loop that starts no processes, as uvloop's."""
-
-    async def refuse(*_: Any, **__: Any) -> None:
-        raise NotImplementedError
-
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
-
-
-@pytest.mark.usefixtures("no_processes")
-async def test_threads_that_read_from_a_started_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launching, "_CHUNK_BYTES", "many")
-    async with URLabClient("sim://arm") as client:
-        with pytest.raises(URLabError, match="urlab-server ended unexpectedly: TypeError") as caught:
-            await client.discover()
-        assert isinstance(caught.value.__cause__, TypeError)
-
-
-@pytest.mark.usefixtures("no_processes")
-async def test_the_thread_that_waits_for_a_started_server(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launching._Watched, "_watch", die)
+    monkeypatch.setattr(launching, "_log_lines", close_and_die)
     client = URLabClient("sim://arm", step_mode="direct")
     async with client.events() as events:
         await client.discover()
         assert (await client.step()).step == 1
         await is_told(events, caplog, "urlab-server")
     await client.close()
+
+
+async def test_the_thread_that_reads_from_a_started_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launching, "_CHUNK_BYTES", "many")
+    async with URLabClient("sim://arm") as client:
+        with pytest.raises(URLabError, match="urlab-server ended unexpectedly: TypeError") as caught:
+            await client.discover()
+        assert isinstance(caught.value.__cause__, TypeError)
 
 
 def look_or_die(monkeypatch: pytest.MonkeyPatch, lives: Iterator[bool]) -> list[bool]:

@@ -146,41 +146,20 @@ async def test_a_killed_server_is_noticed() -> None:
         assert (await reconnections.receive()).refused is True, "another server, not another connection"
 
 
-class LateNews:
-    """A process whose end is told when a test says so."""
-
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
-        self.told = asyncio.Event()
-        self._process = process
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._process, name)
-
-    @property
-    def returncode(self) -> int | None:
-        return self._process.returncode if self.told.is_set() else None
-
-    async def wait(self) -> int:
-        await self.told.wait()
-        return await self._process.wait()
-
-
 async def test_a_call_that_waits_for_a_connection_to_a_killed_server_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes: list[LateNews] = []
-    start = launch._start
-
-    async def start_one(*arguments: Any) -> Any:
-        processes.append(LateNews(await start(*arguments)))
-        return processes[-1]
-
-    monkeypatch.setattr(launch, "_start", start_one)
+    told: list[bool] = []
+    known = property(lambda process: process._process.poll() if told else None)
+    monkeypatch.setattr(launch._ServerProcess, "returncode", known)
     async with URLabClient("sim://ball", step_mode="direct") as client:
         await client.discover()
-        processes[0].kill()
+        transport: Any = client._transport
+        os.kill(transport._process.pid, signal.SIGKILL)
         await until(lambda: not client.connected)
         step = asyncio.create_task(client.step(timeout=10 * DEADLINE_S))
-        await until(lambda: client._transport._inner._waiting)  # type: ignore[attr-defined]
-        processes[0].told.set()
+        await until(lambda: transport._waiting)
+        transport._process._process.wait()
+        told.append(True)
+        transport._on_end()
         async with asyncio.timeout(DEADLINE_S):
             with pytest.raises(ServerUnreachable, match=r"exited with code -9.*discover\(\)"):
                 await step
@@ -232,7 +211,8 @@ def never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def forks_and_never_ends(never_ends: None) -> None:
     program = Path(sys.executable)
-    program.write_text(program.read_text().replace("\ntime", "\nimport os\nos.write(1, b'%d\\n' % os.fork())\ntime"))
+    forks = "\nimport os\npid = os.fork()\npid and open(__file__ + '.forked', 'w').write(str(pid))\ntime"
+    program.write_text(program.read_text().replace("\ntime", forks))
 
 
 async def test_what_a_server_has_forked_does_not_delay_the_close(
@@ -243,15 +223,15 @@ async def test_what_a_server_has_forked_does_not_delay_the_close(
     with pytest.raises(URLabError):  # on a busy machine its time is over before that is known
         await client.discover()
     process = client._transport._process  # type: ignore[attr-defined]
-    forked = max([int(await process.stdout.readline()) for _ in range(2)])  # the fork itself says 0
+    note = Path(sys.executable + ".forked")
+    await until(lambda: note.exists() and note.read_text())
+    forked = int(await asyncio.to_thread(note.read_text))
     try:
         async with asyncio.timeout(DEADLINE_S):
             await client.close()
     finally:
         os.kill(forked, signal.SIGKILL)
-        for pipe in (process.stdout, process.stderr):
-            await pipe.read()
-    assert await process.wait() == -signal.SIGKILL
+    assert process.returncode == -signal.SIGKILL
 
 
 async def test_cancelling_the_close_ends_the_server_at_once(never_ends: None) -> None:
@@ -260,13 +240,12 @@ async def test_cancelling_the_close_ends_the_server_at_once(never_ends: None) ->
         await client.discover()
     process = client._transport._process  # type: ignore[attr-defined]
     close = asyncio.create_task(client.close())
-    await until(process.stdin.is_closing, look=0)
+    await until(lambda: process._input.closed, look=0)
     assert process.returncode is None
     close.cancel()
     with pytest.raises(asyncio.CancelledError):
         await close
     assert process.returncode == -signal.SIGKILL
-    assert process._transport.is_closing(), "its pipes are closed"
     await client.close()
 
 
@@ -277,7 +256,7 @@ def test_interrupting_a_blocking_close_ends_the_server_at_once(never_ends: None)
     process = client._aio._transport._process  # type: ignore[attr-defined]
 
     def interrupt() -> None:
-        eventually(process.stdin.is_closing)
+        eventually(lambda: process._input.closed)
         os.kill(os.getpid(), signal.SIGUSR1)
 
     def strike(*_: object) -> None:

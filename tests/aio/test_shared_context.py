@@ -32,29 +32,29 @@ async def test_those_that_stay_go_on_when_others_are_closed(scripted: Any) -> No
 
 async def test_a_client_that_finds_no_server_gives_it_back_and_one_without_an_address_does_at_once() -> None:
     gc.collect()  # clients of other tests that were not closed
-    users = shared._shared._users
+    users = shared.shared_context._users
     async with URLabClient("tcp://127.0.0.1:9", rcv_timeout_ms=100) as lost:
         with pytest.raises(ServerUnreachable):
             await lost.meta()
-        assert shared._shared._users == users + 1
-    assert shared._shared._users == users
+        assert shared.shared_context._users == users + 1
+    assert shared.shared_context._users == users
     async with URLabClient(f"ipc:///tmp/{'a' * 200}") as wrong:  # longer than a path may be there
         with pytest.raises(ValueError, match="not an address"):
             await wrong.meta()
-        assert shared._shared._users == users
+        assert shared.shared_context._users == users
 
 
 def test_the_last_one_ends_it_and_the_next_one_gets_another() -> None:
-    before = shared.borrow_context()
-    assert shared.borrow_context() is before
-    shared.give_back_context(before)
+    before = shared.shared_context.borrow()
+    assert shared.shared_context.borrow() is before
+    shared.shared_context.give_back(before)
     assert not before.closed
-    shared.give_back_context(before)
+    shared.shared_context.give_back(before)
     # Whether it is over depends on clients of other tests that were not closed.
-    after = shared.borrow_context()
+    after = shared.shared_context.borrow()
     assert not after.closed
     assert before.closed or before is after
-    shared.give_back_context(after)
+    shared.shared_context.give_back(after)
 
 
 def test_borrowed_from_several_threads_at_once() -> None:
@@ -65,9 +65,9 @@ def test_borrowed_from_several_threads_at_once() -> None:
         try:
             start.wait(10)
             for _ in range(50):
-                context = shared.borrow_context()
+                context = shared.shared_context.borrow()
                 assert not context.closed
-                shared.give_back_context(context)
+                shared.shared_context.give_back(context)
         except BaseException as failure:  # noqa: BLE001 - told to the test
             failures.append(failure)
 
@@ -82,15 +82,15 @@ def test_borrowed_from_several_threads_at_once() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks on this system")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_fork_gets_a_context_of_its_own() -> None:
-    ours = shared.borrow_context()
+    ours = shared.shared_context.borrow()
     child = os.fork()
     if child == 0:
-        own = shared.borrow_context()
+        own = shared.shared_context.borrow()
         fine = own is not ours and not own.closed
-        shared.give_back_context(ours)  # nothing to it: it is the parent's
-        shared.give_back_context(own)
+        shared.shared_context.give_back(ours)  # nothing to it: it is the parent's
+        shared.shared_context.give_back(own)
         os._exit(0 if fine and own.closed else 1)
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 0
     assert not ours.closed
-    shared.give_back_context(ours)
+    shared.shared_context.give_back(ours)

@@ -15,7 +15,7 @@ import pytest
 from hello import hello_ok
 from publisher import Publisher
 from waiting import DEADLINE_S
-from written_region import WrittenRegion, create
+from written_region import WrittenRegion
 
 from urlab_client._platform.processors import processor_fence
 from urlab_client.aio.streams.publishers import Publishers
@@ -321,7 +321,7 @@ async def test_pictures_go_on_when_a_server_begins_to_count_anew(
     async with frames(publishers) as stream:
         await stream.receive()
         # After a crash the plugin lays out its files in place.
-        again = create(camera_region._map, camera_region.region.stride, fence=processor_fence())
+        again = shm.Region.lay_out(memoryview(camera_region._map), camera_region.region.stride, fence=processor_fence())
         again.publish(picture(2))
         assert (await stream.receive()).pixels[0, 0, 2] == 2
         again.publish(picture(3))

@@ -10,7 +10,6 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from written_region import create
 
 from urlab_client._platform.processors import no_fence
 from urlab_client.errors import ProtocolError
@@ -22,7 +21,7 @@ STRIDE = 24
 
 def new_region(n_buffers: int = 2, stride: int = STRIDE) -> tuple[bytearray, Region]:
     buffer = bytearray(b"\xee" * shm.region_size(stride, n_buffers))
-    return buffer, create(buffer, stride, n_buffers, fence=no_fence)
+    return buffer, Region.lay_out(buffer, stride, n_buffers, fence=no_fence)
 
 
 def payload_of(publication: int) -> bytes:
@@ -55,7 +54,7 @@ class TestPublishAndRead:
         buffer, region = new_region(n_buffers)
         for payload in payloads:
             region.publish(payload)
-        reader = shm.attach(memoryview(buffer).toreadonly(), fence=no_fence)
+        reader = shm.Region(memoryview(buffer).toreadonly(), fence=no_fence)
         newest = reader.read_latest()
         assert newest == shm.Publication(len(payloads), payloads[-1])
         assert reader.read_latest(len(payloads)) is None
@@ -66,7 +65,7 @@ class TestPublishAndRead:
     @given(st.lists(st.tuples(st.booleans(), st.binary(min_size=1, max_size=STRIDE - 4)), max_size=20))
     def test_following_a_writer(self, steps: list[tuple[bool, bytes]]) -> None:
         buffer, region = new_region()
-        reader = shm.attach(buffer, fence=no_fence)
+        reader = shm.Region(buffer, fence=no_fence)
         last_seen, newest, unread = 0, b"", False
         for is_read, payload in steps:
             if is_read:
@@ -95,7 +94,7 @@ class TestPublishAndRead:
         buffer, region = new_region()
         for _ in range(5):
             region.publish(b"old")
-        anew = create(buffer, STRIDE, fence=no_fence)
+        anew = Region.lay_out(buffer, STRIDE, fence=no_fence)
         assert region.read_latest(5) is None
         anew.publish(b"new")
         assert region.read_latest(5) == shm.Publication(1, b"new")
@@ -103,7 +102,7 @@ class TestPublishAndRead:
     def test_a_second_writer_goes_on_where_the_first_stopped(self) -> None:
         buffer, region = new_region()
         region.publish(b"one")
-        shm.attach(buffer, fence=no_fence).publish(b"two")
+        shm.Region(buffer, fence=no_fence).publish(b"two")
         assert region.read_latest() == shm.Publication(2, b"two")
 
     def test_the_counter_is_64_bits_wide(self) -> None:
@@ -127,12 +126,14 @@ class TestPublishAndRead:
     def test_publishing_needs_a_writable_mapping(self) -> None:
         buffer, _ = new_region()
         with pytest.raises(ValueError, match="mapped read-only"):
-            shm.attach(memoryview(buffer).toreadonly(), fence=no_fence).publish(b"x")
+            shm.Region(memoryview(buffer).toreadonly(), fence=no_fence).publish(b"x")
 
     def test_order_of_the_stores(self) -> None:
         buffer = bytearray(shm.region_size(STRIDE))
         seen: list[tuple[bytes, int, int]] = []
-        region = create(buffer, STRIDE, fence=lambda: seen.append((bytes(buffer[88:95]), buffer[24], buffer[16])))
+        region = Region.lay_out(
+            buffer, STRIDE, fence=lambda: seen.append((bytes(buffer[88:95]), buffer[24], buffer[16]))
+        )
         seen.clear()
         region.publish(b"abc")
         slot = b"\3\0\0\0abc"
@@ -161,7 +162,7 @@ class TestTornReads:
             return first + bytes(live[half:])
 
         advance(head_start)
-        reader = shm.attach(buffer, fence=interrupt)
+        reader = shm.Region(buffer, fence=interrupt)
         last_seen = 0
         for _ in range(4):
             publication = reader.read_latest(last_seen, take=take)
@@ -202,7 +203,7 @@ class TestTornReads:
         def take(live: memoryview) -> bytes:
             copy = bytes(live)
             if copy == b"old":
-                create(buffer, STRIDE, 4, fence=no_fence).publish(b"new")
+                Region.lay_out(buffer, STRIDE, 4, fence=no_fence).publish(b"new")
             return copy
 
         assert region.read_latest(take=take) == shm.Publication(1, b"new")
@@ -242,17 +243,17 @@ class TestTornReads:
     def test_a_slot_that_looks_corrupt_only_for_a_moment(self) -> None:
         buffer, _ = new_region()
         repairs: list[Callable[[], None]] = []
-        reader = shm.attach(buffer, fence=lambda: repairs.pop()() if repairs else None)
-        shm.attach(buffer, fence=no_fence).publish(b"a")
+        reader = shm.Region(buffer, fence=lambda: repairs.pop()() if repairs else None)
+        shm.Region(buffer, fence=no_fence).publish(b"a")
         struct.pack_into("<I", buffer, 64 + STRIDE, 0)
-        repairs[:] = [lambda: shm.attach(buffer, fence=no_fence).publish(b"b"), lambda: None, lambda: None]
+        repairs[:] = [lambda: shm.Region(buffer, fence=no_fence).publish(b"b"), lambda: None, lambda: None]
         assert reader.read_latest() == shm.Publication(2, b"b")
 
 
 class TestCreateAndAttach:
     def test_not_ready_until_the_last_store(self) -> None:
         buffer = bytearray(shm.region_size(STRIDE))
-        region = create(buffer, STRIDE, fence=no_fence)
+        region = Region.lay_out(buffer, STRIDE, fence=no_fence)
         region.publish(b"old")
         looks = 0
 
@@ -260,26 +261,26 @@ class TestCreateAndAttach:
             nonlocal looks
             looks += 1
             with pytest.raises(shm.RegionNotReady, match="not written yet"):
-                shm.attach(buffer, fence=no_fence)
+                shm.Region(buffer, fence=no_fence)
 
-        create(buffer, STRIDE, fence=look)
+        Region.lay_out(buffer, STRIDE, fence=look)
         assert looks == 2
-        assert shm.attach(buffer, fence=no_fence).read_latest() is None
+        assert shm.Region(buffer, fence=no_fence).read_latest() is None
 
     @given(st.integers(0, 111))
     def test_a_file_that_is_still_growing(self, size: int) -> None:
         buffer, _ = new_region()
         with pytest.raises(shm.RegionNotReady, match=f"{size} bytes, expected"):
-            shm.attach(buffer[:size], fence=no_fence)
+            shm.Region(buffer[:size], fence=no_fence)
 
     def test_a_file_full_of_zeros(self) -> None:
         with pytest.raises(shm.RegionNotReady, match="not written yet"):
-            shm.attach(bytearray(112), fence=no_fence)
+            shm.Region(bytearray(112), fence=no_fence)
 
     def test_bytes_beyond_the_slots_do_not_matter(self) -> None:
         buffer, region = new_region()
         region.publish(b"a")
-        assert shm.attach(buffer + b"more", fence=no_fence).read_latest() == shm.Publication(1, b"a")
+        assert shm.Region(buffer + b"more", fence=no_fence).read_latest() == shm.Publication(1, b"a")
 
     @pytest.mark.parametrize(
         ("offset", "value", "problem"),
@@ -294,7 +295,7 @@ class TestCreateAndAttach:
         buffer, _ = new_region()
         struct.pack_into("<I", buffer, offset, value)
         with pytest.raises(ProtocolError, match=problem) as caught:
-            shm.attach(buffer, fence=no_fence)
+            shm.Region(buffer, fence=no_fence)
         assert not isinstance(caught.value, shm.RegionNotReady)
         assert type(pickle.loads(pickle.dumps(caught.value))) is ProtocolError
 
@@ -303,7 +304,7 @@ class TestCreateAndAttach:
         head = struct.pack("<IIII", shm.MAGIC, 1, STRIDE, 2) if plausible else b""
         buffer = bytearray(head + image)
         try:
-            region = shm.attach(buffer, fence=no_fence)
+            region = shm.Region(buffer, fence=no_fence)
             publication = region.read_latest()
         except ProtocolError:
             return
@@ -334,8 +335,8 @@ class TestCreateAndAttach:
         with path.open("r+b") as file:
             ours = mmap.mmap(file.fileno(), 0)
             theirs = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        writer = create(memoryview(ours), STRIDE, fence=no_fence)
-        reader = shm.attach(memoryview(theirs), fence=no_fence)
+        writer = Region.lay_out(memoryview(ours), STRIDE, fence=no_fence)
+        reader = shm.Region(memoryview(theirs), fence=no_fence)
         writer.publish(b"across")
         assert reader.read_latest() == shm.Publication(1, b"across")
         for region, mapping in ((writer, ours), (reader, theirs)):

@@ -220,7 +220,7 @@ def test_a_published_snapshot_and_its_region() -> None:
     assert topic == topics.STATE_FULL
     assert StateSnapshot.decode(payload).per_articulation.keys() == {"arm_a"}
     region = vectors.load("shm_region_state_full", "beta")
-    found = shm.attach(bytearray(region.data), fence=no_fence).read_latest()
+    found = shm.Region(bytearray(region.data), fence=no_fence).read_latest()
     assert found is not None
     assert found.sequence == region.decoded["header"]["sequence"]
     assert StateSnapshot.decode(found.payload).per_articulation.keys() == {"arm_a"}

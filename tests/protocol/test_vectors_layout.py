@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 import pytest
 import vectors
-from written_region import create
 
 from urlab_client._platform.processors import no_fence
 from urlab_client.enums import CameraMode
@@ -253,7 +252,7 @@ def test_shm_fresh_region_is_created_byte_for_byte() -> None:
     for name in ("shm_header_state_fresh", "shm_header_rpc_fresh"):
         vector = vectors.load(name)
         buffer = bytearray(b"\xee" * vector.decoded["file_size"])
-        create(buffer, vector.decoded["buffer_stride"], fence=no_fence)
+        shm.Region.lay_out(buffer, vector.decoded["buffer_stride"], fence=no_fence)
         assert buffer == vector.data.ljust(len(buffer), b"\0")
 
 
@@ -261,7 +260,7 @@ def test_shm_slot() -> None:
     vector = vectors.load("shm_slot_meta_request")
     stride = vector.decoded["stride"]
     buffer = bytearray(shm.region_size(stride))
-    region = create(buffer, stride, fence=no_fence)
+    region = shm.Region.lay_out(buffer, stride, fence=no_fence)
     region.publish(msgspec.msgpack.encode(vector.decoded["payload"]))
     assert buffer[64 + stride :] == vector.data
 
@@ -271,7 +270,7 @@ def test_shm_region(name: str) -> None:
     vector = vectors.load(name)
     header = shm.parse_header(vector.data)
     assert_header(header, vector.decoded["header"])
-    publication = shm.attach(memoryview(vector.data), fence=no_fence).read_latest()
+    publication = shm.Region(memoryview(vector.data), fence=no_fence).read_latest()
     assert publication is not None
     assert publication.sequence == header.sequence
     if "latest" in vector.decoded:
@@ -295,9 +294,9 @@ def test_shm_region(name: str) -> None:
 def test_shm_region_is_produced_byte_for_byte(name: str, publications: list[str]) -> None:
     vector = vectors.load(name)
     buffer = bytearray(len(vector.data))
-    region = create(buffer, vector.decoded["header"]["buffer_stride"], fence=no_fence)
+    region = shm.Region.lay_out(buffer, vector.decoded["header"]["buffer_stride"], fence=no_fence)
     for publication in publications:
-        newest = shm.attach(memoryview(vectors.load(publication).data), fence=no_fence).read_latest()
+        newest = shm.Region(memoryview(vectors.load(publication).data), fence=no_fence).read_latest()
         assert newest is not None
         region.publish(newest.payload)
     assert buffer == vector.data
@@ -315,7 +314,7 @@ def test_rejected_shm_region(name: str) -> None:
         "file shorter than 64 + stride * n_buffers": "88 bytes, expected 112 (64 + 24 * 2)",
     }[vector.decoded["reason"]]
     with pytest.raises(ProtocolError) as caught:
-        shm.attach(memoryview(vector.data), fence=no_fence).read_latest()
+        shm.Region(memoryview(vector.data), fence=no_fence).read_latest()
     assert words in str(caught.value)
     assert isinstance(caught.value, shm.RegionNotReady) == (name == "shm_reject_short_file")
 

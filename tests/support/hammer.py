@@ -2,8 +2,7 @@
 
 Says that it is ready, waits for a line, and in the end prints counts.
 
-`write` and `read` are the client's ways, through a mapping; `serve` and `answer` are the server's, which publishes and
-takes requests by system calls. Every payload is one 64-bit number over and over, so that a mixture of two shows. The
+`write` publishes, `read` reads. Every payload is one 64-bit number over and over, so that a mixture of two shows. The
 number tells which publication it is, so that one taken under the wrong count shows, too.
 """
 
@@ -17,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from urlab_client._platform.processors import processor_fence
-from urlab_client.protocol.shm import Region, attach
+from urlab_client.protocol.shm import Region
 
 WORDS = (8, 40, 100)
 STRIDE = 1024
@@ -28,12 +27,9 @@ LONGEST_PAUSE_S = 20e-6
 
 
 def opened(path: Path) -> tuple[Region, mmap.mmap]:
-    give_up = time.monotonic() + START_S
-    while not path.exists():  # the server's side makes it
-        assert time.monotonic() < give_up, f"there is no {path}"
     with path.open("r+b") as file:
         mapping = mmap.mmap(file.fileno(), 0)
-    return attach(memoryview(mapping), fence=processor_fence()), mapping
+    return Region(memoryview(mapping), fence=processor_fence()), mapping
 
 
 def publish(put: Callable[[bytes], None], seconds: float) -> str:
@@ -80,22 +76,6 @@ def wait_for_start() -> None:
 
 
 def run(role: str, path: Path, seconds: float) -> str:
-    if role == "serve":
-        from urlab_client.server.transport.region_files import RegionFile  # what the client's side need not load
-
-        region_file = RegionFile(path, STRIDE)
-        wait_for_start()
-        return publish(region_file.publish, seconds)
-    if role == "answer":
-        from urlab_client.server.transport.region_files import RequestFile
-
-        requests = RequestFile(path, STRIDE)
-
-        def request(seen: int) -> tuple[int, bytes | None]:
-            return (seen, None) if requests.sequence() == seen else requests.read()
-
-        wait_for_start()
-        return take(request, seconds)
     region, _mapping = opened(path)
     wait_for_start()
     if role == "write":

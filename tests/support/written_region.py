@@ -9,20 +9,6 @@ from urlab_client._platform.processors import processor_fence
 from urlab_client.protocol import shm
 
 
-def create(
-    buffer: bytearray | memoryview | mmap.mmap, stride: int, n_buffers: int = 2, *, fence: shm.Fence
-) -> shm.Region:
-    """Lay out an empty region in a buffer, erasing what it held. Until its end readers find the region not ready."""
-    view = memoryview(buffer)
-    view[:4] = bytes(4)
-    fence()
-    view[4 : shm.HEADER_SIZE] = shm.HEADER.pack(0, shm.VERSION, stride, n_buffers, 0, 0)[4:]
-    view[shm.HEADER_SIZE : shm.region_size(stride, n_buffers)] = bytes(stride * n_buffers)
-    fence()
-    view[:4] = shm.HEADER.pack(shm.MAGIC, 0, 0, 0, 0, 0)[:4]
-    return shm.attach(view, fence=fence)
-
-
 class WrittenRegion:
     """A region's file and its writer, made in place as the plugin does."""
 
@@ -31,7 +17,7 @@ class WrittenRegion:
         with path.open("w+b") as file:
             file.truncate(shm.region_size(stride))
             self._map = mmap.mmap(file.fileno(), shm.region_size(stride))
-        self.region = create(self._map, stride, fence=processor_fence())
+        self.region = shm.Region.lay_out(memoryview(self._map), stride, fence=processor_fence())
 
     def publish(self, payload: bytes) -> None:
         """Publish; what is too large is dropped."""

@@ -38,7 +38,6 @@ from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.connection import client_keys, is_local
-from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.enums import (
     CameraTiming,
@@ -184,8 +183,7 @@ class URLabClient(ClientState):
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
         memory = ServerRegions(shm_dir) if Transport(transport) is Transport.SHM else None
-        plain = transport_to(address, step_port, keys, shm=memory is not None)
-        self._transport = plain if memory is None else ShmTransport(plain, memory)
+        self._transport = transport_to(address, step_port, keys, memory)
         session = Session(
             self._transport,
             default_timeout=rcv_timeout_ms / 1000,

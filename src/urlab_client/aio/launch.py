@@ -13,28 +13,31 @@ import logging
 import math
 import os
 import re
-import signal
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 import warnings
 from collections.abc import Callable, Collection, Sequence
-from functools import partial
-from typing import IO, TypeVarTuple
+from typing import IO, TypeVarTuple, cast
 from urllib.parse import parse_qsl, urlencode
+from weakref import WeakMethod
 
 import msgspec
 from msgspec import Struct
 
 from urlab_client._platform.children import APART
-from urlab_client.aio.background import Tell, background_task, background_thread
-from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
+from urlab_client.aio.background import Tell, background_thread
+from urlab_client.aio.transport.base import LateReply
 from urlab_client.aio.transport.connection import ClientKeys
+from urlab_client.aio.transport.shm import ShmRequests
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.zmq import ZmqTransport
-from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
+from urlab_client.errors import ServerUnreachable, URLabError
 from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Op
-from urlab_client.protocol.messages.session import Hello, HelloOk
+from urlab_client.protocol.messages.session import Hello
 
 log: logging.Logger = logging.getLogger("urlab_client.launch")
 
@@ -44,7 +47,7 @@ SCHEME = "sim://"
 _START_S = 60.0
 _START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
-_LOOK_S = 0.05
+_LOOK_S = 0.01
 _OPENING = frozenset({"allow-any-client", "allow-client", "insecure-no-auth", "server-key"})
 _STOP_S = 10.0  # it takes 0.2 s on an idle machine, and 3 s with eight programs per processor
 
@@ -139,17 +142,21 @@ def start_seconds(address: str) -> float:
     return seconds
 
 
-def with_start_timeout(address: str, seconds: float) -> str:
-    """Return a `sim://` address with a start timeout, unless it already has one. Other addresses do not change."""
-    _, _, query = address.partition("?")
-    if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
+def with_option(address: str, name: str, value: str = "", *, default: bool = False) -> str:
+    """Return a `sim://` address with a further option for its server. Other addresses do not change.
+
+    Args:
+        address: The address.
+        name: Name of the option.
+        value: Its value; empty for a switch.
+        default: Only if the address does not set the option itself, nor its opposite.
+    """
+    _, separator, query = address.partition("?")
+    named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
+    if not address.startswith(SCHEME) or (default and named & {name, f"no-{name}"}):
         return address
-    return f"{address}{'&' if query else '?'}{_START_TIMEOUT}={seconds:g}"
-
-
-def with_option(address: str, name: str, value: str) -> str:
-    """Return a `sim://` address with a further option for its server."""
-    return f"{address}{'&' if '?' in address else '?'}{urlencode({name: value})}"
+    item = urlencode({name: value}) if value else name
+    return f"{address}{'&' if query else '' if separator else '?'}{item}"
 
 
 def with_model_options(address: str) -> str:
@@ -158,14 +165,10 @@ def with_model_options(address: str) -> str:
     Environments and policies use it, to train and evaluate the model as its author wrote it. A plain `sim://` address
     behaves like the plugin, which ignores the options.
     """
-    model, _, query = address.partition("?")
-    named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
-    if not address.startswith(SCHEME) or named & {"mjcf-options", "no-mjcf-options"}:
-        return address
-    return f"{model}?{query}{'&' if query else ''}mjcf-options"
+    return with_option(address, "mjcf-options", default=True)
 
 
-class LaunchedTransport:
+class LaunchedTransport(ZmqTransport):
     """Transport to a simulated server that it starts.
 
     Attributes:
@@ -173,133 +176,80 @@ class LaunchedTransport:
     """
 
     def __init__(self, address: str, *, shm: bool = False) -> None:
-        self.stats: TransportStats = TransportStats()
+        super().__init__(address)  # the endpoint until the server runs
         self._address = address
         self._arguments = serve_arguments(address)
         self._start_s = start_seconds(address)
         if shm and not any(argument.startswith("--shm-dir") for argument in self._arguments):
             self._arguments.append(f"--shm-dir={_memory_directory()}")
-        self._process: asyncio.subprocess.Process | _Watched | None = None
-        self._drain: asyncio.Task[None] | None = None
-        self._watch: asyncio.Task[None] | None = None
-        self._inner: ZmqTransport | None = None
-        self._launching: asyncio.Task[ZmqTransport] | None = None
-        self._state_port: int | None = None
-        self._lost_at = 0.0
-        self._closed = False
-        self.on_event: Callable[[ClientEvent], None] | None = None
+        self._process: _ServerProcess | None = None
         self.scene_warnings: tuple[str, ...] = ()
 
-    @property
-    def state_port(self) -> int | None:
-        """See `Transport.state_port`; None before the server runs."""
-        return self._state_port
-
-    @property
-    def endpoint(self) -> str:
-        """The server's RPC endpoint once it runs; the address before that."""
-        return self._address if self._inner is None else self._inner.endpoint
-
-    @property
-    def connected(self) -> bool:
-        """Whether the server is running and connected."""
-        return self._inner is not None and self._inner.connected
-
-    @property
-    def owed(self) -> bool:
-        """See `RequestTransport.owed`."""
-        return self._inner is not None and self._inner.owed
-
-    async def request(
+    async def send(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`. The first request also starts the server, which its deadline does not cover.
+        """See `ZmqTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         If the server has died, a handshake starts another one; the new server would refuse any other request.
         """
         process = self._process
-        if self._inner is not None and process is not None and process.returncode is not None:
-            if op.request is not Hello:
+        if process is None or process.returncode is not None:
+            if process is not None and op.request is not Hello:
                 raise self._ended(process, op)
-            self._lost_at = self._inner.lost_at
-            await self._stop_server()
-        if self._inner is None:
             loop = asyncio.get_running_loop()
             before = loop.time()
-            self._inner = await self._started(op)
+            await self._launch(op)
             took = loop.time() - before
             deadline = None if deadline is None else deadline + took
             connect_by = None if connect_by is None else connect_by + took
-        return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-
-    async def follow(self, hello: HelloOk) -> None:
-        """See `Transport.follow`. Does nothing: there is only one path."""
+        return await super().send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
 
     async def aclose(self) -> None:
-        """See `Transport.aclose`. Waits a bounded time for the server to end."""
-        if self._closed:
-            return
-        self._closed = True
-        if self._launching is not None:
-            self._launching.cancel()
-            await asyncio.wait((self._launching,))
-        await self._stop_server()
-
-    async def _stop_server(self) -> None:
-        """Release the resources of the server that was started last, and wait a bounded time for its exit."""
-        inner, self._inner = self._inner, None
+        """See `ZmqTransport.aclose`. Waits a bounded time for the server to end."""
+        await super().aclose()
         process, self._process = self._process, None
-        drain, self._drain = self._drain, None
-        watch, self._watch = self._watch, None
-        if watch is not None:
-            watch.cancel()
-        if inner is not None:
-            await inner.aclose()
         if process is None:
             return
-        if process.stdin is not None:
-            process.stdin.close()
         try:
-            async with asyncio.timeout(_STOP_S):
-                await process.wait()
-        except TimeoutError:
-            log.warning("%s: the server did not exit within %g s and was killed", self._address, _STOP_S)
-        finally:  # also if cancelled: no process or pipe may be left behind
-            _kill(process)
-            # Until Python 3.13 the wait ends with the pipes, which what the server has forked may hold for longer.
-            with contextlib.suppress(TimeoutError, URLabError):  # a pipe that could not be read was reported
-                async with asyncio.timeout(_STOP_S):
-                    await process.wait()
-                    # asyncio warns later about a pipe that is still open when its loop is closed.
-                    if drain is not None:
-                        await asyncio.wait((drain,))
-                    for pipe in (process.stdout, process.stderr):
-                        if pipe is not None:
-                            await pipe.read()
+            if not await process.end(_STOP_S):
+                log.warning("%s: the server did not exit within %g s and was killed", self._address, _STOP_S)
+        finally:  # also if cancelled: no process may be left behind
+            await process.kill()
 
-    async def _started(self, op: Op) -> ZmqTransport:
-        """Start a server in a separate task, which both `aclose` and the waiting caller can cancel."""
+    async def _launch(self, op: Op) -> None:
+        """Start a server, and wait until it is ready."""
         if self._closed:
             raise self._was_closed()
-        await self._stop_server()  # remains of a cancelled start
-        task = self._launching = asyncio.create_task(self._launch(op), name="urlab-launch")
+        if self.connected:
+            self._lose()  # the server's end is known before that of the connection
+        self._disconnect()
+        if self._process is not None:
+            await self._process.kill()
+        command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
+        process = self._process = _ServerProcess(command, self._on_end, self._tell)
         try:
-            # If cancelled, this cancels the task and waits for its end.
-            (transport,) = await asyncio.gather(task, return_exceptions=True)
-        finally:
-            self._launching = None
-        if self._closed:
-            raise self._was_closed()
-        if isinstance(transport, BaseException):
-            raise transport
-        return transport
+            ready = await self._ready_line(process, op)
+        except BaseException as error:  # also if cancelled: the next call starts another server
+            await process.kill()
+            self._process = None
+            if self._closed and isinstance(error, URLabError):
+                raise self._was_closed() from None
+            raise
+        process.logs.set()
+        self.endpoint = f"{ready.address}:{ready.step_port}"
+        self.refused = True
+        self.state_port = ready.state_port
+        self.scene_warnings = ready.scene_warnings
+        for warning in ready.scene_warnings:
+            warnings.warn(f"{self._address}: {warning}", stacklevel=2)
 
-    async def _tell_end(self, process: asyncio.subprocess.Process | _Watched, transport: ZmqTransport) -> None:
+    def _on_end(self) -> None:
         """Fail unsent requests that wait for a connection once the server has exited."""
-        await process.wait()
-        transport.fail_waiting(self._ended(process))
+        process = self._process
+        if process is not None and process.logs.is_set() and process.returncode is not None:
+            self.fail_waiting(self._ended(process))
 
-    def _ended(self, process: asyncio.subprocess.Process | _Watched, op: Op | None = None) -> ServerUnreachable:
+    def _ended(self, process: _ServerProcess, op: Op | None = None) -> ServerUnreachable:
         return ServerUnreachable(
             f"{f'{op.name}: ' if op else ''}the simulated server of {self._address} has exited with code "
             f"{process.returncode}. Nothing was sent.",
@@ -307,45 +257,14 @@ class LaunchedTransport:
             hint="discover() starts another one.",
         )
 
-    def _was_closed(self) -> ClientClosed:
-        return ClientClosed(f"The client of {self._address} was closed.", hint="Create a new client.")
-
-    async def _launch(self, op: Op) -> ZmqTransport:
-        command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
-        process = await _start(command, self.on_event)
-        self._process = process
-        try:
-            ready = await self._ready_line(process, op)
-        except BaseException:  # also if cancelled: the next call starts another server
-            _kill(process)
-            raise
-        if process.stderr is not None:
-            self._drain = background_task("urlab-server-log", _log_lines(process.stderr), tell=self.on_event)
-        transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
-        transport.stats = self.stats
-        transport.on_event = self.on_event
-        transport.lost_at = self._lost_at
-        transport.refused = True
-        ending = self._tell_end(process, transport)
-        self._watch = background_task("urlab-server-end", ending, tell=self.on_event, failed=transport.fail_waiting)
-        self._state_port = ready.state_port
-        self.scene_warnings = ready.scene_warnings
-        for warning in ready.scene_warnings:
-            warnings.warn(f"{self._address}: {warning}", stacklevel=2)
-        return transport
-
-    async def _ready_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> _Ready:
+    async def _ready_line(self, process: _ServerProcess, op: Op) -> _Ready:
         """Return what the server says when it is ready, or raise with the server's error output."""
-        output, errors = process.stdout, process.stderr
-        if output is None or errors is None:
-            raise TypeError("the server's output must be a pipe")
         try:
             async with asyncio.timeout(self._start_s):
-                line = await output.readline()
+                line = await process.first_line
                 if line:
                     return msgspec.json.decode(line, type=_Ready)
-                reason = (await errors.read()).decode(errors="replace").strip()
-                await process.wait()
+                reason = await process.last_words()
         except TimeoutError:
             reason = f"not ready within {self._start_s:g} s; add ?{_START_TIMEOUT}=SECONDS to the address for more"
         except (ValueError, RecursionError) as error:
@@ -355,67 +274,107 @@ class LaunchedTransport:
         )
 
 
-async def _start(command: Sequence[str], tell: Tell | None) -> asyncio.subprocess.Process | _Watched:
-    pipe = subprocess.PIPE
-    try:
-        return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)
-    except NotImplementedError:  # asyncio raises it on a loop that cannot start processes
-        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)  # noqa: ASYNC220, S603
-        return _Watched(process, tell)
+class _ServerProcess:
+    """A child process that threads read from, because not every event loop can start processes.
 
+    Such are the selector loop on Windows and, up to Python 3.13, loops of a policy without a child watcher. The threads
+    do not hold this object: when it is forgotten, the child's input closes, and the child exits.
 
-class _Watched:
-    """A process that threads read from and wait for, with the part of `asyncio.subprocess.Process` used here.
+    Args:
+        command: What to run.
+        on_end: Called on the event loop when the process has ended.
+        tell: Publishes the event that a thread died.
 
-    For loops that cannot start processes: the selector loop on Windows and, up to Python 3.13, loops of a policy
-    without a child watcher, such as uvloop's.
+    Attributes:
+        first_line: What it prints first; empty if it prints nothing.
+        errors: What it writes to its error output, while `logs` is not set.
+        logs: Whether to log that output instead.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], tell: Tell | None) -> None:
-        self.pid = process.pid
-        self.stdin = process.stdin
-        self.stdout = asyncio.StreamReader()
-        self.stderr = asyncio.StreamReader()
+    def __init__(self, command: Sequence[str], on_end: Callable[[], object], tell: Tell) -> None:
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)  # noqa: S603
+        loop = asyncio.get_running_loop()
+        self.pid: int = process.pid
+        self.first_line: asyncio.Future[bytes] = loop.create_future()
+        self.errors: list[str] = []
+        self.logs: threading.Event = threading.Event()
         self._process = process
-        self._loop = asyncio.get_running_loop()
-        self._ended = asyncio.Event()
-        background_thread("urlab-server", self._watch, tell=tell, failed=lambda _: self._soon(self._ended.set)).start()
-        for reader, pipe in ((self.stdout, process.stdout), (self.stderr, process.stderr)):
-            if pipe is not None:
-                fail = partial(self._fail, reader)
-                background_thread("urlab-server", self._feed, reader, pipe, tell=tell, failed=fail).start()
+        self._input, process.stdin = process.stdin, None
+        first_line, ended, told = self.first_line, WeakMethod(on_end), WeakMethod(tell)
+
+        def soon(callback: Callable[[*Ts], object], *arguments: *Ts) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(callback, *arguments)
+
+        def read(output: IO[bytes]) -> None:
+            with output:
+                soon(_settle, first_line, output.readline(_CHUNK_BYTES))
+                while output.read(_CHUNK_BYTES):
+                    pass  # a full pipe would block the server
+            process.wait()
+            soon(lambda: (on_end := ended()) and on_end())
+
+        def tell_of(event: ClientEvent) -> None:
+            if (tell := told()) is not None:
+                tell(event)
+
+        output, errors = cast("IO[bytes]", process.stdout), cast("IO[bytes]", process.stderr)
+        self._log = background_thread("urlab-server", _log_lines, errors, self.errors, self.logs, tell=tell_of)
+        self._log.start()
+        background_thread(
+            "urlab-server", read, output, tell=tell_of, failed=lambda error: soon(_settle, first_line, error)
+        ).start()
 
     @property
     def returncode(self) -> int | None:
         """The exit code; None while the process runs."""
-        return self._process.returncode
+        return self._process.poll()
 
-    def kill(self) -> None:
-        """Kill the process."""
-        self._process.kill()
-
-    async def wait(self) -> None:
-        """Wait for the exit of the process."""
-        await self._ended.wait()
-        while self._process.poll() is None:  # noqa: ASYNC110 - the thread that waits for it died
+    async def last_words(self) -> str:
+        """Wait for the end and return the error output."""
+        await self.wait()
+        while self._log.is_alive():  # noqa: ASYNC110 - a thread has no event
             await asyncio.sleep(_LOOK_S)
+        return "".join(self.errors).strip()
 
-    def _feed(self, reader: asyncio.StreamReader, pipe: IO[bytes]) -> None:
-        with pipe:
-            while data := os.read(pipe.fileno(), _CHUNK_BYTES):
-                self._soon(reader.feed_data, data)
-        self._soon(reader.feed_eof)
+    async def wait(self, seconds: float = math.inf) -> bool:
+        """Wait for the end; return whether it came in time."""
+        give_up = time.monotonic() + seconds
+        while self.returncode is None and time.monotonic() < give_up:  # noqa: ASYNC110 - likewise
+            await asyncio.sleep(_LOOK_S)
+        return self.returncode is not None
 
-    def _fail(self, reader: asyncio.StreamReader, error: URLabError) -> None:
-        self._soon(reader.set_exception, error)
+    async def end(self, seconds: float) -> bool:
+        """Close the input, which ends the process; return whether it ended in time."""
+        if self._input is not None:
+            self._input.close()
+        return await self.wait(seconds)
 
-    def _watch(self) -> None:
-        self._process.wait()
-        self._soon(self._ended.set)
+    async def kill(self) -> None:
+        """End the process at once, if it still runs, and close its input."""
+        self._process.kill()
+        await self.end(_STOP_S)
 
-    def _soon(self, callback: Callable[[*Ts], object], *arguments: *Ts) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            self._loop.call_soon_threadsafe(callback, *arguments)
+
+def _settle(first_line: asyncio.Future[bytes], result: bytes | URLabError) -> None:
+    if first_line.done():
+        return
+    if isinstance(result, bytes):
+        first_line.set_result(result)
+    else:
+        first_line.set_exception(result)
+
+
+def _log_lines(pipe: IO[bytes], errors: list[str], logs: threading.Event) -> None:
+    """Log what the server prints. An undrained pipe would block the server."""
+    with pipe:
+        while line := pipe.readline(_CHUNK_BYTES):
+            text = line.decode(errors="replace")
+            if logs.is_set():
+                log.info("server: %s", text.rstrip())
+            else:
+                errors.append(text)
 
 
 def _memory_directory() -> str:
@@ -430,39 +389,25 @@ _DEFAULTS: Sequence[str] = (
 )  # fmt: skip
 
 
-def _kill(process: asyncio.subprocess.Process | _Watched) -> None:
-    if process.returncode is not None:
-        return
-    if sys.platform == "win32":
-        process.kill()
-        return
-    # Not `process.kill()`: it would reap a child that has just exited, whose status asyncio's watcher waits for.
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(process.pid, signal.SIGKILL)
-
-
-async def _log_lines(stream: asyncio.StreamReader) -> None:
-    """Log what the server prints. An undrained pipe would block the server."""
-    while True:
-        try:
-            line = await stream.readline()
-        except ValueError:  # longer than the stream's limit, and dropped
-            continue
-        if not line:
-            return
-        log.info("server: %s", line.decode(errors="replace").rstrip())
-
-
 _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
 _LAST_PORT = 65535
 
 
-def transport_to(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
-    """Return the transport to a server at an address.
+def transport_to(
+    address: str, step_port: int, keys: ClientKeys | None, memory: ServerRegions | None = None
+) -> ZmqTransport:
+    """Return the transport to a server at an address, with requests over shared memory if there is `memory`.
 
     Raises:
         ValueError: The address is malformed.
     """
+    transport = _over_zmq(address, step_port, keys, shm=memory is not None)
+    if memory is not None:
+        transport.shared = ShmRequests(transport, memory)
+    return transport
+
+
+def _over_zmq(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> ZmqTransport:
     if address.startswith(SCHEME):
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")

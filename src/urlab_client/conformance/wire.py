@@ -16,9 +16,7 @@ import msgspec
 from msgspec import Struct, inspect
 
 from urlab_client.aio.launch import transport_to
-from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.transport.connection import ClientKeys
-from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.conformance.declarations import expecting, holds
@@ -65,9 +63,8 @@ class Wire:
     """
 
     def __init__(self, address: str, step_port: int, keys: ClientKeys | None, *, shm: bool, timeout: float) -> None:
-        inner = transport_to(address, step_port, keys, shm=shm)
         self.regions: ServerRegions | None = ServerRegions(None) if shm else None
-        self._transport: RequestTransport = inner if self.regions is None else ShmTransport(inner, self.regions)
+        self._transport = transport_to(address, step_port, keys, self.regions)
         self._subscriptions = Subscriptions(keys)
         self._timeout = timeout
         self.session_id: str = ""

@@ -20,7 +20,6 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import force_setattr
 
 from urlab_client.errors import ProtocolError, rpc_error
 from urlab_client.protocol.base import Needs, Op, Reply, Request
@@ -309,108 +308,43 @@ def _restore_binary(value: Any) -> Any:
 
 
 def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
-    """Return the bytes of a reply as the plugin sends it, with every number as a float64."""
-    reply = _widen_struct(reply)
-    if not json:
-        return _encoder.encode(reply)
-    plain = msgspec.to_builtins(reply, builtin_types=(bytes, msgspec.Raw), enc_hook=_to_wire)
-    return msgspec.json.encode(_spelled(plain))
+    """Return the bytes of a reply as the plugin sends it: structs declare counters as `int`, the wire has float64."""
+    plain = msgspec.to_builtins(reply, builtin_types=(bytes, msgspec.Raw), enc_hook=_packed)
+    return msgspec.json.encode(_spelled(plain)) if json else _encoder.encode(_widened(plain))
+
+
+def _packed(value: Any) -> msgspec.Raw:
+    """Return an array in msgpack, so that nothing looks at each of its numbers again."""
+    return msgspec.Raw(_encoder.encode(np.asarray(value, dtype=np.float64).tolist()))
+
+
+def _widened(value: Any) -> Any:
+    match value:
+        case bool():
+            return value
+        case int():
+            return float(value)
+        case dict():
+            return {key: _widened(item) for key, item in cast("dict[str, Any]", value).items()}
+        case list() | tuple():
+            return [_widened(item) for item in cast("list[Any]", value)]
+        case _:
+            return value
 
 
 def _spelled(value: Any) -> Any:
     """Return a reply as the plugin encodes it in JSON: bytes as base64 under a separate key, numbers as `%.17g`."""
+    if isinstance(value, msgspec.Raw):
+        value = msgspec.msgpack.decode(value)
     match value:
         case dict():
             items = cast("dict[str, Any]", value).items()
             return {f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spelled(item) for key, item in items}
-        case list():
+        case list() | tuple():
             return [_spelled(item) for item in cast("list[Any]", value)]
-        case msgspec.Raw():
-            return msgspec.msgpack.decode(value)
         case bytes():
             return base64.b64encode(value).decode("ascii")
-        case float() if math.isfinite(value):
+        case int() | float() if math.isfinite(value) and not isinstance(value, bool):
             return msgspec.Raw(b"%.17g" % value)
         case _:
             return value  # numbers that are not finite become null; the plugin's JSON would be invalid
-
-
-# Widening integers. Structs declare counters as `int` for readability, but the wire uses float64. The affected fields
-# are determined once per struct type; most structs need no or one assignment.
-
-Widener = Callable[[Any], Any]
-
-
-@cache
-def _widener(struct: type[Struct]) -> Widener | None:
-    """Return a function that returns a `struct` with widened integers, or None if it cannot contain any."""
-    plan = [(f.name, widen) for f in msgspec.structs.fields(struct) if (widen := _plan(f.type, struct)) is not None]
-    if not plan:
-        return None
-
-    def apply(value: Any) -> Any:
-        widened = value.__copy__()  # what is encoded belongs to others, too: a picture also to the camera's stream
-        for name, widen in plan:
-            item = getattr(value, name)
-            if item is not None:
-                force_setattr(widened, name, widen(item))  # public types in replies are frozen
-        return widened
-
-    return apply
-
-
-def _plan(annotation: Any, owner: type[Struct]) -> Widener | None:
-    return _plan_info(msgspec.inspect.type_info(annotation), owner)
-
-
-def _plan_info(info: msgspec.inspect.Type, owner: type[Struct]) -> Widener | None:  # noqa: PLR0911
-    match info:
-        case msgspec.inspect.Metadata(type=inner):
-            return _plan_info(inner, owner)
-        case msgspec.inspect.UnionType(types=types):
-            plans = [plan for member in types if (plan := _plan_info(member, owner)) is not None]
-            return plans[0] if plans else None
-        case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
-            return float
-        case msgspec.inspect.TupleType() | msgspec.inspect.ListType(item_type=msgspec.inspect.FloatType()):
-            return _widen_numbers  # tuples on the wire are vectors and sizes
-        case msgspec.inspect.ListType(item_type=item):
-            return _each(_plan_info(item, owner))
-        case msgspec.inspect.DictType(value_type=item):
-            return _each_value(_plan_info(item, owner))
-        case msgspec.inspect.StructType(cls=cls):
-            # A recursive struct is looked up when it occurs, not while its plan is being built.
-            return _widen_struct if cls is owner else _widener(cls)
-        case msgspec.inspect.AnyType():
-            return _widen_any
-        case _:
-            return None
-
-
-def _widen_struct(value: Struct) -> Struct:
-    widen = _widener(type(value))
-    return widen(value) if widen is not None else value
-
-
-def _widen_numbers(values: Any) -> list[float]:
-    return [*map(float, values)]
-
-
-def _each(widen: Widener | None) -> Widener | None:
-    return None if widen is None else lambda values: list(map(widen, values))
-
-
-def _each_value(widen: Widener | None) -> Widener | None:
-    return None if widen is None else lambda values: {k: widen(v) for k, v in values.items()}
-
-
-def _widen_any(value: Any) -> Any:
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, int):
-        return float(value)
-    if isinstance(value, dict):
-        return {k: _widen_any(v) for k, v in cast("dict[str, Any]", value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_widen_any(v) for v in cast("list[Any]", value)]
-    return value

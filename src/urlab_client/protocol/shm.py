@@ -1,7 +1,6 @@
 """Layout of the shared-memory regions: header, slots, publication order, torn reads, file names. No files, no mapping.
 
-For the shared-memory transports of client and server, which map files and hand the mapped bytes to `attach`. Which ops
-may travel this way is the registry's business.
+For the shared-memory transports of client and server, which map files and hand the mapped bytes to `Region`.
 
 A region is a header of 64 bytes and two or more slots of `stride` bytes, each a payload after its size:
 
@@ -40,8 +39,6 @@ from urlab_client.errors import ProtocolError
 MAGIC = 0x424C5255
 VERSION = 1
 HEADER_SIZE = 64
-LAYOUT_SIZE = 16
-"""How much of the header, from its start, stays as it is for as long as the region does."""
 SIZE_PREFIX = 4
 RPC_STRIDE = 1_048_576
 MAX_BUFFERS = 64
@@ -55,6 +52,7 @@ MAX_DOORBELL_PATH_BYTES = 103
 """Longest path that every system's `sockaddr_un` holds; with a longer one there is no doorbell."""
 
 HEADER = Layout("<IIIIQI36x")
+_LAYOUT_SIZE = 16  # bytes of the header, from its start, that stay as they are for as long as the region does
 _SIZE = Layout("<I")
 _SEQUENCE_MASK = (1 << 64) - 1
 _MIN_STATE_STRIDE = 16_384
@@ -151,45 +149,66 @@ def parse_header(buffer: bytes | bytearray | memoryview) -> Header:
     magic, version, stride, n_buffers, sequence, latest = HEADER.unpack(head)
     if 0 in (magic, version, stride, n_buffers):
         raise RegionNotReady("shared-memory region: the header is not written yet.", raw=head)
-    _check_field("magic", f"{magic:#010x}", f"{MAGIC:#010x}", ok=magic == MAGIC, raw=head)
-    _check_field("protocol_version", version, VERSION, ok=version == VERSION, raw=head)
-    _check_field("buffer_stride", stride, f"{SIZE_PREFIX} or more", ok=stride >= SIZE_PREFIX, raw=head)
-    # A lone slot could change at any moment: no read of it can be known to be whole.
-    _check_field("n_buffers", n_buffers, f"2 to {MAX_BUFFERS}", ok=2 <= n_buffers <= MAX_BUFFERS, raw=head)
-    expected = region_size(stride, n_buffers)
-    if len(buffer) < expected:
-        problem = f"{len(buffer)} bytes, expected {expected} (64 + {stride} * {n_buffers})"
+    for field, value, expected, right in (
+        ("magic", f"{magic:#010x}", f"{MAGIC:#010x}", magic == MAGIC),
+        ("protocol_version", version, VERSION, version == VERSION),
+        ("buffer_stride", stride, f"{SIZE_PREFIX} or more", stride >= SIZE_PREFIX),
+        # A lone slot could change at any moment: no read of it can be known to be whole.
+        ("n_buffers", n_buffers, f"2 to {MAX_BUFFERS}", 2 <= n_buffers <= MAX_BUFFERS),
+        ("latest_idx", latest, f"below n_buffers ({n_buffers})", latest < n_buffers),
+    ):
+        if not right:
+            raise ProtocolError(f"shared-memory region: {field} is {value}, expected {expected}.", raw=head)
+    size = region_size(stride, n_buffers)
+    if len(buffer) < size:
+        problem = f"{len(buffer)} bytes, expected {size} (64 + {stride} * {n_buffers})"
         raise RegionNotReady(f"shared-memory region: {problem}.", raw=head)
-    _check_field("latest_idx", latest, f"below n_buffers ({n_buffers})", ok=latest < n_buffers, raw=head)
     return Header(stride, n_buffers, sequence, latest)
-
-
-def _check_field(field: str, value: object, expected: object, *, ok: bool, raw: bytes) -> None:
-    if not ok:
-        raise ProtocolError(f"shared-memory region: {field} is {value}, expected {expected}.", raw=raw)
 
 
 class Region:
     """A region in mapped memory, for its one writer or for any of its readers.
 
-    Made by `attach`. Stride and number of slots are those found then: a later change of the header by the
-    other side cannot lead outside the buffer.
+    Stride and number of slots are those found at first: a later change of the header by the other side cannot lead
+    outside the buffer.
+
+    Args:
+        buffer: The whole region, aligned to 8 as a mapping is; read-only is enough for reading.
+        fence: The memory barrier of this processor; a function that does nothing on x86.
 
     Attributes:
         stride: Bytes per slot, the size prefix included.
         n_buffers: Number of slots.
         max_payload: Largest payload that fits, bytes.
+
+    Raises:
+        RegionNotReady: It is still being created.
+        ProtocolError: The header cannot be right.
     """
 
-    def __init__(self, buffer: bytearray | memoryview, stride: int, n_buffers: int, fence: Fence) -> None:
-        self.stride = stride
-        self.n_buffers = n_buffers
-        self.max_payload: int = stride - SIZE_PREFIX
+    def __init__(self, buffer: bytearray | memoryview, *, fence: Fence) -> None:
+        header = parse_header(buffer)
+        self.stride: int = header.stride
+        self.n_buffers: int = header.n_buffers
+        self.max_payload: int = header.stride - SIZE_PREFIX
         self._fence = fence
         self._bytes = memoryview(buffer)
+        self._layout = bytes(self._bytes[:_LAYOUT_SIZE])
         # Single aligned moves; putting a number together from bytes could mix an old half with a new one.
         self._sequence = self._bytes[16:24].cast("Q")
         self._latest = self._bytes[24:28].cast("I")
+
+    @classmethod
+    def lay_out(cls, buffer: bytearray | memoryview, stride: int, n_buffers: int = 2, *, fence: Fence) -> Region:
+        """Make an empty region of a buffer. Until its end, readers find the region not ready."""
+        view = memoryview(buffer)
+        view[:4] = bytes(4)
+        fence()
+        view[4:HEADER_SIZE] = HEADER.pack(0, VERSION, stride, n_buffers, 0, 0)[4:]
+        view[HEADER_SIZE : region_size(stride, n_buffers)] = bytes(stride * n_buffers)
+        fence()
+        view[:4] = HEADER.pack(MAGIC, 0, 0, 0, 0, 0)[:4]
+        return cls(view, fence=fence)
 
     @property
     def sequence(self) -> int:
@@ -234,10 +253,9 @@ class Region:
         Args:
             last_seen: `sequence` of the publication seen last. To take what is there already, pass 0; to wait for
                 what comes next, pass the region's present `sequence`.
-            take: Makes the payload from a live view of the slot: a copy by default, or for example a decoder, or a
-                conversion into an array of the caller's. The writer may be changing the slot meanwhile. What was
-                taken is dropped and taken again when it did, so nothing returned may alias the view, and neither a
-                result nor an exception counts before the sequence was checked.
+            take: Makes the payload from a live view of the slot: a copy by default, or for example a conversion into
+                an array of the caller's. The writer may be changing the slot meanwhile. What was taken is dropped and
+                taken again when it did, so nothing returned may alias the view.
 
         Returns:
             The publication; None when there is no other one, or when the writer kept overwriting it while it was
@@ -285,26 +303,14 @@ class Region:
         self._fence()
         return not 0 <= self._sequence[0] - sequence <= self.n_buffers - 2
 
+    def begun_anew(self, seen: int) -> bool:
+        """Return whether another writer laid the region out in place since publication `seen`."""
+        return self.sequence < seen or bytes(self._bytes[:_LAYOUT_SIZE]) != self._layout
+
     def release(self) -> None:
         """Let go of the buffer, so that it can be unmapped. The region is unusable afterwards."""
         for view in (self._sequence, self._latest, self._bytes):
             view.release()
-
-
-def attach(buffer: bytearray | memoryview, *, fence: Fence) -> Region:
-    """Open the region that another process laid out in a buffer.
-
-    Args:
-        buffer: The whole region, aligned to 8 as a mapping is; read-only is enough for reading.
-        fence: The memory barrier of this processor; a function that does nothing on x86.
-
-    Raises:
-        RegionNotReady: If it is still being created.
-        ProtocolError: If the header cannot be right.
-    """
-    view = memoryview(buffer)
-    header = parse_header(view)
-    return Region(view, header.stride, header.n_buffers, fence)
 
 
 _SEPARATORS = re.compile(r"[/\\:\0]")

@@ -11,7 +11,8 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 from urlab_client.aio.client_types import CallOutcome, CallRecord
-from urlab_client.aio.transport.base import LateReply, RequestTransport
+from urlab_client.aio.transport.base import LateReply
+from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import URLabConnectionError, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.base import Op
 
@@ -30,7 +31,7 @@ class CallRecords:
     A session without an observer does not use this class: its requests go directly to the transport.
     """
 
-    def __init__(self, observe: Observe, transport: RequestTransport) -> None:
+    def __init__(self, observe: Observe, transport: ZmqTransport) -> None:
         if not callable(observe):
             raise TypeError(f"observe= takes a function of one argument, a CallRecord, not {observe!r}")
         if inspect.iscoroutinefunction(observe) or inspect.iscoroutinefunction(getattr(observe, "__call__", None)):  # noqa: B004

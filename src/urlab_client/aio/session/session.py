@@ -17,7 +17,7 @@ from urlab_client.aio.session.call_records import CallRecords, Observe
 from urlab_client.aio.session.control import Control
 from urlab_client.aio.session.jobs import OnProgress, finish
 from urlab_client.aio.session.turn import Deadlines, Mutex, Settle, Turn, require_reply
-from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import (
     ConnectionLost,
     GameThreadTimeout,
@@ -92,7 +92,7 @@ class Session:
 
     def __init__(
         self,
-        transport: RequestTransport,
+        transport: ZmqTransport,
         *,
         default_timeout: float | None,
         json: bool = False,
@@ -132,7 +132,7 @@ class Session:
         self._hello_unanswered = False
 
     @property
-    def transport(self) -> RequestTransport:
+    def transport(self) -> ZmqTransport:
         return self._transport
 
     async def call(

@@ -15,7 +15,8 @@ from typing import Any, Generic, TypeVar
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams.buffer import BufferedMessage, StreamBuffer
-from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
+from urlab_client.aio.transport.shm_regions import MessageGone
+from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import (
     ClientClosed,
     ConcurrentReadError,

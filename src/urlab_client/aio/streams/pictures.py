@@ -15,7 +15,8 @@ from typing import Final
 
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import Camera, CameraSource
-from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler, client_closed
+from urlab_client.aio.transport.shm_regions import MessageGone
+from urlab_client.aio.transport.subscriber import MessageHandler, client_closed
 from urlab_client.enums import CameraMode
 from urlab_client.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.session import CameraFrame

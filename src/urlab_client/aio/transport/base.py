@@ -1,17 +1,15 @@
-"""The interface between a session and its transport."""
+"""What requests over ZeroMQ and over shared memory share."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from msgspec import Struct
 
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabError, URLabTimeoutError
-from urlab_client.events import ClientEvent
 from urlab_client.protocol.base import Effect, Op
-from urlab_client.protocol.messages.session import HelloOk
 
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
 """Callback invoked with a future when the caller abandons a request that was sent. The future receives the late reply,
@@ -46,68 +44,6 @@ class SentRequest(Struct):
     reply: asyncio.Future[bytes]
     at: float
     deadline: float | None
-
-
-class RequestTransport(Protocol):
-    """Sends requests and returns their replies. Use from one event loop."""
-
-    stats: TransportStats
-    on_event: Callable[[ClientEvent], None] | None
-    """Callback invoked when the connection is opened, lost or restored."""
-
-    @property
-    def state_port(self) -> int | None:
-        """Port of the state stream if the transport knows it; None if it is configured separately."""
-        ...
-
-    @property
-    def endpoint(self) -> str:
-        """Address that requests go to, for messages."""
-        ...
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is connected."""
-        ...
-
-    @property
-    def owed(self) -> bool:
-        """Whether the server has yet to answer a request whose caller gave up, so that it may still execute it."""
-        ...
-
-    async def request(
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> bytes:
-        """Send `frame` and return the reply's bytes.
-
-        Args:
-            frame: The encoded request.
-            op: Its op, which errors name and which determines the meaning of a lost reply.
-            deadline: Loop time at which to give up; None waits without limit.
-            connect_by: Loop time by which a connection must be open; None waits without limit.
-            late: Callback invoked with a future for the reply when this call is cancelled or times out after sending;
-                None drops the reply.
-
-        Raises:
-            ServerUnreachable: No connection was open by `connect_by`; nothing was sent.
-            URLabTimeoutError: The request was sent, but no reply arrived by `deadline`.
-            ConnectionLost: The connection broke after sending; the op changes nothing.
-            OutcomeUnknown: The connection broke after sending; the op may have been executed.
-            ClientClosed: The client was closed.
-        """
-        ...
-
-    async def follow(self, hello: HelloOk) -> None:
-        """Adopt the alternative transports that a handshake describes.
-
-        Raises:
-            URLabConnectionError: The requested transport is not available.
-        """
-        ...
-
-    async def aclose(self) -> None:
-        """Fail all pending requests and release all resources. Idempotent."""
-        ...
 
 
 def lost(op: Op, what: str) -> URLabError:

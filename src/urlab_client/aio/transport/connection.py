@@ -262,11 +262,18 @@ class _SharedContext:
     """
 
     def __init__(self) -> None:
+        self._start_over()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._start_over)
+
+    def _start_over(self) -> None:
+        # A fork's copy of the context has no threads behind it.
         self._lock = threading.Lock()
         self._context: Context | None = None
         self._users = 0
 
     def borrow(self) -> Context:
+        """Return the context, created if needed. The caller must call `give_back`."""
         with self._lock:
             if self._context is None:
                 self._context = zmq.Context()
@@ -275,6 +282,7 @@ class _SharedContext:
             return self._context
 
     def give_back(self, context: Context) -> None:
+        """Return a borrowed context after closing its sockets. The last call terminates the context."""
         with self._lock:
             if context is not self._context:  # this process is a fork of the borrower
                 return
@@ -286,23 +294,4 @@ class _SharedContext:
             context.term()
 
 
-_shared = _SharedContext()
-
-
-def _start_over() -> None:
-    global _shared  # noqa: PLW0603  # a fork's copy of the context has no threads behind it
-    _shared = _SharedContext()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_start_over)
-
-
-def borrow_context() -> Context:
-    """Return the shared context, created if needed. The caller must call `give_back_context`."""
-    return _shared.borrow()
-
-
-def give_back_context(context: Context) -> None:
-    """Return a borrowed context after closing its sockets. The last call terminates the context."""
-    _shared.give_back(context)
+shared_context: Final = _SharedContext()

@@ -16,13 +16,13 @@ import logging
 import time
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Final
 
-from urlab_client.aio.transport.base import LateReply, RequestTransport, SentRequest, TransportStats, lost, no_reply
-from urlab_client.aio.transport.shm_channel import RegionChannel, answers, envelope_of, succeeded
-from urlab_client.aio.transport.shm_regions import RegionInUse, ServerRegions
+from urlab_client.aio.transport.base import LateReply, SentRequest, lost, no_reply
+from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of
+from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
+from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import (
     ClientClosed,
     ProtocolError,
@@ -30,10 +30,9 @@ from urlab_client.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.events import ClientEvent, ServerLost
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages.session import HelloOk, StateReply
-from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, Ring
+from urlab_client.protocol.shm import RegionNotReady, Ring
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
@@ -47,8 +46,6 @@ _SETTLE_LOOK_S = 1e-3
 # No request over shared memory takes this long, so nothing reads these regions any more.
 _DEAD_S = 30.0
 _IDLE_S = 0.5
-# Look for the reply at this interval in any case, so that a lost ring delays it no longer.
-_LOOK_S = 0.05
 
 # Time to poll on the loop before it sleeps.
 _SPIN_S = 400e-6
@@ -72,54 +69,28 @@ def _always_over_zmq(op: Op) -> str:
     return ""
 
 
-class ShmTransport:
-    """Transport over shared memory for requests that fit, and over another transport for the rest.
+class ShmRequests:
+    """Requests over shared memory if they fit, and over ZeroMQ if not.
 
     Args:
-        inner: The other transport, which also detects whether the server is alive.
+        over_zmq: The transport that they belong to, which also detects whether the server is alive.
         regions: Location of the server's regions.
     """
 
-    def __init__(self, inner: RequestTransport, regions: ServerRegions) -> None:
-        self.on_event: Callable[[ClientEvent], None] | None = None
-        self.stats: TransportStats = inner.stats
-        self._inner = inner
+    def __init__(self, over_zmq: ZmqTransport, regions: ServerRegions) -> None:
+        self._over_zmq = over_zmq
+        self._stats = over_zmq.stats
         self._regions = regions
-        inner.on_event = self._on_event
-        regions.on_ring[Ring.REPLY].append(self._on_news)
+        regions.on_look.append(self._on_look)
         self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
         self._used_at = 0.0
         self._pending: SentRequest | None = None
-        # One for all requests: most replies arrive long before, and creating and cancelling a timer takes a tenth of
-        # the time of a step.
-        self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
-
-    @property
-    def state_port(self) -> int | None:
-        """See `RequestTransport.state_port`."""
-        return self._inner.state_port
-
-    @property
-    def endpoint(self) -> str:
-        """The server's RPC endpoint."""
-        return self._inner.endpoint
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is connected."""
-        return self._inner.connected
-
-    @property
-    def owed(self) -> bool:
-        """See `RequestTransport.owed`."""
-        return self._inner.owed or (self._channel is not None and self._channel.abandoned_at is not None)
 
     async def follow(self, hello: HelloOk) -> None:
         """Open the regions that a handshake names.
@@ -132,7 +103,7 @@ class ShmTransport:
         moved = self._regions.follow(hello)
         self._largest_state = 0
         self._refused.clear()
-        if self._channel is not None and (moved or not self._channel.intact() or self._channel.replaced()):
+        if self._channel is not None and (moved or not self._channel.intact() or self._channel.replies.moved()):
             self._drop("the server moved")
         if self._regions.directory is None:
             self._obstacle = "play has not begun"
@@ -154,7 +125,6 @@ class ShmTransport:
         channel = self._channel
         if channel is None:
             return
-        self._regions.connect_doorbell()
         give_up = loop.time() + _SETTLE_S
         while loop.time() < give_up and self._channel is channel and self._pending is None:
             if self._is_clean(channel):
@@ -164,13 +134,13 @@ class ShmTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`. `late` is invoked only for requests over ZMQ, such as handshakes."""
+        """See `ZmqTransport.request`."""
         if self._channel is not None and self._channel.abandoned_at is not None:
             await self._let_it_end(op, deadline)
         pictures = op.name == "step" and b"include_cameras" in frame
         has_state = issubclass(op.reply, StateReply)  # whose size is nearly constant
         why_zmq = _always_over_zmq(op) or ("pictures" if pictures else self._refused.get(op.name, ""))
-        if not why_zmq and self._inner.owed:
+        if not why_zmq and self._over_zmq.owed:
             why_zmq = "behind an abandoned request"
         if not why_zmq:
             loop = asyncio.get_running_loop()
@@ -191,21 +161,25 @@ class ShmTransport:
                     if has_state and len(answer) > self._largest_state:
                         self._largest_state = len(answer)
                     return answer
-        self.stats.over_zmq[why_zmq] = self.stats.over_zmq.get(why_zmq, 0) + 1
-        answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if has_state and not pictures and succeeded(answer, op):  # a refusal does not show the size of the state
+        self._stats.over_zmq[why_zmq] = self._stats.over_zmq.get(why_zmq, 0) + 1
+        answer = await self._over_zmq.send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+        if (
+            has_state and not pictures and envelope_of(answer, op).op == op.reply_name
+        ):  # a refusal does not show the size of the state
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
-    async def aclose(self) -> None:
-        """See `RequestTransport.aclose`."""
+    def on_server_lost(self) -> None:
+        """Fail the pending request, unless its reply has arrived."""
+        if self._channel is not None:
+            self._channel.replies.check()
+        self._drop("the server was lost")
+
+    def close(self, error: ClientClosed) -> None:
+        """Fail the pending request and release the regions. Idempotent."""
         self._closed = True
-        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
-        self._fail(lambda _: closed)
+        self._fail(lambda _: error)
         self._drop("closed")
-        if self._timer is not None:
-            self._timer.cancel()
-        await self._inner.aclose()
 
     # Routing
 
@@ -215,23 +189,21 @@ class ShmTransport:
             self._obstacle = "busy"
             return None
         channel = self._channel
-        doubtful = channel is not None and (channel.dirty or now - self._used_at > _IDLE_S)
-        if channel is not None and (not channel.intact() or (doubtful and channel.replaced())):
-            self._drop("the regions were replaced")
-            channel = None
-        if channel is None:
-            if self._regions.directory is None or now < self._retry_at or not self._inner.connected:
+        if channel is not None:
+            doubtful = channel.dirty or now - self._used_at > _IDLE_S
+            if not channel.intact() or (doubtful and channel.replies.moved()):
+                self._drop("the regions were replaced")
+        if self._channel is None:
+            if self._regions.directory is None or now < self._retry_at or not self._over_zmq.connected:
                 return None
             self._try_to_open(now)
-            channel = self._channel
-            if channel is None:
-                return None
         self._used_at = now
-        if channel.dirty and not self._is_clean(channel):
-            if self._channel is not None:
-                self._obstacle = "waiting for an old reply"
-            return None
-        return channel
+        channel = self._channel
+        if channel is None or not channel.dirty or self._is_clean(channel):
+            return channel
+        if self._channel is not None:
+            self._obstacle = "waiting for an old reply"
+        return None
 
     async def _let_it_end(self, op: Op, deadline: float | None) -> None:
         """Wait until the server is done with the request whose caller gave up.
@@ -257,33 +229,24 @@ class ShmTransport:
                 await asyncio.sleep(_SETTLE_LOOK_S)
 
     def _is_clean(self, channel: RegionChannel) -> bool:
+        now = asyncio.get_running_loop().time()
         try:
-            waits = channel.dirty and channel.intact() and not channel.synchronised()
-            if waits and channel.ask_for_sync(asyncio.get_running_loop().time()):
+            if channel.dirty and channel.intact() and not channel.synchronised() and channel.ask_for_sync(now):
                 self._ring()
         except ProtocolError as error:
             self._drop("")
-            self._put_off(error, asyncio.get_running_loop().time())
+            self._put_off(error, now)
         return not channel.dirty
 
     def _try_to_open(self, now: float) -> Exception | None:
         """Open the regions. Return why they cannot be used."""
         try:
-            paths: list[Path] = []
-            for file in (REQUEST_FILE, REPLY_FILE):
-                path = self._regions.find(file)
-                if path is None:
-                    paths_tried = ", ".join(map(str, self._regions.candidates(file)))
-                    raise FileNotFoundError(f"there is no {paths_tried}")
-                paths.append(path)
-            self._channel = RegionChannel(paths[0], paths[1], self._regions.events(paths[0]))
+            channel = self._channel = RegionChannel(self._regions, on_news=self._on_news, on_lost=self._on_lost)
         except (OSError, ProtocolError) as error:
             self._put_off(error, now)
             return error
-        self._regions.connect_doorbell()
-        self._used_at = now
         doorbell = "no" if self._regions.doorbell is None else "yes"
-        log.info("shared memory in %s; doorbell: %s", paths[0].parent, doorbell)
+        log.info("shared memory in %s; doorbell: %s", channel.replies.file.path.parent, doorbell)
         return None
 
     def _put_off(self, error: Exception, now: float) -> None:
@@ -295,49 +258,47 @@ class ShmTransport:
 
     def _refusal(self, answer: bytes, op: Op) -> str:
         """Return why a reply requires sending the request over ZMQ; empty if the reply is final."""
-        if succeeded(answer, op):
-            return ""
-        code = envelope_of(answer).code
+        code = envelope_of(answer, op).code
         if code == "wrong_transport":  # the server did not execute the request
             self._refused[op.name] = "refused by the server"
         elif code == "reply_too_large":
             self._refused[op.name] = "reply too large"
             if op.effect is not Effect.READ:
                 return ""
-        return self._refused.get(op.name, "")
+        else:
+            return ""
+        return self._refused[op.name]
 
     # Over shared memory
 
     async def _over_shm(
         self, channel: RegionChannel, frame: bytes, pending: SentRequest, loop: asyncio.AbstractEventLoop
     ) -> bytes:
-        op, reply, deadline = pending.op, pending.reply, pending.deadline
+        op, reply = pending.op, pending.reply
         self._pending = pending
         # If the wait ends without the reply, that reply is still outstanding.
-        channel.dirty = True
+        channel.dirty = channel.replies.waits = True
         try:
             channel.publish(frame)
             sent = time.perf_counter()
-            self.stats.sent += 1
-            self.stats.over_shm += 1
+            self._stats.sent += 1
+            self._stats.over_shm += 1
             self._ring()
-            if self._timer is None or (deadline is not None and deadline < self._due):
-                self._look_at(loop, deadline)
+            self._regions.look_by(pending.deadline)
             awake = self._busy_poll.pays(op.name)
             if awake:
-                await self._busy_poll.look(op.name, reply, self._look)
+                await self._busy_poll.look(op.name, reply, channel.replies.check)
             if not reply.done() and self._regions.doorbell is None:
-                self._on_news()
+                channel.replies.look()
             answer = await reply
         except BaseException:
             channel.abandoned_at = loop.time()
             raise
         finally:
-            channel.ignore()
+            channel.replies.ignore()
             self._pending = None
-            self._used_at = loop.time()
         channel.dirty = False
-        self.stats.received += 1
+        self._stats.received += 1
         self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
         return answer
 
@@ -346,80 +307,50 @@ class ShmTransport:
             self._regions.doorbell.ring(Ring.REQUEST)
 
     def _on_news(self) -> None:
-        """Deliver the reply if it has arrived; otherwise wait for the next news."""
-        self._look()
-        waits = self._pending is not None and not self._pending.reply.done()
-        if waits and self._regions.doorbell is None and self._channel is not None:
-            self._channel.expect(self._on_news, self._regions.tell)
-
-    def _look(self) -> None:
         """Deliver the reply if it has arrived."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.reply.done() or channel is None:
             return
-        if not channel.replies.intact():
-            self._drop("the reply region was cut off")
-            return
+        replies = channel.replies
         try:
-            found = channel.replies.region.read_latest(channel.seen)
+            found = replies.region.read_latest(replies.seen)
         except ProtocolError as error:
             pending.reply.set_exception(
-                ProtocolError(f"{pending.op.name}: {channel.replies.path}: {error.args[0]}", op=pending.op.name)
+                ProtocolError(f"{pending.op.name}: {replies.file.path}: {error.args[0]}", op=pending.op.name)
             )
             self._drop("the reply region is damaged")
             return
-        if found is None:
-            sequence = channel.replies.region.sequence
-            if sequence == 0:  # reinitialised: it counts from one again
-                channel.seen = 0
-            if sequence != channel.seen:  # it kept changing while it was read
-                asyncio.get_running_loop().call_soon(self._look)
+        if found is None:  # it kept changing while it was read
+            asyncio.get_running_loop().call_soon(replies.look)
             return
-        channel.seen = found.sequence
+        replies.seen = found.sequence
         if answers(found.payload, pending.op):
             pending.reply.set_result(found.payload)
         else:
-            self.stats.late += 1
-            log.debug("%s: dropped a reply to another request", channel.replies.path)
+            self._stats.late += 1
+            log.debug("%s: dropped a reply to another request", replies.file.path)
 
-    def _look_at(self, loop: asyncio.AbstractEventLoop, deadline: float | None) -> None:
-        """Look for the reply after a pause, or at the deadline."""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._due = loop.time() + _LOOK_S
-        if deadline is not None:
-            self._due = min(self._due, deadline)
-        self._timer = loop.call_at(self._due, self._on_timer, loop)
-
-    def _on_timer(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._timer = None
-        pending = self._pending
+    def _on_look(self, due: float) -> None:
+        """Keep looking until the deadline, and give up then."""
+        pending, channel = self._pending, self._channel
         if pending is None:
             return
-        # Not compared to the current time: the loop may be early by its resolution.
-        expired = pending.deadline is not None and pending.deadline <= self._due
+        expired = pending.deadline is not None and pending.deadline <= due
         if not expired:
-            self._look_at(loop, pending.deadline)  # first, whatever happens below
-        self._on_news()
-        if pending.reply.done():
-            return
-        if expired:
-            pending.reply.set_exception(no_reply(pending.op, "in shared memory", self._due - pending.at))
-        elif self._channel is not None and self._channel.replaced():
-            self._drop("the regions were replaced")
+            self._regions.look_by(pending.deadline)
+        elif channel is not None:
+            channel.replies.check()
+            if not pending.reply.done():
+                pending.reply.set_exception(no_reply(pending.op, "in shared memory", due - pending.at))
 
     # When the server goes
 
-    def _on_event(self, event: ClientEvent) -> None:
-        if isinstance(event, ServerLost):
-            self._look()
-            self._drop("the server was lost")
-        if self.on_event is not None:
-            self.on_event(event)
+    def _on_lost(self) -> None:
+        self._drop("the regions were replaced")
 
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
-        self._fail(lambda op: lost(op, f"the server at {self.endpoint}"))
+        self._fail(lambda op: lost(op, f"the server at {self._over_zmq.endpoint}"))
         if self._channel is not None:
             self._channel.close()
             self._channel = None

@@ -1,149 +1,204 @@
-"""A server's regions of shared memory: where they are, how they are mapped, and the doorbell that tells of news.
+"""A server's regions of shared memory: where they are, who reads them, and how the client learns of news in them.
 
-The files belong to the server, which may remove, replace or truncate them at any time. Accessing a mapping beyond the
-end of its file kills the process, so check `intact` before each access.
+The files belong to the server, which may remove, replace or truncate them at any time. All regions are read in the same
+way: the doorbell tells of news, or, without one, a thread that looks at them. While somebody waits for news, the loop
+looks, too, every 50 ms, for lost rings and for regions that were lost.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import hashlib
 import logging
-import mmap
+import math
 import os
 import socket
-import stat
-import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path, PurePath
+from typing import TypeVar
 
+from urlab_client._platform.mapped_files import MappedFile
 from urlab_client._platform.processors import processor_fence
-from urlab_client._platform.windows import NamedLock
 from urlab_client.aio.background import Tell
 from urlab_client.aio.transport.waiting import Watch
 from urlab_client.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol import shm
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.shm import RegionNotReady, Ring
-
-if sys.platform != "win32":
-    import fcntl
+from urlab_client.protocol.shm import Publication, Region, Ring
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
-_BLOCK = 512  # bytes; unit of `st_blocks`
+T = TypeVar("T")
+
+_LOOK_S = 0.05
+_ATTEMPTS = 4
+
+_WANTS = {Ring.STATE: Ring.WANT_STATE, Ring.CAMERA: Ring.WANT_CAMERAS}
 
 
-class RegionInUse(ProtocolError):
-    """Another client on this machine uses the region."""
+class MessageGone(ProtocolError):
+    """A message was overwritten or removed before it was read. This is not a fault of either side."""
 
 
-class MappedRegion:
-    """One mapped region.
+def attached(file: MappedFile) -> Region:
+    """Return the region in a file. Raises `ProtocolError` and closes the file if there is none."""
+    try:
+        return Region(file.view, fence=processor_fence())
+    except ProtocolError as error:
+        file.close()
+        raise type(error)(f"{file.path}: {error.args[0]}") from None
+
+
+class RegionReader:
+    """A mapped region that is read.
 
     Args:
-        path: The file.
-        writable: Whether to map the region for writing, too, and to take the lock that excludes other clients, held
-            until `close`.
+        location: Where the region is; tells of rings.
+        name: Name of the region's file.
+        ring: The doorbell's message about it.
+        on_news: Called on the loop when there is a publication that is not `seen` yet. Must set `seen`.
+        on_lost: Called on the loop when the file was removed, replaced, truncated or laid out anew. Must close this.
+        fastest_s: Pause between two looks of the thread, if there is no doorbell, in the first millisecond.
+
+    Attributes:
+        waits: Whether somebody waits for news.
+        seen: Sequence of the last publication that was dealt with.
+        quiet: Looks of the loop since there was news.
+        block: Sleeps until the server signals news, for at most the given seconds; None without signals.
 
     Raises:
+        FileNotFoundError: There is no file.
         RegionNotReady: The region is still being created.
-        RegionInUse: Another client holds the lock.
         ProtocolError: The file is not a region.
         OSError: The file cannot be opened.
     """
 
-    def __init__(self, path: Path, *, writable: bool = False) -> None:
-        self.path = path
-        self._lock: NamedLock | None = None
-        self._locked_by = 0
-        # Non-blocking: opening a pipe at this path would wait for its other end.
-        mode = os.O_RDWR if writable else os.O_RDONLY
-        self._fd = os.open(path, mode | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0))
-        try:
-            self._map(writable=writable)
-        except BaseException:
-            self._release()
-            raise
+    def __init__(
+        self,
+        location: ServerRegions,
+        name: str,
+        ring: bytes,
+        *,
+        on_news: Callable[[], None],
+        on_lost: Callable[[], None],
+        fastest_s: float,
+    ) -> None:
+        self.name = name
+        self.ring = ring
+        self.file: MappedFile = MappedFile(location.find(name))
+        self.region: Region = attached(self.file)
+        self.waits: bool = True
+        self.seen: int = 0
+        self.quiet: int = 0
+        self.block: Callable[[float], object] | None = None
+        self._location = location
+        self._on_news = on_news
+        self._on_lost = on_lost
+        self._fastest_s = fastest_s
+        self._watch: Watch | None = None
+        # Pictures are read on the thread that accesses them.
+        self._lock = threading.Lock()
+        self.closed: bool = False
+        location.add(self)
 
-    def _map(self, *, writable: bool) -> None:
-        about = os.fstat(self._fd)
-        if not stat.S_ISREG(about.st_mode):
-            raise ProtocolError(f"{self.path} is not a file.")
-        if about.st_size < shm.HEADER_SIZE:
-            raise RegionNotReady(f"{self.path}: {about.st_size} bytes, expected a header of {shm.HEADER_SIZE}.")
-        if writable and not self._take_lock():
-            raise RegionInUse(f"{self.path}: another client on this machine uses it.")
-        self._identity = about.st_dev, about.st_ino
-        self._size = about.st_size
-        if writable and hasattr(os, "posix_fallocate") and about.st_blocks * _BLOCK < self._size:
-            # Writing to a hole of a file when the disk is full also kills the process.
-            os.posix_fallocate(self._fd, 0, self._size)
-        access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
-        self._mmap = mmap.mmap(self._fd, self._size, access=access)
-        try:
-            self.region: shm.Region = shm.attach(memoryview(self._mmap), fence=processor_fence())
-        except ProtocolError as error:
-            raise type(error)(f"{self.path}: {error.args[0]}") from None
-        self._layout = self._mmap[: shm.LAYOUT_SIZE]
+    def has_news(self) -> bool:
+        """Return whether there is something to do. Called on the watching thread, too."""
+        return not self.file.intact() or self.region.sequence != self.seen
 
-    def _take_lock(self) -> bool:
-        if sys.platform == "win32":
-            # Hash the whole path, because the directories of different servers may have the same name.
-            place = hashlib.sha256(os.path.normcase(self.path.resolve()).encode()).hexdigest()[:16]
-            self._lock = NamedLock(f"Local\\URLab_{place}_client")
-            return self._lock.held
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        self._locked_by = os.getpid()
-        return True
+    def check(self) -> None:
+        """Report news or the loss of the region."""
+        if self.closed:
+            return
+        if not self.file.intact():
+            self._on_lost()
+        elif self.region.sequence != self.seen:
+            if self.region.begun_anew(self.seen):
+                self._on_lost()
+            else:
+                self.quiet = 0
+                self._on_news()
 
-    def intact(self) -> bool:
-        """Return whether the file still has its mapped length, so that accessing the mapping is safe."""
-        # Called for each request; takes a quarter of the time of fstat.
-        return os.lseek(self._fd, 0, os.SEEK_END) >= self._size
+    def look(self) -> None:
+        """Check, and have the thread look on if somebody waits and there is no doorbell."""
+        self.check()
+        if self.closed or not self.waits or self._location.doorbell is not None:
+            return
+        if self._watch is None:
+            self._watch = Watch(
+                self._location.loop,
+                self.look,
+                has_news=self.has_news,
+                block=self.block,
+                fastest_s=self._fastest_s,
+                tell=self._location.tell,
+            )
+        self._watch.expect()
 
-    def replaced(self) -> bool:
-        """Return whether the path now leads to another file or to none."""
+    def ignore(self) -> None:
+        """Nobody waits for news any more."""
+        self.waits = False
+        if self._watch is not None:
+            self._watch.ignore()
+
+    def moved(self) -> bool:
+        """Return whether another file has taken the place of this one."""
         try:
-            about = self.path.stat()
-        except OSError:
+            return self.file.replaced() or self._location.find(self.name) != self.file.path
+        except (OSError, ProtocolError):  # the directory's name comes from the server
             return True
-        if not about.st_ino:  # Windows may not identify a file in use; then it is the same file
-            return False
-        return (about.st_dev, about.st_ino) != self._identity
 
-    def laid_out_anew(self) -> bool:
-        """Return whether the layout of the region has changed since it was mapped. Call only while `intact`."""
-        return self._mmap[: shm.LAYOUT_SIZE] != self._layout
+    def supervise(self) -> None:
+        """Look, and check the file if nothing has come since the last time."""
+        self.quiet += 1
+        self.look()
+        if not self.closed and self.quiet > 1 and self.moved():
+            self._on_lost()
+
+    def read(self, take: Callable[[memoryview], T]) -> Publication[T]:
+        """Return the newest publication, converted. Call from any thread.
+
+        Raises:
+            MessageGone: The region is gone.
+            ProtocolError: No publication could be read completely.
+        """
+        with self._lock:
+            if not self.closed and self.file.intact():
+                for _ in range(_ATTEMPTS):
+                    found = self.region.read_latest(take=take)
+                    if found is not None:
+                        return found
+                raise ProtocolError(f"{self.file.path}: pictures arrive faster than they can be read.")
+        raise MessageGone(f"{self.file.path}: the picture is gone.")
+
+    def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
+        """Return a live view of the current publication and a check whether it is still valid."""
+
+        def holds(sequence: int) -> bool:
+            with self._lock:
+                return not self.closed and self.file.intact() and self.region.holds(sequence)
+
+        with self._lock:
+            if self.closed or not self.file.intact():
+                return None
+            found = self.region.read_latest(take=lambda view: view)
+            return None if found is None else (found, lambda: holds(found.sequence))
 
     def close(self) -> None:
-        """Unmap and close the file. A view that the user holds keeps the mapping alive."""
-        self.region.release()
-        with contextlib.suppress(BufferError):
-            self._mmap.close()
-        self._release()
-
-    def __del__(self) -> None:
-        # A client that was never closed must not block the regions for the next one.
-        if getattr(self, "_fd", -1) >= 0:
-            self._release()
-
-    def _release(self) -> None:
-        if sys.platform != "win32" and self._locked_by == os.getpid():
-            # Closing alone would leave the lock to a forked child, which has the file open, too. A child never unlocks.
-            fcntl.flock(self._fd, fcntl.LOCK_UN)
-        os.close(self._fd)
-        self._fd = -1
-        if self._lock is not None:
-            self._lock.close()
+        """Let go of the region. Idempotent."""
+        if self.closed:
+            return
+        self._location.remove(self)
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None  # it refers to this reader, whose mapping must not wait for the garbage collector
+        with self._lock:
+            self.closed = True
+            self.region.release()
+            self.file.close()
 
 
 class ServerRegions:
-    """Location of the regions of one client's server, and the doorbell if the server has one.
+    """The regions of one client's server, and the doorbell if the server has one.
 
     Args:
         directory: Directory of the regions, overriding the one that the server reports.
@@ -151,20 +206,31 @@ class ServerRegions:
     Attributes:
         directory: Directory of `state.shm`; None until a server reports it.
         doorbell: The doorbell; None if it is not connected.
-        on_ring: Callbacks for each kind of ring. All are also called when the doorbell is lost: they look once more and
-            go on without it.
+        on_look: Callbacks for each look of the loop, with the loop time at which it was due.
         tell: Publishes an event of the client.
     """
 
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
         self.doorbell: Doorbell | None = None
-        self.on_ring: dict[bytes, list[Callable[[], None]]] = {Ring.STATE: [], Ring.CAMERA: [], Ring.REPLY: []}
+        self.on_look: list[Callable[[float], None]] = []
         self.tell: Tell | None = None
         self._reported: dict[str, Path] = {}  # files that the server names explicitly, by region
         self._events = "", ""
         self._given = None if directory is None else Path(directory).absolute()
-        self._wanted: set[bytes] = set()
+        self._readers: dict[RegionReader, None] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        # One timer for all: most replies arrive long before, and creating and cancelling one takes a tenth of the time
+        # of a step.
+        self._timer: asyncio.TimerHandle | None = None
+        self._due = 0.0
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The client's event loop."""
+        if self._loop is None:
+            self._loop = asyncio.get_running_loop()
+        return self._loop
 
     def follow(self, hello: HelloOk) -> bool:
         """Adopt the locations in a handshake; return whether the regions have moved.
@@ -189,12 +255,8 @@ class ServerRegions:
             )
         return (self.directory, self._reported) != before
 
-    def candidates(self, file: str) -> list[Path]:
-        """Return the possible paths of a region's file, best first.
-
-        Raises:
-            ProtocolError: The server's directory is not absolute.
-        """
+    def _candidates(self, file: str) -> list[Path]:
+        """Return the possible paths of a region's file, best first."""
         if self.directory is None:
             return []
         if self._given is not None:
@@ -212,32 +274,51 @@ class ServerRegions:
         session = requests.parent.name
         return request or f"Local\\URLab_{session}_req_ready", reply or f"Local\\URLab_{session}_rep_ready"
 
-    def find(self, file: str) -> Path | None:
-        """Return the path of a region's file, or None if it does not exist."""
-        return next((path for path in self.candidates(file) if path.exists()), None)
+    def find(self, file: str) -> Path:
+        """Return the path of a region's file.
+
+        Raises:
+            FileNotFoundError: There is none.
+            ProtocolError: The server's directory is not absolute.
+        """
+        candidates = self._candidates(file)
+        for path in candidates:
+            if path.exists():
+                return path
+        raise FileNotFoundError(f"there is no {', '.join(map(str, candidates)) or file}")
+
+    def add(self, reader: RegionReader) -> None:
+        """Tell a reader of its news."""
+        self._readers[reader] = None
+        self.connect_doorbell()
+        if self.doorbell is not None and reader.ring in _WANTS:
+            self.doorbell.ring(_WANTS[reader.ring])
+
+    def remove(self, reader: RegionReader) -> None:
+        """Tell a reader of nothing any more."""
+        self._readers.pop(reader, None)
 
     def connect_doorbell(self) -> None:
         """Connect to the doorbell if the server has one and it is not connected yet."""
         if self.doorbell is not None:
             return
         try:
-            requests = self.find(shm.REQUEST_FILE)
-            path = None if requests is None else requests.with_name(shm.DOORBELL_FILE)
-            if path is None or not path.exists():
-                return
-            doorbell = self.doorbell = Doorbell(asyncio.get_running_loop(), path, self._on_rings, self._on_lost)
+            path = self.find(shm.REQUEST_FILE).with_name(shm.DOORBELL_FILE)
+            doorbell = self.doorbell = Doorbell(self.loop, path, self._on_rings, self._on_lost)
         except (OSError, ProtocolError) as error:
             log.debug("no doorbell: %s", error)
             return
-        for message in self._wanted:
-            doorbell.ring(message)  # may detect that the connection is already lost
+        for want in {_WANTS[reader.ring] for reader in self._readers if reader.ring in _WANTS}:
+            doorbell.ring(want)  # may detect that the connection is already lost
 
-    def want(self, message: bytes) -> None:
-        """Request rings for publications, too: `Ring.WANT_STATE` or `Ring.WANT_CAMERAS`."""
-        if message not in self._wanted:
-            self._wanted.add(message)
-            if self.doorbell is not None:
-                self.doorbell.ring(message)
+    def look_by(self, when: float | None = None) -> None:
+        """Look at the regions in 50 ms, or at `when`, if that is earlier."""
+        if self._timer is not None:
+            if when is None or when >= self._due:
+                return
+            self._timer.cancel()
+        self._due = min(self.loop.time() + _LOOK_S, math.inf if when is None else when)
+        self._timer = self.loop.call_at(self._due, self._look)
 
     def close(self) -> None:
         """Disconnect from a server that has gone or moved. Idempotent."""
@@ -245,15 +326,24 @@ class ServerRegions:
             self.doorbell.close()
             self.doorbell = None
 
+    def _look(self) -> None:
+        self._timer = None
+        due = self._due  # not the current time: the loop may be early by its resolution
+        for callback in self.on_look:
+            callback(due)
+        for reader in tuple(self._readers):
+            if reader.waits:
+                reader.supervise()
+
     def _on_rings(self, rings: bytes) -> None:
-        for ring, listeners in self.on_ring.items():
-            if ring in rings:
-                for listener in tuple(listeners):
-                    listener()
+        for reader in tuple(self._readers):
+            if reader.ring in rings:
+                reader.look()
 
     def _on_lost(self) -> None:
         self.doorbell = None
-        self._on_rings(b"".join(self.on_ring))
+        for reader in tuple(self._readers):
+            reader.look()
 
 
 class Doorbell:

@@ -54,10 +54,6 @@ _contexts: set[Context] = set()
 _REMEMBERED_TOPICS = 4096
 
 
-class MessageGone(ProtocolError):
-    """A message was overwritten or removed before it was read. This is not a fault of either side."""
-
-
 class MessageHandler(ABC):
     """Receives the messages of a subscription. Called on the event loop; must not block.
 

@@ -12,11 +12,13 @@ import contextlib
 import socket
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar, Final, TypeAlias, cast
 from weakref import WeakSet, ref
 
 import zmq
+from msgspec import Struct
 
 from urlab_client._platform.processors import crowded
 from urlab_client.aio.background import Tell, background_thread
@@ -314,18 +316,15 @@ _WEIGHT: Final = 0.2  # of a new time in the average
 _polling = False
 
 
-class _ReplyTimes:
+class _ReplyTimes(Struct):
     """Reply times of one op in seconds, in the way of waiting that is in use and in the other one."""
 
-    __slots__ = ("missed", "other", "polls", "tried", "until_trial", "usual")
-
-    def __init__(self) -> None:
-        self.polls = True  # the way in use
-        self.usual = 0.0
-        self.other = 0.0  # as the last trial found it; 0 before the first
-        self.tried: list[float] = []
-        self.until_trial = _FIRST
-        self.missed = 0
+    polls: bool = True  # the way in use
+    usual: float = 0.0
+    other: float = 0.0  # as the last trial found it; 0 before the first
+    tried: list[float] = []
+    until_trial: int = _FIRST
+    missed: int = 0
 
     @property
     def awake(self) -> bool:
@@ -370,16 +369,11 @@ class BusyPoll:
     def __init__(self, shortest: float, longest: float) -> None:
         self._shortest = shortest
         self._longest = longest
-        self._ops: dict[str, _ReplyTimes] = {}
+        self._ops = defaultdict[str, _ReplyTimes](_ReplyTimes)
 
     def pays(self, op: str) -> bool:
         """Return whether to poll for the reply to this op."""
-        if _polling or crowded():
-            return False
-        times = self._ops.get(op)
-        if times is None:
-            times = self._ops[op] = _ReplyTimes()
-        return times.awake
+        return not _polling and not crowded() and self._ops[op].awake
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or the time limit is reached. Other tasks run between two calls."""
@@ -400,16 +394,12 @@ class BusyPoll:
 
     def _limit(self, op: str) -> float:
         """Return the seconds to poll; a trial is no longer than sleeping takes."""
-        times = self._ops.get(op)
-        if times is None:
-            return self._shortest
+        times = self._ops[op]
         return min(max(2 * times.usual, self._shortest) if times.polls else times.usual, self._longest)
 
     def note(self, op: str, seconds: float, *, awake: bool) -> None:
         """Record the time of a reply, with a polling or a sleeping loop."""
-        times = self._ops.get(op)
-        if times is None:
-            return  # `pays` was never called for it
+        times = self._ops[op]
         if seconds > self._longest:
             times.missed += 1
             return

@@ -11,8 +11,8 @@ import asyncio
 import errno
 import logging
 import time
-from collections.abc import Callable
-from typing import NamedTuple, cast
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import zmq
 
@@ -24,8 +24,7 @@ from urlab_client.aio.transport.connection import (
     ClientKeys,
     Connection,
     Context,
-    borrow_context,
-    give_back_context,
+    shared_context,
 )
 from urlab_client.aio.transport.waiting import BusyPoll, Watch
 from urlab_client.errors import (
@@ -39,6 +38,9 @@ from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, Ser
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.messages.session import HelloOk
+
+if TYPE_CHECKING:
+    from urlab_client.aio.transport.shm import ShmRequests
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
@@ -72,12 +74,16 @@ class _Open(NamedTuple):
 
 
 class ZmqTransport:
-    """Transport over one DEALER socket. It connects on first use and reconnects automatically.
+    """Sends requests and returns their replies. Use from one event loop.
+
+    It has one DEALER socket, connects on first use and reconnects automatically.
 
     Attributes:
+        shared: Requests over shared memory, which take what they can; None without.
+        on_event: Callback invoked when the connection is opened, lost or restored.
         endpoint: The server's RPC endpoint.
         connected: Whether a server is connected.
-        state_port: See `RequestTransport.state_port`.
+        state_port: Port of the state stream if the transport knows it; None if it is configured separately.
         lost_at: Loop time at which the connection was last lost.
         refused: Whether a connection attempt has been refused since then.
     """
@@ -107,16 +113,40 @@ class ZmqTransport:
         self.refused: bool = False
         self._silent_since: float | None = None
         self.on_event: Callable[[ClientEvent], None] | None = None
+        self.shared: ShmRequests | None = None
 
     @property
     def owed(self) -> bool:
-        """See `RequestTransport.owed`."""
+        """Whether the server has yet to answer a request whose caller gave up, so that it may still execute it."""
         return bool(self._abandoned)
 
-    async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
+    def request(
+        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
+    ) -> Coroutine[Any, Any, bytes]:
+        """Send `frame` and return the reply's bytes.
+
+        Args:
+            frame: The encoded request.
+            op: Its op, which errors name and which determines the meaning of a lost reply.
+            deadline: Loop time at which to give up; None waits without limit.
+            connect_by: Loop time by which a connection must be open; None waits without limit.
+            late: Callback invoked with a future for the reply when this call is cancelled or times out after sending
+                over ZeroMQ; None drops the reply.
+
+        Raises:
+            ServerUnreachable: No connection was open by `connect_by`; nothing was sent.
+            URLabTimeoutError: The request was sent, but no reply arrived by `deadline`.
+            ConnectionLost: The connection broke after sending; the op changes nothing.
+            OutcomeUnknown: The connection broke after sending; the op may have been executed.
+            ClientClosed: The client was closed.
+        """
+        send = self.send if self.shared is None else self.shared.request
+        return send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+
+    async def send(  # noqa: PLR0912  # each call between a step and its socket costs every step
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `RequestTransport.request`."""
+        """See `request`, over ZeroMQ."""
         opened = self._open
         if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
             opened = self._connect()
@@ -168,7 +198,13 @@ class ZmqTransport:
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
-        """See `RequestTransport.follow`: there is no alternative transport."""
+        """Open the shared memory that a handshake describes.
+
+        Raises:
+            URLabConnectionError: It is not available.
+        """
+        if self.shared is not None:
+            await self.shared.follow(hello)
 
     def fail_waiting(self, error: URLabError) -> None:
         """Fail the unsent requests that wait for a connection."""
@@ -177,32 +213,40 @@ class ZmqTransport:
                 waiter.set_exception(error)
 
     async def aclose(self) -> None:
-        """See `RequestTransport.aclose`."""
+        """Fail all pending requests and release all resources. Idempotent."""
         if self._closed:
             return
         self._closed = True
         self.connected = False
-        closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
+        closed = self._was_closed()
+        if self.shared is not None:
+            self.shared.close(closed)
         self._fail_sent(lambda _: closed)
         self.fail_waiting(closed)
         if self._timer is not None:
             self._timer.cancel()
-        if self._open is not None:
-            opened, self._open = self._open, None
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        opened, self._open = self._open, None
+        if opened is not None:
             opened.connection.close()
-            give_back_context(opened.context)
+            shared_context.give_back(opened.context)
+
+    def _was_closed(self) -> ClientClosed:
+        return ClientClosed(f"The client of {self.endpoint} was closed.", hint="Create a new client.")
 
     def _connect(self) -> _Open:
         if self._closed:
-            raise ClientClosed(f"The client of {self.endpoint} is closed.", hint="Create a new client.")
+            raise self._was_closed()
         loop = running_loop(None if self._open is None else self._open.loop)
-        context = borrow_context()
+        context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         socket.maxmsgsize = MAX_REPLY_BYTES  # rejected by its header, before it uses memory
         try:
             connection = Connection(loop, socket, self.endpoint, self._keys, self._note, tell=self._tell)
         except ValueError:
-            give_back_context(context)
+            shared_context.give_back(context)
             raise
         replies = connection.watch(self._on_readable, on_demand=True)
         send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
@@ -392,6 +436,8 @@ class ZmqTransport:
             self.lost_at = self._now()
             self.refused = False
             self._obstacle = "the connection was lost and not restored"
+            if self.shared is not None:
+                self.shared.on_server_lost()
             self._tell(ServerLost(endpoint=self.endpoint))
         else:
             self.refused = True  # a tunnel accepts connections even if the server is down

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
+from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
@@ -182,14 +182,14 @@ class URLabVectorEnv(Vectorized):
         declared = None if randomise is None else Randomisation.of(randomise)
         if declared is not None:
             text = declared.to_json()
-            addresses = [with_option(a, "randomise", text) if a.startswith(SCHEME) else a for a in addresses]
+            addresses = [with_option(a, "randomise", text) for a in addresses]
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
         client_options = client_defaults(client_options)
         starts = asyncio.Semaphore(_processors())
         self._sessions = [
             _Session(
-                with_start_timeout(address, start_timeout),
+                with_option(address, "start-timeout", f"{start_timeout:g}", default=True),
                 starts,
                 client_options,
                 settings=settings,

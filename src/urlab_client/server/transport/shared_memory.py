@@ -1,8 +1,8 @@
 """The shared-memory transport of a server: requests and replies in two regions, state and pictures in others.
 
-For `SimulatedServer`. One thread watches the request region. For this package's client it sleeps until the doorbell
-rings, or on Windows until the named event is set. For clients without a doorbell, such as the plugin's, it polls every
-100 µs while they are active and every 5 ms otherwise.
+One thread watches the request region. For this package's client it sleeps until the doorbell rings, or on Windows until
+the named event is set. For clients without a doorbell, such as the plugin's, it polls every 100 µs while they are
+active and every 5 ms otherwise.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ import logging
 import os
 import selectors
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, cast
 
-from urlab_client._platform.processors import crowded
+from urlab_client._platform.mapped_files import MappedFile
+from urlab_client._platform.processors import crowded, processor_fence
 from urlab_client._platform.windows import NamedEvent
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.shm import (
@@ -30,14 +32,16 @@ from urlab_client.protocol.shm import (
     RPC_STRIDE,
     SIZE_PREFIX,
     STATE_FILE,
+    Publication,
+    Region,
     Ring,
     camera_file,
     camera_stride,
+    region_size,
     state_stride,
 )
 from urlab_client.server.system.temporary_folder import TemporaryFolder
 from urlab_client.server.system.threads import Health, ServingThread
-from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -65,10 +69,69 @@ PICTURE_PERIOD_S: Final = 10.0
 BLIND_PICTURE_PERIOD_S: Final = 0.5
 """How often pictures are published while no client has a doorbell: a region does not know its readers."""
 
-MAX_LISTENERS: Final = 32
-
+_BACKLOG: Final = 32
 _SELECTOR_STEP_S: Final = 1e-3
 """`epoll` rounds shorter waits up to this."""
+
+
+class RegionFile:
+    """A region of this server, moved into place once it is readable, and laid out again if somebody truncates it.
+
+    Raises:
+        OSError: The disk is full.
+    """
+
+    def __init__(self, path: Path, stride: int) -> None:
+        self._path = path
+        self._stride = stride
+        # Windows neither replaces nor removes a file that a client has open, so there it is laid out in place.
+        new = path if sys.platform == "win32" else path.with_name(f".{path.name}")
+        try:
+            self._file = MappedFile(new, writable=True, size=region_size(stride))
+            self._region = self._laid_out()
+            if new != path:
+                new.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                new.unlink()
+            raise
+
+    @property
+    def sequence(self) -> int:
+        """Number of publications."""
+        self._mend()
+        return self._region.sequence
+
+    def publish(self, payload: bytes) -> None:
+        """Publish a payload.
+
+        Raises:
+            ValueError: The payload does not fit.
+            OSError: The file was truncated, and the disk is too full to restore it.
+        """
+        self._mend()
+        self._region.publish(payload)
+
+    def read(self, seen: int) -> Publication[bytes] | None:
+        """Return the newest publication, unless `seen` is its sequence. Raises `ProtocolError`."""
+        self._mend()
+        return self._region.read_latest(seen)
+
+    def close(self) -> None:
+        """Close the file and remove it. On Windows it remains while a client has it open."""
+        self._region.release()
+        self._file.close()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def _mend(self) -> None:
+        if not self._file.intact():
+            logger.warning("%s was damaged and is laid out again", self._path)
+            self._file.restore()
+            self._region = self._laid_out()
+
+    def _laid_out(self) -> Region:
+        return Region.lay_out(self._file.view, self._stride, fence=processor_fence())
 
 
 class SharedMemoryServer:
@@ -96,14 +159,13 @@ class SharedMemoryServer:
             # is the directory itself, whatever other servers share the base.
             self.directory: Path = self._folder.path / LIVE_DIRECTORY
             self.directory.mkdir(mode=0o700)
-            self._requests = RequestFile(self.directory / REQUEST_FILE, RPC_STRIDE)
+            self._requests = RegionFile(self.directory / REQUEST_FILE, RPC_STRIDE)
             made.callback(self._requests.close)
             self._replies = RegionFile(self.directory / REPLY_FILE, RPC_STRIDE)
             made.callback(self._replies.close)
             self._doorbell = _Doorbell(self.directory)
             made.pop_all()
         self._active_at = -ACTIVE_S
-        self._unannounced = False
         self._served_at = -SPIN_S
         self._spinning = False
         self._state: RegionFile | None = None
@@ -114,7 +176,6 @@ class SharedMemoryServer:
         self._too_large = False
         self._stopping = False
         self._released = False
-        self._given_up = False
         self._seen = 0  # so that a request before the thread's start is served
         self._answer: Answer = bytes
         self.serving: ServingThread = ServingThread("urlab-shm", self._run, health)
@@ -139,11 +200,7 @@ class SharedMemoryServer:
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`, and remove the regions. Return False if a request took longer."""
         if self.serving.started:
-            ended = self.serving.join(timeout)
-            with self._lock:
-                self._given_up = not ended and self.serving.alive
-            if self._given_up:
-                return False
+            return self.serving.join(timeout)
         self._release()
         return True
 
@@ -153,16 +210,15 @@ class SharedMemoryServer:
         """Whether to publish the snapshot of this tick. Cheap, because physics calls it."""
         if self._released:
             return False
-        if self._doorbell.wanted(Ring.STATE) or not self._doorbell.listeners:
-            return True
-        now = time.monotonic()
-        return self._active(now) or now - self._state_at >= STATE_PERIOD_S
+        return not self._doorbell.listeners or self._due(Ring.STATE, self._state_at, STATE_PERIOD_S)
 
     def publish_state(self, snapshot: bytes) -> None:
         """Publish a snapshot; the first one of a play session determines the size of the region."""
         self._state_at = time.monotonic()
         try:
             with self._lock:
+                if self._released:
+                    return
                 if self._state is None:
                     self._state = RegionFile(self.directory / STATE_FILE, state_stride(len(snapshot)))
                 self._state.publish(snapshot)
@@ -201,7 +257,7 @@ class SharedMemoryServer:
                 if region is not None:
                     region.close()
                 return
-            if key in self._cameras:
+            if self._released or key in self._cameras:
                 return
             articulation, _, camera = key.partition("/")
             try:
@@ -212,11 +268,8 @@ class SharedMemoryServer:
 
     def wanted_cameras(self) -> list[str]:
         """Return the cameras whose pictures to publish now."""
-        now = time.monotonic()
         period = PICTURE_PERIOD_S if self._doorbell.listeners else BLIND_PICTURE_PERIOD_S
-        if self._doorbell.wanted(Ring.CAMERA) or self._active(now) or now - self._pictures_at >= period:
-            return list(self._cameras)
-        return []
+        return list(self._cameras) if self._due(Ring.CAMERA, self._pictures_at, period) else []
 
     def publish_picture(self, key: str, pixels: bytes) -> None:
         """Publish a picture of one of the `wanted_cameras`."""
@@ -232,9 +285,13 @@ class SharedMemoryServer:
                 return
         self._doorbell.ring(Ring.CAMERA)
 
-    def _active(self, now: float) -> bool:
+    def _due(self, ring: bytes, last: float, period: float) -> bool:
+        """Whether a client subscribed, or a client without a doorbell is active, or so much time has passed."""
+        return self._doorbell.wanted(ring) or self._active() or time.monotonic() - last >= period
+
+    def _active(self) -> bool:
         """Whether a client without a doorbell has sent a request recently."""
-        return now - self._active_at < ACTIVE_S
+        return time.monotonic() - self._active_at < ACTIVE_S
 
     # The thread.
 
@@ -243,14 +300,13 @@ class SharedMemoryServer:
             if owed is not None:
                 self._reply(owed)
             while not self._stopping:
-                if self._requests.sequence() == self._seen and not (self._spinning and self._spin(self._seen)):
+                if self._requests.sequence == self._seen and not (self._spinning and self._spin()):
                     rung = self._doorbell.wait(self._pause())
+                    news = self._requests.sequence != self._seen
                     if rung:
                         self._active_at = -ACTIVE_S
-                    elif self._unannounced:  # a ring may arrive after its request was seen
+                    elif news:
                         self._active_at = time.monotonic()
-                    news = self._requests.sequence() != self._seen
-                    self._unannounced = news and not rung
                     if not news:
                         continue
                 self._spinning = time.monotonic() - self._served_at < SPIN_S and not crowded()
@@ -259,41 +315,37 @@ class SharedMemoryServer:
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
-            self._give_up()
-        except BaseException:
-            self._give_up()
-            raise
         finally:
-            with self._lock:
-                given_up = self._given_up
-            if given_up and self.serving.is_current:  # `join` has stopped waiting for this thread
-                self._release()
+            if self.serving.is_current:
+                self._release()  # so that clients notice
 
-    def _give_up(self) -> None:
-        self._stopping = True
-        self._release()  # so that clients notice
-
-    def _spin(self, seen: int) -> bool:
+    def _spin(self) -> bool:
         """Poll for a short time without sleeping; return whether a request arrived."""
         while time.monotonic() - self._served_at < SPIN_S:
-            if self._requests.sequence() != seen:
+            if self._requests.sequence != self._seen:
                 return True
             time.sleep(0)  # releases the interpreter lock
         return False
 
     def _pause(self) -> float:
-        if self._unannounced or self._active(time.monotonic()):
+        if self._active():
             return ACTIVE_POLL_S
         return DOORBELL_POLL_S if self._doorbell.listeners else IDLE_POLL_S
 
     def _serve(self) -> bool:
         """Answer the pending request; return False if another thread has done so and serves now."""
-        self._seen, request = self._requests.read()
-        if request is None:
-            logger.warning("a request in shared memory could not be read and stays unanswered")
+        sequence = self._requests.sequence
+        try:
+            request = self._requests.read(self._seen)
+        except ProtocolError as error:
+            logger.warning("a request stays unanswered: %s", error)
+            request = None
+        if request is None:  # laid out anew, damaged, or overwritten again and again
+            self._seen = sequence
             return True
+        self._seen = request.sequence
         self.serving.begin()
-        reply = self._answer(request)
+        reply = self._answer(request.payload)
         if not self.serving.finish():
             return False
         if reply:
@@ -306,9 +358,7 @@ class SharedMemoryServer:
 
     def _release(self) -> None:
         with self._lock:
-            released, self._released = self._released, True
-        if released:
-            return
+            self._released = True
         self.show_cameras({})
         self.end_state()
         self._doorbell.close()
@@ -391,7 +441,7 @@ class _Doorbell:
         try:
             listener.bind(os.fspath(path))
             path.chmod(0o600)
-            listener.listen(MAX_LISTENERS)
+            listener.listen(_BACKLOG)
             listener.setblocking(False)
         except OSError as error:
             listener.close()
@@ -430,9 +480,6 @@ class _Doorbell:
         except OSError as error:  # no descriptor left: retrying would be a busy loop
             logger.warning("no doorbell any more: %s; further clients poll", error)
             self._stop_listening()
-            return
-        if len(self._subscriptions) >= MAX_LISTENERS:
-            client.close()
             return
         client.setblocking(False)
         self._selector.register(client, selectors.EVENT_READ)
