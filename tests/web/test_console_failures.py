@@ -18,7 +18,7 @@ from waiting import DEADLINE_S, until
 from urlab_client.aio import URLabClient, background
 from urlab_client.console.controls import Controls
 from urlab_client.console.hand_driving import HandDriving
-from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.lease import Viewer
 from urlab_client.console.pictures import Feed
 from urlab_client.console.replay import Replay
 from urlab_client.console.session import ConsoleSession
@@ -162,16 +162,3 @@ async def test_pictures_go_on_after_a_failure(
             assert (await feed.after(0)).jpeg
         assert "MemoryError: none left" in errors(console)["camera arm/wrist"]
         assert logged(caplog, "urlab-web-camera")
-
-
-async def test_a_lease_that_cannot_be_kept_ends_what_it_is_held_for(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    once(monkeypatch, DrivingLease, "_keep")
-    lease = DrivingLease()
-    with pytest.raises(MemoryError, match="none left"):
-        async with lease.hold(ME), asyncio.timeout(DEADLINE_S):
-            await asyncio.Event().wait()
-    assert logged(caplog, "urlab-web-lease")
-    async with lease.hold(ME):
-        assert lease.holder is ME
