@@ -46,7 +46,6 @@ AWAITED = {
     "console/file_jobs.py:run_job": "waits for the task and raises its error",
     "web/file_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
     "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
-    "console/session.py:_keep": "waits for both tasks, and raises the error of the first",
     "integrations/forwarding.py:until_first": "the task group of one connection, which ends with the error",
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
     "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
