@@ -44,9 +44,7 @@ AWAITED = {
     "sync/_loop.py:_end": "likewise",
     "console/file_jobs.py:run_job": "waits for the task and raises its error",
     "web/file_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
-    "console/recordings.py:start": "start() waits for its begin, stop() or the console's end for its end; both raise",
     "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
-    "console/session.py:_keep": "waits for both tasks, and raises the error of the first",
     "integrations/forwarding.py:until_first": "the task group of one connection, which ends with the error",
     "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
     "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
@@ -79,7 +77,7 @@ KILLED = {
         "urlab-watch",
     },
     "tests/sync/test_portal.py": {"urlab-io"},
-    "tests/web/test_console_failures.py": {"urlab-web-camera", "urlab-web-lease", "urlab-web-"},
+    "tests/web/test_console_failures.py": {"urlab-web-camera", "urlab-web-"},
     "tests/integrations/test_failing_threads.py": {
         "urlab-environment",
         "urlab-feed",

@@ -3,13 +3,14 @@
 Run: python tools/check_versions.py [ENVIRONMENT ...] [--quick] [--keep FOLDER] [-- PYTEST ARGUMENTS]
 
 Each environment is made with uv where that is installed, otherwise with pip, for this interpreter's release of Python.
-`lowest` has every core dependency at the version that pyproject.toml allows as the lowest; the others have one release
-of MuJoCo each. The core is what depends on these: protocol, both clients, server, conformance and Gymnasium
-environments. Then a client there drives a server of this interpreter's, which so needs the package, too, and the other
-way round. Exit code 1 says that something failed.
+`lowest` has every core dependency at the version that pyproject.toml allows as the lowest; `mujoco-…` one release of
+MuJoCo. There the core is tested, what depends on these: protocol, both clients, server, conformance and Gymnasium
+environments. `lowest-extras` has all that the extras bring at the lowest versions, and runs a file of tests for each.
+Then a client there drives a server of this interpreter's, which so needs the package, too, and the other way round.
+Exit code 1 says that something failed.
 
-With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, and of
-the release between what drives a simulation from end to end.
+With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, of the
+release between what drives a simulation from end to end, and `lowest-extras` without the extras that take gigabytes.
 
 Asyncio's debug mode is on here, as nowhere else: it costs time, and nothing in it depends on a version.
 """
@@ -25,6 +26,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,46 @@ FROM_END_TO_END = (
     *("tests/integrations/test_gym.py", "tests/integrations/test_vector_env.py"),
 )
 CORE = (*FROM_END_TO_END, "tests/server", "tests/protocol", "tests/aio", "tests/sync")
-QUICK = {"lowest": CORE, "mujoco-3.11": FROM_END_TO_END}
+
+SMOKE = {
+    "coacd": "tests/server/test_decomposition.py",
+    "completion": "tests/cli/test_cli_usage.py",
+    "dataset": "tests/integrations/test_record_export.py",
+    "demo": "tests/cli/test_cli_demo.py",
+    "foxglove": "tests/integrations/test_view.py",
+    "gym": "tests/integrations/test_gym.py",
+    "mcap": "tests/integrations/test_record.py",
+    "mcp": "tests/mcp/test_transports.py",
+    "onnx": "tests/integrations/test_policy_trained.py",
+    "opentelemetry": "tests/integrations/test_telemetry.py",
+    "pillow": "tests/protocol/test_picture_files.py",
+    "prometheus": "tests/integrations/test_telemetry.py",
+    "ray": "tests/integrations/test_cluster.py",
+    "rerun": "tests/integrations/test_view.py",
+    "sb3": "tests/integrations/test_sb3.py",
+    "teleop": "tests/integrations/test_teleop.py",
+    "train": "tests/integrations/test_policy_trained.py",
+    "video": "tests/integrations/test_record_export.py",
+    "warp": "tests/integrations/test_warp_batch.py",
+    "web": "tests/web/test_web_servers.py",
+}
+"""Tests of each extra that users install for what it does at run time."""
+
+LOWEST = re.compile(r">=([\d.]+)[^;]*")
+"""What a requirement says of versions; the lowest is in the group."""
+
+GIGABYTES = {"ray", "sb3", "warp"}
+LIGHT = SMOKE.keys() - GIGABYTES
+QUICK = {
+    "lowest": CORE,
+    "mujoco-3.11": FROM_END_TO_END,
+    "lowest-light-extras": tuple(sorted({SMOKE[extra] for extra in LIGHT})),
+}
+TESTS = {
+    "lowest-light-extras": QUICK["lowest-light-extras"],
+    "lowest-extras": ("-m", "not browser and not long and not matrix", *sorted(set(SMOKE.values()))),
+}
+"""What runs in an environment, if not the core."""
 
 # What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
 TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "mcap", "pillow", "trio", "uvloop"}
@@ -57,6 +98,12 @@ def lowest() -> list[str]:
     return [re.sub(r">=(\d+\.\d+)$", r"==\1.0", requirement) for requirement in project()["dependencies"]]
 
 
+def lowest_of(extras: Iterable[str]) -> list[str]:
+    """Return what extras bring, each at the lowest version allowed."""
+    declared = project()["optional-dependencies"]
+    return sorted({LOWEST.sub(r"==\1", one) for extra in extras for one in declared[extra]})
+
+
 def environments() -> dict[str, list[str]]:
     """Return what to install beside the package, by environment."""
     return {
@@ -65,13 +112,15 @@ def environments() -> dict[str, list[str]]:
         "mujoco-3.11": ["mujoco==3.11.*"],
         "mujoco-newest": ["mujoco"],
         "lowest": lowest(),
+        "lowest-light-extras": lowest_of(LIGHT),
+        "lowest-extras": lowest_of(SMOKE),
     }
 
 
 def make(folder: Path, requirements: list[str]) -> Path:
     """Make an environment; return its interpreter."""
-    tests = project()["optional-dependencies"]["test"]
-    needed = [one for one in tests if name(one) in TESTS_NEED or name(one).startswith("pytest")]
+    tests, all_of_them = project()["optional-dependencies"]["test"], "extras" in folder.name
+    needed = [one for one in tests if all_of_them or name(one) in TESTS_NEED or name(one).startswith("pytest")]
     python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     if uv := shutil.which("uv"):
         commands = [
@@ -111,7 +160,8 @@ def main() -> int:
         parser.error(f"unknown: {', '.join(sorted(unknown))}. There are {', '.join(known)}.")
     if arguments.quick and arguments.environments:
         parser.error("--quick has environments of its own")
-    chosen = QUICK if arguments.quick else dict.fromkeys(arguments.environments or known, CORE)
+    named = arguments.environments or [one for one in known if "extras" not in one]
+    chosen = QUICK if arguments.quick else {one: TESTS.get(one, CORE) for one in named}
     failed: list[str] = []
     with tempfile.TemporaryDirectory(prefix="urlab-versions-") as scratch:
         folder = (arguments.keep or Path(scratch)).absolute()
@@ -127,6 +177,8 @@ def check(environment: str, python: Path, pytest: list[str]) -> list[str]:
     started = time.monotonic()
     print(f"=== {environment}: {versions(python)}", flush=True)
     tests = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_debug=true", *pytest]
+    if "extras" in environment:  # old releases use what newer ones of their own dependencies deprecate
+        tests += ["-W", "ignore::DeprecationWarning"]
     commands = {f"{environment}: pytest": tests}
     for client, server in ((str(python), sys.executable), (sys.executable, str(python))):
         commands[f"{environment}: client of {client}, server of {server}"] = [client, str(DRIVE), server]

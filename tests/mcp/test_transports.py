@@ -149,6 +149,36 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
                     assert "urlab://log" in {str(one.uri) for one in (await mcp.list_resources()).resources}
 
 
+async def test_behind_a_proxy_agents_and_console_have_its_path_and_its_tls() -> None:
+    public = "https://lab.example/robots"
+    with SimulatedServer("arm", play=True) as server:
+        async with URLabClient(**server.client_options()) as client:
+            access = Access(hosts=["lab.example"])
+            site = app(client, access=access)
+            application = http_application(Agent(site, ALL), site, Access(hosts=["lab.example"], keys=[TOKEN]))
+            headers = {"authorization": f"Bearer {TOKEN}", "host": "lab.example"}
+            async with site.router.lifespan_context(site), served(application, public_url=public) as http:
+                own = httpx2.AsyncClient(headers=headers, timeout=DEADLINE_S)
+                async with own, Client(streamable_http_client(f"{http.base_url}/mcp", http_client=own)) as mcp:
+                    assert not (await mcp.call_tool("look", {})).is_error
+                entered = await http.get(f"/?token={access.invite()}", headers={"host": "lab.example"})
+                assert (entered.status_code, entered.headers["location"]) == (303, "/robots/")
+                assert "path=/robots/" in entered.headers["set-cookie"].lower()
+                assert "secure" in entered.headers["set-cookie"].lower()
+
+
+@pytest.mark.parametrize("options", [["--http"], []], ids=["http", "streams"])
+def test_the_command_prints_the_links_of_its_proxy(options: list[str], tmp_path: Path) -> None:
+    arguments = ["-m", "urlab_client", "mcp", "sim://arm", *options, "--port", "0"]
+    public = "https://lab.example/robots"
+    with child(*arguments, "--public-url", f"{public}/", cwd=tmp_path, stdin=subprocess.PIPE) as process:
+        lines = [process.stderr.readline() for _ in range(2 if options else 1)]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(DEADLINE_S) == 0
+    links = [f"Agent: {public}/mcp with", f"Console: {public}/?token="]
+    assert all(line.startswith(link) for line, link in zip(lines, links[-len(lines) :], strict=True)), lines
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

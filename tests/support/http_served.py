@@ -14,11 +14,15 @@ from urlab_client.cli._pages import bound, serve
 
 
 @contextlib.asynccontextmanager
-async def served(application: ASGIApp, *, lifespan: bool = True) -> AsyncGenerator[httpx2.AsyncClient]:
+async def served(
+    application: ASGIApp, *, lifespan: bool = True, public_url: str = ""
+) -> AsyncGenerator[httpx2.AsyncClient]:
     """Serve an application over a real socket, and yield an HTTP client of it."""
     ready, ended = asyncio.Event(), asyncio.Event()
     with bound("127.0.0.1", 0) as listener:
-        serving = asyncio.create_task(serve(application, listener, ready.set, ended, lifespan=lifespan))
+        serving = asyncio.create_task(
+            serve(application, listener, ready.set, ended, public_url=public_url, lifespan=lifespan)
+        )
         await ready.wait()
         try:
             url = f"http://127.0.0.1:{listener.getsockname()[1]}"

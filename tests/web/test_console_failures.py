@@ -18,17 +18,19 @@ from waiting import DEADLINE_S, until
 from urlab_client.aio import URLabClient, background
 from urlab_client.console.controls import Controls
 from urlab_client.console.hand_driving import HandDriving
-from urlab_client.console.lease import DrivingLease, Viewer
+from urlab_client.console.lease import Viewer
 from urlab_client.console.pictures import Feed
 from urlab_client.console.replay import Replay
 from urlab_client.console.session import ConsoleSession
 from urlab_client.enums import StepMode
+from urlab_client.errors import ServerUnreachable
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
 ME = Viewer("key", "me")
 LOOPS = [
+    (ConsoleSession, "_follow_events"),
     (ConsoleSession, "_keep"),
     (ConsoleSession, "_receive"),
     (ConsoleSession, "_pulse"),
@@ -164,14 +166,24 @@ async def test_pictures_go_on_after_a_failure(
         assert logged(caplog, "urlab-web-camera")
 
 
-async def test_a_lease_that_cannot_be_kept_ends_what_it_is_held_for(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+async def test_a_server_that_stays_away_is_told_once_for_each_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    once(monkeypatch, DrivingLease, "_keep")
-    lease = DrivingLease()
-    with pytest.raises(MemoryError, match="none left"):
-        async with lease.hold(ME), asyncio.timeout(DEADLINE_S):
+    reasons = iter(["within 4997 ms: refused", "within 5000 ms: refused", "within 5000 ms: no such host"])
+    tried = asyncio.Event()
+
+    async def refused(_: ConsoleSession) -> None:
+        reason = next(reasons, None)
+        if reason is None:
+            tried.set()
             await asyncio.Event().wait()
-    assert logged(caplog, "urlab-web-lease")
-    async with lease.hold(ME):
-        assert lease.holder is ME
+        raise ServerUnreachable(f"no connection {reason}.")
+
+    monkeypatch.setattr(ConsoleSession, "_discover", refused)
+    monkeypatch.setattr("urlab_client.console.session._RETRY_S", 0.0)
+    async with URLabClient(address="tcp://127.0.0.1:1") as client:
+        console = ConsoleSession(client, recordings=tmp_path)
+        async with console.open(), asyncio.timeout(DEADLINE_S):
+            await tried.wait()
+            told = [entry.text for entry in console.view.entries if entry.what == "connect"]
+    assert told == ["no connection within 4997 ms: refused.", "no connection within 5000 ms: no such host."]

@@ -122,6 +122,7 @@ async def test_programs_have_a_key_and_sigterm_ends_it_while_browsers_watch(tmp_
                 output, log = await asyncio.to_thread(process.communicate, timeout=DEADLINE_S)
     assert (process.returncode, output) == (0, "")
     lines = [json.loads(line) for line in log.splitlines()]
+    # It would log an error if the time passed that requests have after SIGTERM before they are given up.
     assert {"at", "level", "logger", "message"} <= set(lines[0])
     assert [line for line in lines if "error" in line or line["level"] == "error"] == []
     assert "Application shutdown complete." in [line["message"] for line in lines]

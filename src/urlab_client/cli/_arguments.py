@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeAlias, TypeVar, cast
+from urllib.parse import urlsplit
 
 from urlab_client._installation import need
 from urlab_client.cli._common import CommandError, joined, refusing
@@ -303,11 +304,26 @@ def add_page(parser: Parser, default_port: int) -> None:
         metavar="NAME",
         help="host name by which browsers and programs reach the page, besides localhost; repeatable",
     )
+    network.add_argument(
+        "--public-url",
+        type=_public_url,
+        metavar="URL",
+        help="URL by which browsers and programs reach the page through a proxy, which removes its path",
+    )
     network.add_argument("--open", action="store_true", help="open the page in the browser")
 
 
+def _public_url(text: str) -> str:
+    parts = urlsplit(text)
+    if parts.scheme not in {"http", "https"} or not parts.hostname or parts.query or parts.fragment:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a URL of a page, such as https://lab.example/robots/")
+    return text.rstrip("/")
+
+
 def check_page(arguments: Namespace) -> None:
-    """Refuse an interface that no host name reaches."""
+    """Admit the host of the public URL, and refuse an interface that no host name reaches."""
+    if host := urlsplit(str(arguments.public_url or "")).hostname:
+        arguments.allow_host = [*arguments.allow_host, host]
     if arguments.host not in _LOOPBACK and not arguments.allow_host:
         raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name by which browsers reach it")
 
@@ -319,7 +335,7 @@ def host_names(arguments: Namespace) -> list[str]:
 
 def page_url(arguments: Namespace, number: int) -> str:
     """Return the URL of the page that is served at a port."""
-    return f"http://{arguments.allow_host[0] if arguments.allow_host else '127.0.0.1'}:{number}"
+    return arguments.public_url or f"http://{arguments.allow_host[0] if arguments.allow_host else '127.0.0.1'}:{number}"
 
 
 def address(text: str) -> str:

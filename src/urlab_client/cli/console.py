@@ -12,9 +12,8 @@ import json
 import logging
 import os
 import webbrowser
-from argparse import ArgumentTypeError, Namespace
+from argparse import Namespace
 from datetime import UTC, datetime
-from urllib.parse import urlsplit
 
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
@@ -49,20 +48,7 @@ def add_arguments(parser: Parser) -> None:
     add_address(parser)
     add_client(parser, handshake=True)
     add_page(parser, _PORT)
-    parser.add_argument(
-        "--public-url",
-        type=_public_url,
-        metavar="URL",
-        help="URL by which browsers reach the page through a proxy, which removes its path",
-    )
     parser.add_argument("--json-log", action="store_true", help="write the log as lines of JSON")
-
-
-def _public_url(text: str) -> str:
-    parts = urlsplit(text)
-    if parts.scheme not in {"http", "https"} or not parts.hostname or parts.query or parts.fragment:
-        raise ArgumentTypeError(f"{text!r} is not a URL of a page, such as https://lab.example/robots/")
-    return text.rstrip("/")
 
 
 def run(arguments: Namespace) -> int:
@@ -74,8 +60,6 @@ def run(arguments: Namespace) -> int:
         from urlab_client.web import Access  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise CommandError(f"{error.name or error} is not installed; run: {install_command('web')}") from None
-    if host := urlsplit(str(arguments.public_url or "")).hostname:
-        arguments.allow_host = [*arguments.allow_host, host]
     check_page(arguments)
     if any(len(key) < _KEY_CHARACTERS for key in _keys()):
         raise CommandError(f"${_KEY}: a key must have at least {_KEY_CHARACTERS} characters")
@@ -122,7 +106,7 @@ async def _serve(arguments: Namespace) -> None:
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
-            url = arguments.public_url or page_url(arguments, listener.getsockname()[1])
+            url = page_url(arguments, listener.getsockname()[1])
             link = f"{url}/?token={access.invite()}"
 
             def started() -> None:

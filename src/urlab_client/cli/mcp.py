@@ -18,6 +18,7 @@ import sys
 import webbrowser
 from argparse import Namespace
 from collections.abc import Coroutine
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,7 @@ EXAMPLES = (
         "drive a running server; another client's session ends",
     ),
     ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
+    ("urlab mcp --http --public-url https://lab.example/robots/", "behind a proxy, which has that address"),
 )
 
 
@@ -208,7 +210,8 @@ async def _serve_stdio_and_console(arguments: Namespace, agent: Agent, session: 
         served.add_done_callback(lambda _: ended.set())
         try:
             url = page_url(arguments, listener.getsockname()[1])
-            await serve(console, listener, lambda: _print_link(arguments, url, access), ended, lifespan=False)
+            started = partial(_print_link, arguments, url, access)
+            await serve(console, listener, started, ended, public_url=arguments.public_url or "", lifespan=False)
         finally:
             served.cancel()
             await asyncio.wait((served,))
@@ -249,7 +252,8 @@ async def _serve_http(arguments: Namespace, agent: Agent, session: ConsoleSessio
                 _print_link(arguments, url, access)
 
         own = Access(hosts=access.hosts, keys=tokens)
-        await serve(http_application(agent, console if arguments.console else None, own), listener, started)
+        application = http_application(agent, console if arguments.console else None, own)
+        await serve(application, listener, started, public_url=arguments.public_url or "")
 
 
 def _print_link(arguments: Namespace, url: str, access: Access) -> None:

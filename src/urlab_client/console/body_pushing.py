@@ -18,6 +18,7 @@ from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer, Shown, no_model
 from urlab_client.console.replay import Replay
 from urlab_client.enums import StepMode
+from urlab_client.values.names import split_prefix
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
@@ -163,9 +164,10 @@ class BodyPushing:
 
     def _robot(self, shown: Shown, body: int) -> URLabArticulation:
         """Return whose body it is."""
-        robot = self._client.articulations.get(_owner(shown, body))
+        key, name = _named(shown, body)
+        robot = self._client.articulations.get(key)
         if robot is None:
-            raise ValueError(f"{_name(shown, body)} does not belong to a robot. Only bodies of robots can be pushed.")
+            raise ValueError(f"{name} does not belong to a robot. Only bodies of robots can be pushed.")
         return robot
 
     async def _place(self, shown: Shown, push: Push, robot: URLabArticulation) -> None:
@@ -197,27 +199,23 @@ def _root(model: Any, body: int) -> int:
     return found
 
 
-def _owner(shown: Shown, body: int) -> str:
-    name = shown.model.body(body).name
-    owners = [key for key, prefix in shown.prefixes.items() if name.startswith(f"{prefix}_")]
-    return max(owners, key=lambda key: len(shown.prefixes[key]), default="")
-
-
-def _name(shown: Shown, body: int) -> str:
-    name = shown.model.body(body).name
-    owner = _owner(shown, body)
-    return name.removeprefix(f"{shown.prefixes[owner]}_") if owner else name or f"body {body}"
+def _named(shown: Shown, body: int) -> tuple[str, str]:
+    """Return whose body it is, and what that robot calls it; an empty key for none."""
+    keys = {prefix: key for key, prefix in shown.prefixes.items()}
+    [(owner, name)] = split_prefix([shown.model.body(body).name], keys)
+    return ("", name or f"body {body}") if owner is None else (keys[owner], name)
 
 
 def _view(shown: Shown, body: int) -> BodyView:
+    robot, name = _named(shown, body)
     mass = float(shown.model.body_mass[body])
-    return BodyView(body, _name(shown, body), _owner(shown, body), round(mass, 4), _rounded(shown.data.xpos[body]))
+    return BodyView(body, name, robot, round(mass, 4), _rounded(shown.data.xpos[body]))
 
 
 def _sphere(shown: Shown) -> tuple[list[float], float]:
     """Return a sphere around all robots, or around all bodies where there is none."""
     model, data = shown.model, shown.data
-    owned = np.array([bool(_owner(shown, body)) for body in range(model.nbody)])
+    owned = np.array([bool(_named(shown, body)[0]) for body in range(model.nbody)])
     if not owned.any():
         owned[1:] = True  # all but the world
     geoms = owned[model.geom_bodyid] & (model.geom_rbound > 0.0)

@@ -9,10 +9,6 @@ from dataclasses import dataclass
 
 import anyio
 
-from urlab_client.aio.background import background_task
-
-_LOOK_S = 0.1
-
 
 @dataclass(eq=False)
 class Viewer:
@@ -43,6 +39,7 @@ class DrivingLease:
         self._clock = clock
         self._holder: Viewer | None = None
         self._until = 0.0
+        self._block: anyio.CancelScope | None = None  # of the holder, who keeps the controls while it runs
         self._one = anyio.Lock()
 
     @property
@@ -58,15 +55,25 @@ class DrivingLease:
     @property
     def left(self) -> float:
         """Seconds until the controls are free unless the holder acts."""
-        return 0.0 if self._holder is None else max(0.0, self._until - self._clock())
+        if self._holder is None:
+            return 0.0
+        return self._kept_by(self._holder) if self._block is not None else max(0.0, self._until - self._clock())
 
     def use(self, viewer: Viewer) -> None:
         """Take or keep the controls."""
         holder = self.holder
-        if holder is not None and holder.key != viewer.key and not _gives_way(holder, viewer):
-            raise NotDriving(f"{holder.name} has the controls for another {self.left:.0f} s, unless they act again.")
-        kept = self.seconds if viewer.keeps is None else viewer.keeps
-        self._holder, self._until = viewer, self._clock() + kept
+        if holder is not None and holder.key != viewer.key:
+            if not _gives_way(holder, viewer):
+                raise NotDriving(
+                    f"{holder.name} has the controls for another {self.left:.0f} s, unless they act again."
+                )
+            if self._block is not None:
+                self._block.cancel()
+                self._block = None
+        self._holder, self._until = viewer, self._clock() + self._kept_by(viewer)
+
+    def _kept_by(self, viewer: Viewer) -> float:
+        return self.seconds if viewer.keeps is None else viewer.keeps
 
     def interrupt(self, viewer: Viewer) -> None:
         """Take the controls from a holder that yields; otherwise do nothing."""
@@ -83,30 +90,20 @@ class DrivingLease:
         self.use(viewer)
         async with self._one:
             self.use(viewer)
-            body = anyio.CancelScope()
-            keeping = background_task("urlab-web-lease", self._keep(viewer, body), failed=lambda _: body.cancel())
-            with body:
+            with anyio.CancelScope() as block:
+                self._block = block
                 try:
                     yield
                 finally:
-                    keeping.cancel()
-            if body.cancelled_caught and keeping.done():
-                keeping.result()  # raises what ended it
-            if body.cancelled_caught and (holder := self.holder) is not None:
-                raise NotDriving(f"{holder.name} took the controls.")
-
-    async def _keep(self, viewer: Viewer, body: anyio.CancelScope) -> None:
-        while True:
-            try:
-                self.use(viewer)
-            except NotDriving:
-                body.cancel()
-                return
-            await anyio.sleep(_LOOK_S)
+                    if self._block is block:
+                        self._block = None
+                        self.use(viewer)
+            if block.cancelled_caught:
+                raise NotDriving(f"{self._holder.name if self._holder else 'Another viewer'} took the controls.")
 
     def release(self, viewer: Viewer) -> None:
-        """Release the controls if this viewer has them."""
-        if self._holder is not None and self._holder.key == viewer.key:
+        """Release the controls if this viewer has them, and no block needs them."""
+        if self._holder is not None and self._holder.key == viewer.key and self._block is None:
             self._holder = None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import re
@@ -14,6 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import anyio
 import anyio.to_thread
 from msgspec import Struct
 
@@ -68,8 +68,8 @@ class Recordings:
         self._client = client
         self._recorder: AsyncRecorder | None = None
         self._began = 0.0
-        self._task: asyncio.Task[None] | None = None
-        self._stop = asyncio.Event()
+        self._open = contextlib.AsyncExitStack()
+        self._changing = anyio.Lock()
         self._described: dict[str, tuple[float, RecordingContents]] = {}
 
     @property
@@ -90,45 +90,26 @@ class Recordings:
 
     async def start(self, *, cameras: bool) -> str:
         """Start a recording and return its file's name."""
-        if self._task is not None:
-            raise ValueError("a recording runs already: stop it first")
-        from urlab_client.integrations.record import record
+        async with self._changing:
+            if self._recorder is not None:
+                raise ValueError("a recording runs already: stop it first")
+            from urlab_client.integrations.record import record
 
-        if not self._client.manager_present:
-            raise URLabError("There is nothing to record.", hint="Begin play first.")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        now = f"{datetime.now().astimezone():%Y-%m-%d_%H.%M.%S}"
-        names = (f"{now}.mcap", *(f"{now}-{number}.mcap" for number in range(2, 100)))  # several in a second
-        path = next(one for one in (self.folder / name for name in names) if not one.exists())
-        recorder = record(
-            self._client,
-            path,
-            cameras="all" if cameras else (),
-            camera_hz=_CAMERA_HZ,
-            pose_hz=0.0 if self._client.model is None else 50.0,
-        )
-        self._stop.clear()
-        begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._task = asyncio.create_task(self._write(recorder, begun), name="urlab-web-recording")
-        try:
-            await begun
-        except BaseException:
-            self._task = None
-            raise
-        return path.name
-
-    async def _write(self, recorder: AsyncRecorder, begun: asyncio.Future[None]) -> None:
-        try:
-            async with recorder:
-                self._recorder, self._began = recorder, time.monotonic()
-                begun.set_result(None)
-                await self._stop.wait()
-        except BaseException as error:
-            if begun.done():
-                raise
-            begun.set_exception(error)
-        finally:
-            self._recorder = None
+            if not self._client.manager_present:
+                raise URLabError("There is nothing to record.", hint="Begin play first.")
+            self.folder.mkdir(parents=True, exist_ok=True)
+            now = f"{datetime.now().astimezone():%Y-%m-%d_%H.%M.%S}"
+            names = (f"{now}.mcap", *(f"{now}-{number}.mcap" for number in range(2, 100)))  # several in a second
+            path = next(one for one in (self.folder / name for name in names) if not one.exists())
+            recorder = record(
+                self._client,
+                path,
+                cameras="all" if cameras else (),
+                camera_hz=_CAMERA_HZ,
+                pose_hz=0.0 if self._client.model is None else 50.0,
+            )
+            self._recorder, self._began = await self._open.enter_async_context(recorder), time.monotonic()
+            return path.name
 
     async def mark(self, outcome: EpisodeOutcome) -> None:
         """Record the outcome of the current episode."""
@@ -138,26 +119,19 @@ class Recordings:
 
     async def stop(self) -> RecordingContents:
         """End the recording and describe it."""
-        recorder = self._recorder
-        if recorder is None:
-            raise ValueError("no recording runs")
-        await self._finish()
+        async with self._changing:
+            recorder, self._recorder = self._recorder, None
+            if recorder is None:
+                raise ValueError("no recording runs")
+            await self._open.aclose()
         return await self.describe(recorder.path.name)
-
-    async def _finish(self) -> None:
-        task = self._task
-        self._stop.set()
-        if task is not None:
-            try:
-                await asyncio.shield(task)
-            finally:
-                self._task = None
 
     async def end(self) -> None:
         """End a running recording, so that its file is complete."""
-        if self._task is not None:
+        async with self._changing:
+            self._recorder = None
             with contextlib.suppress(URLabError):  # the recorder has logged it
-                await self._finish()
+                await self._open.aclose()
 
     def list(self) -> list[RecordingView]:
         """Return the recordings of the folder, newest first."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import secrets
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Generator
@@ -29,7 +30,7 @@ from urlab_client.console.recordings import Recordings
 from urlab_client.console.replay import Replay
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
-from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
+from urlab_client.errors import ClientClosed, ServerUnreachable, URLabError
 from urlab_client.events import (
     ClientEvent,
     PlayEnded,
@@ -50,6 +51,7 @@ _RETRY_S = 1.0
 _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _AGENT_NAME = 40
+_TIMES = re.compile(r"\d+ ms")  # by which messages of one failure differ
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
@@ -90,6 +92,7 @@ class ConsoleSession:
         self._agents = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
+        self._connecting = anyio.Lock()
         self._ready = asyncio.Event()
         self._clock = _SimulationClock()
         self._status: Status = self._present_status()
@@ -102,6 +105,7 @@ class ConsoleSession:
     async def open(self) -> AsyncGenerator[None]:
         """Keep the session and receive state while the block runs."""
         jobs = (
+            self._follow_events,
             self._keep,
             self._receive,
             self._pulse,
@@ -146,29 +150,27 @@ class ConsoleSession:
 
     def reconnect(self) -> None:
         """Open a new session, for example after another program has taken the server over."""
-        self._want = "discover"
+        self._ask_for("discover")
+
+    def _ask_for(self, want: str) -> None:
+        self._want = want
         self._wake.set()
+
+    async def _follow_events(self) -> None:
+        async for event in self.client.events():
+            async with self._connecting:  # what an attempt causes is judged by its result
+                self._follow(event)
 
     async def _keep(self) -> None:
         """Open the session, and reopen it whenever necessary."""
-        events = self.client.events()
-        while True:
-            if self._want is not None:
-                await self._connect()
-            event = asyncio.create_task(events.receive(timeout=None if self._want is None else _RETRY_S))
-            asked = asyncio.create_task(self._wake.wait())
-            try:
-                await asyncio.wait((event, asked), return_when=asyncio.FIRST_COMPLETED)
-                if event.done():
-                    with contextlib.suppress(URLabTimeoutError):
-                        self._follow(event.result())
-            except ClientClosed:
-                return
-            finally:
-                event.cancel()
-                asked.cancel()
-                await asyncio.wait((event, asked))
-            self._wake.clear()
+        with contextlib.suppress(ClientClosed):
+            while True:
+                if self._want is not None:
+                    async with self._connecting:
+                        await self._connect()
+                with anyio.move_on_after(None if self._want is None else _RETRY_S):
+                    await self._wake.wait()
+                self._wake.clear()
 
     async def _connect(self) -> None:
         want, self._want = self._want, None
@@ -180,9 +182,11 @@ class ConsoleSession:
                     await self._discover()
             else:
                 await self._discover()
+        except ClientClosed:
+            raise
         except Exception as error:  # noqa: BLE001 - whatever it is, the next attempt may do better
             self._want = want
-            if self.link.reason != str(error):
+            if _TIMES.sub("", self.link.reason) != _TIMES.sub("", str(error)):  # else it is known already
                 self._set_link("lost" if self._ready.is_set() else "connecting", str(error))
                 self._note_error("connect", error)
             return
@@ -205,9 +209,9 @@ class ConsoleSession:
         match event:
             case ServerLost():
                 self._set_link("lost", event.reason or "the connection broke")
-                self._want = "resync"
+                self._ask_for("resync")
             case ServerReconnected():
-                self._want = "resync"
+                self._ask_for("resync")
             case ServerSilent():
                 self._set_link("silent", f"no reply to {event.op} in {event.waited_s:.0f} s")
             case ServerAnswers():
@@ -219,7 +223,7 @@ class ConsoleSession:
                 if event.articulations or not self.client.session_id:
                     self._begin_anew()
                 else:
-                    self._want = "discover"
+                    self._ask_for("discover")
             case PlayEnded() | SessionOpened():
                 self.controls.running = False
                 self._begin_anew()

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urllib.parse import unquote
 
 import msgspec
@@ -40,16 +40,23 @@ itself unless it is paused. look, explain and log answer without a connection, t
 explain. apply_scene places several objects at once.
 One drives at a time: a person may take the controls at any time, and another agent may have them; then wait. One call
 may take {sim:g} s of simulation time and {wall:g} s on the wall.{missing}"""
-_RESOURCES = {
-    "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
-    "urlab://log": "Calls, errors and events, of people, too; the newest last.",
-    "urlab://recordings": "Recordings, the newest first.",
-}
-_TEMPLATES = {
-    "urlab://cameras/{+camera}": ("A picture now; the cameras are those of `look`.", "image/jpeg"),
-    "urlab://recordings/{name}": ("Length, robots, cameras and damage of a recording.", "application/json"),
-    "urlab://log/{since}": ("Entries of the log after one, by its number.", "application/json"),
-}
+_RESOURCES = [
+    types.Resource(uri=f"urlab://{name}", name=name, description=text, mime_type="application/json")
+    for name, text in (
+        ("model", "Robots, joints, actuators, sensors, cameras, units and limits, as they are now."),
+        ("log", "Calls, errors and events, of people, too; the newest last."),
+        ("recordings", "Recordings, the newest first."),
+    )
+]
+_TEMPLATES = [
+    types.ResourceTemplate(uri_template=f"urlab://{name}/{{{part}}}", name=name, description=text, mime_type=kind)
+    for name, part, text, kind in (
+        ("cameras", "+camera", "A picture now; the cameras are those of `look`.", "image/jpeg"),
+        ("recordings", "name", "Length, robots, cameras and damage of a recording.", "application/json"),
+        ("log", "since", "Entries of the log after one, by its number.", "application/json"),
+    )
+]
+_ADDRESSES = [*(one.uri for one in _RESOURCES), *(one.uri_template for one in _TEMPLATES)]
 _PROMPTS = {
     "why_it_does_not_move": (
         "Find out why a robot does not move, and get it to move.",
@@ -89,6 +96,9 @@ _METHODS = {
     "Call reset()": "Call reset",
 }
 """Methods in the client's hints, and the tools that correspond to them."""
+
+_Context: TypeAlias = ServerRequestContext[Any]
+_Page: TypeAlias = types.PaginatedRequestParams | None
 
 
 class Agent:
@@ -136,20 +146,18 @@ class Agent:
             ),
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,
-            on_list_resources=self._list_resources,
-            on_list_resource_templates=self._list_templates,
+            on_list_resources=_list_resources,
+            on_list_resource_templates=_list_templates,
             on_read_resource=self._read_resource,
-            on_list_prompts=self._list_prompts,
-            on_get_prompt=self._get_prompt,
+            on_list_prompts=_list_prompts,
+            on_get_prompt=_get_prompt,
         )
 
-    async def _list_tools(
-        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
-    ) -> types.ListToolsResult:
+    async def _list_tools(self, context: _Context, params: _Page) -> types.ListToolsResult:
         return types.ListToolsResult(tools=[one.described for one in self._offered.values()])
 
     async def _call_tool(
-        self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
+        self, context: _Context, params: types.CallToolRequestParams
     ) -> types.CallToolResult | types.InputRequiredResult:
         console, caller = self._console, self._caller(context)
         call = self._new_call(context, caller)
@@ -176,10 +184,10 @@ class Agent:
             console.view.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
 
-    def _new_call(self, context: ServerRequestContext[Any], caller: Caller) -> Call:
+    def _new_call(self, context: _Context, caller: Caller) -> Call:
         return Call(self._console, caller, self._limits, self._models, context.session.report_progress)
 
-    def _caller(self, context: ServerRequestContext[Any]) -> Caller:
+    def _caller(self, context: _Context) -> Caller:
         """Return the caller, identified by token, session, if any, and program.
 
         Current clients open no session, so two of the same program that share a token count as one. If there are too
@@ -222,28 +230,8 @@ class Agent:
             content.append(types.ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
         return types.CallToolResult(content=list(content), structured_content=structure)
 
-    async def _list_resources(
-        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
-    ) -> types.ListResourcesResult:
-        return types.ListResourcesResult(
-            resources=[
-                types.Resource(uri=uri, name=uri.partition("//")[2], description=text, mime_type="application/json")
-                for uri, text in _RESOURCES.items()
-            ]
-        )
-
-    async def _list_templates(
-        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
-    ) -> types.ListResourceTemplatesResult:
-        return types.ListResourceTemplatesResult(
-            resource_templates=[
-                types.ResourceTemplate(uri_template=uri, name=uri.split("/")[2], description=text, mime_type=kind)
-                for uri, (text, kind) in _TEMPLATES.items()
-            ]
-        )
-
     async def _read_resource(
-        self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
+        self, context: _Context, params: types.ReadResourceRequestParams
     ) -> types.ReadResourceResult:
         uri, console = str(params.uri), self._console
         kind, _, name = unquote(uri.removeprefix("urlab://")).partition("/")
@@ -261,45 +249,46 @@ class Agent:
                 case "recordings", _:
                     shown = await console.recordings.describe(name) if name else console.recordings.list()
                 case _:
-                    raise LookupError(
-                        f"No resource has the address {uri!r}, only {', '.join(_RESOURCES | _TEMPLATES)}."
-                    )
+                    raise LookupError(f"No resource has the address {uri!r}, only {', '.join(_ADDRESSES)}.")
         except _FAILURES as error:
             raise MCPError(types.INVALID_PARAMS, _message(error)) from None
         contents = types.TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
         return types.ReadResourceResult(contents=[contents])
 
-    async def _list_prompts(
-        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
-    ) -> types.ListPromptsResult:
-        return types.ListPromptsResult(
-            prompts=[
-                types.Prompt(
-                    name=name,
-                    description=text,
-                    arguments=[
-                        types.PromptArgument(name=one, description=what, required=True) for one, what in takes.items()
-                    ],
-                )
-                for name, (text, takes, _) in _PROMPTS.items()
-            ]
-        )
 
-    async def _get_prompt(
-        self, context: ServerRequestContext[Any], params: types.GetPromptRequestParams
-    ) -> types.GetPromptResult:
-        if params.name not in _PROMPTS:
-            raise MCPError(types.INVALID_PARAMS, f"No prompt is called {params.name!r}, only {', '.join(_PROMPTS)}.")
-        text, takes, template = _PROMPTS[params.name]
-        given = params.arguments or {}
-        if given.keys() != takes.keys():
-            raise MCPError(types.INVALID_PARAMS, f"{params.name} takes {', '.join(takes)}.")
-        content = types.TextContent(text=template.format(**given))
-        return types.GetPromptResult(description=text, messages=[types.PromptMessage(role="user", content=content)])
+async def _list_resources(context: _Context, params: _Page) -> types.ListResourcesResult:
+    return types.ListResourcesResult(resources=_RESOURCES)
+
+
+async def _list_templates(context: _Context, params: _Page) -> types.ListResourceTemplatesResult:
+    return types.ListResourceTemplatesResult(resource_templates=_TEMPLATES)
+
+
+async def _list_prompts(context: _Context, params: _Page) -> types.ListPromptsResult:
+    prompts = [
+        types.Prompt(
+            name=name,
+            description=text,
+            arguments=[types.PromptArgument(name=one, description=what, required=True) for one, what in takes.items()],
+        )
+        for name, (text, takes, _) in _PROMPTS.items()
+    ]
+    return types.ListPromptsResult(prompts=prompts)
+
+
+async def _get_prompt(context: _Context, params: types.GetPromptRequestParams) -> types.GetPromptResult:
+    if params.name not in _PROMPTS:
+        raise MCPError(types.INVALID_PARAMS, f"No prompt is called {params.name!r}, only {', '.join(_PROMPTS)}.")
+    text, takes, template = _PROMPTS[params.name]
+    given = params.arguments or {}
+    if given.keys() != takes.keys():
+        raise MCPError(types.INVALID_PARAMS, f"{params.name} takes {', '.join(takes)}.")
+    content = types.TextContent(text=template.format(**given))
+    return types.GetPromptResult(description=text, messages=[types.PromptMessage(role="user", content=content)])
 
 
 async def _ask(
-    context: ServerRequestContext[Any], params: types.CallToolRequestParams, question: str
+    context: _Context, params: types.CallToolRequestParams, question: str
 ) -> types.InputRequiredResult | None:
     """Ask the person at the agent's host, if it can ask: return the question as the result, or None to go on.
 

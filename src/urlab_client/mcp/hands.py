@@ -262,11 +262,9 @@ def _angle(one: Floats, other: Floats | None) -> float:
 
 def _between(one: Floats, other: Floats, share: float) -> Floats:
     """Return the orientation at a share of the shortest turn from one to another."""
-    cosine = float(one @ other)
-    other, angle = (other if cosine >= 0 else -other), math.acos(min(1.0, abs(cosine)))
-    if angle < 1e-6:
-        return other
-    return (math.sin((1 - share) * angle) * one + math.sin(share * angle) * other) / math.sin(angle)
+    from mink import SO3
+
+    return SO3(one).interpolate(SO3(other), share).wxyz
 
 
 def unit(quaternion: list[float]) -> Quat:

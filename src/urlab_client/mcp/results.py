@@ -35,12 +35,9 @@ def label(client: URLabClient, body: str, geom: str = "") -> str:
 
 
 class Moment(Struct):
-    """Time of a result; every result also has these fields.
+    """Time of a result, whose fields every result also has.
 
-    Attributes:
-        sim_time: Simulation time, seconds.
-        step: Physics steps since the session began or the last reset; not counted in mode `live`.
-        mode: `direct`: time passes only while a tool steps; `live`: time passes automatically unless paused.
+    `step` counts physics steps since the session began or the last reset, and none in `mode` `live`.
     """
 
     sim_time: float
@@ -49,16 +46,7 @@ class Moment(Struct):
 
 
 class HandPose(Struct):
-    """A robot's hand: the site or body that `move_hand` moves.
-
-    Attributes:
-        robot: Name of the robot.
-        hand: Name of the site or body.
-        position: Metres.
-        quaternion: Orientation (w, x, y, z).
-        gripper: Set-point of the gripper, or None if there is none.
-        gripper_limits: Range of that set-point.
-    """
+    """A robot's hand: the site or body that `move_hand` moves. `gripper` is its set-point, None without a gripper."""
 
     robot: str
     hand: str
@@ -69,14 +57,7 @@ class HandPose(Struct):
 
 
 class HandMoved(Struct):
-    """A hand after a movement.
-
-    Attributes:
-        pose: Its pose.
-        error: Distance from the last pose that was asked for, metres.
-        reached: Poses reached.
-        passed: Simulation time that passed, seconds.
-    """
+    """A hand after a movement. `error` is the distance from the last pose asked for, `reached` counts poses."""
 
     pose: HandPose
     error: float
@@ -85,13 +66,7 @@ class HandMoved(Struct):
 
 
 class Object(Struct):
-    """A body or thing that is not a robot.
-
-    Attributes:
-        name: Its id.
-        pose: Its pose.
-        fixed: Whether it cannot move.
-    """
+    """A body or thing that is not a robot; `fixed` if it cannot move."""
 
     name: str
     pose: Pose | None
@@ -99,19 +74,10 @@ class Object(Struct):
 
 
 class World(Struct):
-    """The world.
+    """The world. Without a connection, `connection` says what is missing, and the rest is what was last known.
 
-    Attributes:
-        connection: `connected`, or what is missing; then the rest is what was last known.
-        units: Frame and units of all poses.
-        playing: Whether a play session is running.
-        robots: Robots with joints, actuators, sensors and cameras.
-        hands: Hands of the robots.
-        objects: Everything else that was placed or can move.
-        cameras: Names for `picture`.
-        models: What `apply_scene` can place.
-        keyframes: What `reset` can start from.
-        driver: Holder of the controls: `you`, another name, or None.
+    `cameras` are names for `picture`, `models` what `apply_scene` can place, `keyframes` what `reset` can start from.
+    `driver` has the controls: `you`, another name, or None.
     """
 
     connection: str
@@ -127,16 +93,7 @@ class World(Struct):
 
 
 class RobotState(Struct):
-    """One robot at one moment.
-
-    Attributes:
-        robot: Name of the robot.
-        pose: Pose of its root, or None if unknown.
-        joints: Positions of hinge and slide joints: rad or m.
-        velocities: Velocities of these joints: rad/s or m/s.
-        set_points: Set-points of its actuators.
-        sensors: Readings by name.
-    """
+    """One robot at one moment: hinge and slide joints in rad or m and per second; `pose` is that of its root."""
 
     robot: str
     pose: Pose | None
@@ -147,38 +104,21 @@ class RobotState(Struct):
 
 
 class Done(Struct):
-    """Result of a call that changed something.
-
-    Attributes:
-        done: Description of what was done.
-        passed: Simulation time that passed, seconds.
-    """
+    """Result of a call that changed something; `passed` is the simulation time that passed, seconds."""
 
     done: str
     passed: float = 0.0
 
 
 class Picture(Struct):
-    """Description of an image.
-
-    Attributes:
-        camera: `ROBOT/CAMERA`, or a camera of the scene.
-        kind: `real`, `depth` (near is bright), `semantic` or `instance`.
-    """
+    """Description of an image of `ROBOT/CAMERA` or a camera of the scene; its `kind` is the camera's mode."""
 
     camera: str
     kind: str
 
 
 class Touch(Struct):
-    """Two bodies that touch.
-
-    Attributes:
-        between: Their names.
-        position: Metres.
-        distance: Metres; negative if they penetrate.
-        force: Normal force, N.
-    """
+    """Two bodies that touch: `distance` is negative if they penetrate, `force` the normal force, N."""
 
     between: tuple[str, str]
     position: Vec3
@@ -187,39 +127,23 @@ class Touch(Struct):
 
 
 class Contacts(Struct):
-    """Bodies that touch.
-
-    Attributes:
-        contacts: Where and how they touch.
-        truncated: Whether there are more.
-    """
+    """Bodies that touch; `truncated` if there are more."""
 
     contacts: list[Touch]
     truncated: bool
 
 
 class Log(Struct):
-    """Calls, errors and events.
-
-    Attributes:
-        entries: Newest last; `at` is Unix time.
-        next: Pass this as `since` to continue from here.
-    """
+    """Calls, errors and events, newest last; `since=next` continues from here."""
 
     entries: list[LogEntry]
     next: int
 
 
 class Recorded(Struct):
-    """A recording. Its contents are known when it has ended.
+    """A recording, whose contents are known when it has ended. `seconds` is simulation time.
 
-    Attributes:
-        name: Name of the MCAP file in the folder for recordings.
-        running: Whether it is in progress.
-        seconds: Duration in simulation time.
-        robots: Robots in it.
-        cameras: Cameras in it.
-        lost: States and pictures that arrived too fast to be written.
+    `lost` counts states and pictures that arrived too fast to be written.
     """
 
     name: str
@@ -231,13 +155,7 @@ class Recorded(Struct):
 
 
 class Edited(Struct):
-    """The scene after an edit, which restarted play.
-
-    Attributes:
-        done: Description of what was done.
-        robots: Robots in the scene.
-        objects: Other things in the scene.
-    """
+    """The scene after an edit, which restarted play."""
 
     done: str
     robots: list[str]

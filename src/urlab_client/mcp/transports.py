@@ -84,7 +84,8 @@ def http_application(agent: Agent, console: ASGIApp | None, access: Access) -> S
     guarded = Guarded(inner, access, advice="Send the token that `urlab mcp` printed: `Authorization: Bearer TOKEN`.")
 
     async def dispatch(scope: Scope, receive: Receive, send: Send) -> None:
-        target = guarded if console is None or scope["path"] == _PATH else console
+        path = str(scope["path"]).removeprefix(scope.get("root_path", ""))
+        target = guarded if console is None or path == _PATH else console
         await target(scope, receive, send)
 
     @contextlib.asynccontextmanager

@@ -103,7 +103,7 @@ class Op:
     Attributes:
         request: The request struct; its tag is the name of the op.
         ns: Namespace on the client (`scene`, …); empty for ops of the client itself.
-        method: Name of the client's method; defaults to the op's name.
+        method: Name of the client's method; by default the op's name, without the namespace in front of it.
         needs: What must be running.
         effect: Whether it may be sent again after a lost reply.
         timeout: Minimum time to wait for the reply, seconds; None for the client's default.
@@ -145,7 +145,7 @@ class Op:
         object.__setattr__(self, "name", str(self.request.__struct_config__.tag))
         object.__setattr__(self, "reply", _reply_type(self.request))
         if not self.method:
-            object.__setattr__(self, "method", self.name)
+            object.__setattr__(self, "method", self.name.removeprefix(f"{self.ns}_"))
 
     @property
     def reply_name(self) -> str:

@@ -75,8 +75,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
@@ -100,8 +98,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
@@ -120,8 +116,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -135,8 +129,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -147,9 +139,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
         return self._portal.call(self._aio.list_keyframes, timeout=timeout)
 
@@ -165,9 +154,6 @@ class ReplayOps(Facade, twin=aio_ops.ReplayOps):
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
         return self._portal.call(self._aio.list_sessions, timeout=timeout)
 
@@ -189,7 +175,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         self._portal.call(self._aio.create_level, name, force_overwrite=force_overwrite, timeout=timeout)
@@ -202,7 +187,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         self._portal.call(self._aio.load_level, name_or_path, timeout=timeout)
@@ -253,7 +237,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             DestroyAssetFailed: The asset exists but cannot be deleted.
         """
         return self._portal.call(self._aio.destroy_asset, asset_path, timeout=timeout)
@@ -279,7 +262,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         self._portal.call(
@@ -301,7 +283,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             ActorHierarchyFailed: No actor matches.
         """
         return self._portal.call(self._aio.actor_hierarchy, target, by_name=by_name, timeout=timeout)
@@ -336,7 +317,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             GetActorBoundsFailed: No actor matches.
         """
         return self._portal.call(
@@ -352,7 +332,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SelectFailed: No actor matches.
         """
         self._portal.call(self._aio.select_actor, target, by_name=by_name, timeout=timeout)
@@ -382,7 +361,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             AddQuickConvertFailed: No actor matches, or it has no mesh to convert.
         """
         self._portal.call(
@@ -406,7 +384,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             RemoveQuickConvertFailed: No actor matches, or it is not converted.
         """
         self._portal.call(self._aio.remove_quick_convert, target, by_name=by_name, timeout=timeout)
@@ -443,7 +420,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(self._aio.draw_marker, location, color, ttl=ttl, label=label, tag=tag, timeout=timeout)
@@ -471,7 +447,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(self._aio.draw_line, from_, to, color, ttl=ttl, thickness=thickness, tag=tag, timeout=timeout)
@@ -499,7 +474,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -538,7 +512,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -576,7 +549,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -611,7 +583,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoEngine: There is no engine object to draw with.
         """
         self._portal.call(self._aio.set_overlay_text, text, anchor=anchor, timeout=timeout)
@@ -642,7 +613,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoViewport: The editor has no perspective viewport.
         """
         return self._portal.call(
@@ -674,7 +644,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
@@ -689,7 +658,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
             Unsupported: The request is not supported without Unreal; only the simulated server answers this.
@@ -715,7 +683,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
@@ -750,7 +717,6 @@ class FarmNamespace(Facade, twin=aio_ops.FarmNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             LeaseBusy: Another client holds the server's driver lease.
         """
         return self._portal.call(self._aio.acquire_lease, owner, ttl_s=ttl_s, timeout=timeout)
@@ -761,10 +727,6 @@ class FarmNamespace(Facade, twin=aio_ops.FarmNamespace):
         Args:
             lease_id: Return value of `acquire_lease`.
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            BadRequest: The frame is neither a msgpack map nor a JSON object.
         """
         self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)
 

@@ -10,6 +10,7 @@ import os
 import sys
 from collections import deque
 from struct import Struct as Layout
+from types import ModuleType
 from typing import IO, TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -105,11 +106,7 @@ def decode_camera(
         check_picture_size(width, height)
     except ValueError as error:
         raise damaged("camera frame", where, str(error), payload) from None
-    size = width * height * 4
     header = _frame_header(payload, width, height, where)
-    if header is None and len(payload) != size:
-        problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
-        raise damaged("camera frame", where, problem, payload)
     start = header.size if header else 0
     count = width * height
     words = np.empty(count + 1, "<u4") if memory is None else memory.words(count + 1)
@@ -135,10 +132,6 @@ def picture_stamp(payload: BytesLike, width: int, height: int, *, where: object 
     """
     header = _frame_header(payload, width, height, where)
     if header is None:
-        size = width * height * 4
-        if len(payload) != size:
-            problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
-            raise damaged("camera frame", where, problem, payload)
         return None
     _, _, frame_id, sim_time, *_ = header.unpack_from(payload)
     return PictureStamp(frame_id, sim_time, header.size)
@@ -158,8 +151,9 @@ def camera_header(frame_id: int, sim_time: float, width: int, height: int, captu
 
 
 def _frame_header(payload: BytesLike, width: int, height: int, where: object) -> Layout | None:
+    size = width * height * 4
     for version, layout in _FRAME_HEADERS.items():
-        if len(payload) != width * height * 4 + layout.size:
+        if len(payload) != size + layout.size:
             continue
         magic, said, _, _, columns, rows, *_ = layout.unpack_from(payload)
         if magic != _FRAME_MAGIC or said != version:
@@ -168,6 +162,9 @@ def _frame_header(payload: BytesLike, width: int, height: int, where: object) ->
             problem = f"header says {columns}x{rows} pixels, the handshake {width}x{height}"
             raise damaged("camera frame", where, problem, payload)
         return layout
+    if len(payload) != size:
+        problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
+        raise damaged("camera frame", where, problem, payload)
     return None
 
 
@@ -314,10 +311,7 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
         raise ValueError(f"max_size is at least 1 pixel, got {max_size}")
     if mode == CameraMode.REAL and max_size is None:
         return encoded(_in_place(pixels), "JPEG", quality=quality)
-    image = _image(grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
-    if max_size is not None:
-        image.thumbnail((max_size, max_size))
-    return encoded(image, "JPEG", quality=quality)
+    return encoded(_shown(pixels, mode, max_size), "JPEG", quality=quality)
 
 
 def shown_png(pixels: Pixels, mode: CameraMode | str) -> bytes | None:
@@ -328,7 +322,7 @@ def shown_png(pixels: Pixels, mode: CameraMode | str) -> bytes | None:
         mode: Meaning of the pixels.
     """
     try:
-        return encoded(_image(to_rgb(pixels, mode)), "PNG")
+        return encoded(_shown(pixels, mode), "PNG")
     except MissingExtra:
         return None
 
@@ -342,11 +336,17 @@ def thumbnail(pixels: Pixels, mode: CameraMode | str, description: str) -> str:
         description: Text for those who cannot see it.
     """
     try:
-        image = _image(to_rgb(pixels, mode))
-        image.thumbnail((_THUMBNAIL, _THUMBNAIL))
-        return picture(encoded(image, "PNG"), "png", description)
+        return picture(encoded(_shown(pixels, mode, _THUMBNAIL), "PNG"), "png", description)
     except MissingExtra as missing:
         return str(missing)
+
+
+def _shown(pixels: Pixels, mode: CameraMode | str, max_size: int | None = None) -> Image.Image:
+    """Return a picture for display as a Pillow image: colours, or depths as grey."""
+    image = _image(grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
+    if max_size is not None:
+        image.thumbnail((max_size, max_size))
+    return image
 
 
 def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:
@@ -362,30 +362,28 @@ def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False)
     Raises:
         MissingExtra: Pillow is not installed.
     """
-    need("PIL", extra="pillow")
-    from PIL import Image
-
-    height, width = pixels.shape[:2]
+    height, width, count = pixels.shape
     channels = "RGB" if mode == CameraMode.REAL else "BGR"
-    kind, raw = ("RGBA", f"{channels}A") if alpha else ("RGB", f"{channels}X")
-    return Image.frombytes(kind, (width, height), np.ascontiguousarray(pixels).data, "raw", raw)
+    kind, raw = ("RGBA", f"{channels}A") if alpha else ("RGB", channels if count == 3 else f"{channels}X")
+    return _pillow().frombytes(kind, (width, height), np.ascontiguousarray(pixels).data, "raw", raw)
 
 
 def _in_place(pixels: Pixels) -> Image.Image:
     """Return a colour picture as a Pillow image that shares its memory. JPEG supports this; PNG does not."""
-    need("PIL", extra="pillow")
-    from PIL import Image
-
     height, width, channels = pixels.shape
     kind = "RGB" if channels == 3 else "RGBX"
-    return Image.frombuffer(kind, (width, height), np.ascontiguousarray(pixels), "raw", kind, 0, 1)
+    return _pillow().frombuffer(kind, (width, height), np.ascontiguousarray(pixels), "raw", kind, 0, 1)
 
 
 def _image(array: NDArray[Any]) -> Image.Image:
+    return _pillow().fromarray(array)
+
+
+def _pillow() -> ModuleType:
     need("PIL", extra="pillow")
     from PIL import Image
 
-    return Image.fromarray(array)
+    return Image
 
 
 def encoded(image: Image.Image, kind: str, **options: Any) -> bytes:

@@ -3,19 +3,11 @@
 Needs the extra `web`.
 """
 
-try:
-    import PIL
-    import starlette
-except ImportError as error:
-    from urlab_client._installation import install_command
+from urlab_client._installation import need
 
-    raise ImportError(
-        f"urlab_client.web: {error.name} is not installed; run: {install_command('web')}", name=error.name
-    ) from error
+need("PIL", "starlette", extra="web")
 
-from urlab_client.web.access import Access
-from urlab_client.web.application import app, apps
+from urlab_client.web.access import Access  # noqa: E402 - its libraries may be missing
+from urlab_client.web.application import app, apps  # noqa: E402
 
 __all__ = ["Access", "app", "apps"]
-
-del PIL, starlette

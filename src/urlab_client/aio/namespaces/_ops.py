@@ -69,8 +69,6 @@ class RuntimeOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
@@ -94,8 +92,6 @@ class RuntimeOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
@@ -117,8 +113,6 @@ class RuntimeOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -135,8 +129,6 @@ class RuntimeOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -147,9 +139,6 @@ class RuntimeOps(Namespace):
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
         return (await self._call(ListKeyframes(), timeout)).keyframes
 
@@ -162,9 +151,6 @@ class ReplayOps(Namespace):
 
         Args:
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
         return (await self._call(ReplayListSessions(), timeout)).sessions
 
@@ -183,7 +169,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         await self._call(CreateLevel(name=name, force_overwrite=force_overwrite), timeout)
@@ -196,7 +181,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         await self._call(LoadLevel(name_or_path=name_or_path), timeout)
@@ -247,7 +231,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             DestroyAssetFailed: The asset exists but cannot be deleted.
         """
         return (await self._call(DestroyAsset(asset_path=asset_path), timeout)).was_found
@@ -273,7 +256,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         await self._call(
@@ -298,7 +280,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             ActorHierarchyFailed: No actor matches.
         """
         return (await self._call(ActorHierarchy(target=target, target_by=target_by(by_name)), timeout)).root
@@ -330,7 +311,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             GetActorBoundsFailed: No actor matches.
         """
         return fill(
@@ -349,7 +329,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SelectFailed: No actor matches.
         """
         await self._call(SelectActor(target=target, target_by=target_by(by_name)), timeout)
@@ -379,7 +358,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             AddQuickConvertFailed: No actor matches, or it has no mesh to convert.
         """
         await self._call(
@@ -404,7 +382,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             RemoveQuickConvertFailed: No actor matches, or it is not converted.
         """
         await self._call(RemoveQuickConvert(target=target, target_by=target_by(by_name)), timeout)
@@ -438,7 +415,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -471,7 +447,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -509,7 +484,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -549,7 +523,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -588,7 +561,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -624,7 +596,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoEngine: There is no engine object to draw with.
         """
         await self._call(SetOverlayText(text=text, anchor=anchor), timeout)
@@ -652,7 +623,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoViewport: The editor has no perspective viewport.
         """
         return fill(
@@ -688,7 +658,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
@@ -703,7 +672,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
             Unsupported: The request is not supported without Unreal; only the simulated server answers this.
@@ -729,7 +697,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
@@ -766,7 +733,6 @@ class FarmNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             LeaseBusy: Another client holds the server's driver lease.
         """
         return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
@@ -777,9 +743,5 @@ class FarmNamespace(Namespace):
         Args:
             lease_id: Return value of `acquire_lease`.
             timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            BadRequest: The frame is neither a msgpack map nor a JSON object.
         """
         await self._call(ReleaseLease(lease_id=lease_id), timeout)

@@ -80,15 +80,8 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         timeout=6.5,
-        errors=("missing_field", "not_ready", "bad_request", "timeout"),
+        errors=("timeout",),
         dialects=("beta",),
     ),
-    Op(
-        request=SetCameraDelay,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        timeout=6.5,
-        errors=("missing_field", "not_ready", "bad_request", "timeout"),
-        dialects=("beta",),
-    ),
+    Op(request=SetCameraDelay, ns="runtime", needs=Needs.MANAGER, timeout=6.5, errors=("timeout",), dialects=("beta",)),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from msgspec import field
@@ -113,54 +114,14 @@ class SetOverlayText(Request[SetOverlayTextOk], tag="set_overlay_text", kw_only=
     anchor: Annotated[str, doc("Accepted but not used; the plugin always uses the top left.")] = "top_left"
 
 
+_drawing = partial(Op, ns="debug", timeout=EDITOR_TIMEOUT_S, errors=("no_world",), generated=True)
+
 OPS: Final = (
-    Op(
-        request=DrawMarker,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_world"),
-        generated=True,
-        positional=2,
-    ),
-    Op(
-        request=DrawLine,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_world"),
-        generated=True,
-        positional=3,
-    ),
-    Op(
-        request=DrawBox,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_world"),
-        generated=True,
-        positional=3,
-    ),
-    Op(
-        request=DrawArrow,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_world"),
-        generated=True,
-        positional=3,
-    ),
-    Op(
-        request=DrawAxes,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_world"),
-        generated=True,
-        positional=1,
-    ),
-    Op(request=ClearMarkers, ns="debug", timeout=EDITOR_TIMEOUT_S, errors=("no_world",), generated=True),
-    Op(
-        request=SetOverlayText,
-        ns="debug",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_engine"),
-        generated=True,
-        positional=1,
-    ),
+    _drawing(request=DrawMarker, positional=2),
+    _drawing(request=DrawLine, positional=3),
+    _drawing(request=DrawBox, positional=3),
+    _drawing(request=DrawArrow, positional=3),
+    _drawing(request=DrawAxes, positional=1),
+    _drawing(request=ClearMarkers),
+    _drawing(request=SetOverlayText, errors=("no_engine",), positional=1),
 )

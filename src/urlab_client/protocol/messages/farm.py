@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
@@ -35,25 +36,9 @@ class ReleaseLease(Request[ReleaseLeaseOk], tag="release_lease", kw_only=True):
     lease_id: Annotated[str, doc("Return value of `acquire_lease`.")]
 
 
+_lease_op = partial(Op, ns="farm", needs=Needs.NOTHING, generated=True, positional=1, dialects=("beta",))
+
 OPS: Final = (
-    Op(
-        request=AcquireLease,
-        ns="farm",
-        needs=Needs.NOTHING,
-        errors=("not_ready", "busy"),
-        generated=True,
-        returns="lease_id",
-        positional=1,
-        dialects=("beta",),
-    ),
-    Op(
-        request=ReleaseLease,
-        ns="farm",
-        needs=Needs.NOTHING,
-        errors=("not_ready", "bad_request"),
-        generated=True,
-        positional=1,
-        undeclared=("lease_id",),
-        dialects=("beta",),
-    ),
+    _lease_op(request=AcquireLease, errors=("busy",), returns="lease_id"),
+    _lease_op(request=ReleaseLease, undeclared=("lease_id",)),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from msgspec import Struct, field
@@ -158,51 +159,43 @@ class RemoveQuickConvert(Request[RemoveQuickConvertOk], tag="remove_quick_conver
     target_by: TargetBy = "actor_id"
 
 
+_editor_op = partial(Op, ns="outliner", timeout=EDITOR_TIMEOUT_S)
+
 OPS: Final = (
-    Op(request=ListActors, ns="outliner", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("list_actors_failed",)),
-    Op(
+    _editor_op(request=ListActors, effect=Effect.READ, errors=("list_actors_failed",)),
+    _editor_op(
         request=ListBlueprints,
-        ns="outliner",
         effect=Effect.READ,
-        timeout=EDITOR_TIMEOUT_S,
         errors=("list_blueprints_failed",),
         generated=True,
         returns="blueprints",
     ),
-    Op(request=FindActors, ns="outliner", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("find_actors_failed",)),
-    Op(
+    _editor_op(request=FindActors, effect=Effect.READ, errors=("find_actors_failed",)),
+    _editor_op(
         request=GetActorBounds,
-        ns="outliner",
         effect=Effect.READ,
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "get_actor_bounds_failed"),
+        errors=("get_actor_bounds_failed",),
         generated=True,
         returns=ActorBounds,
         positional=1,
     ),
-    Op(
+    _editor_op(
         request=SelectActor,
-        ns="outliner",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "select_failed"),
+        errors=("select_failed",),
         generated=True,
         positional=1,
         declares=("op:string", "target:string"),
     ),
-    Op(
+    _editor_op(
         request=AddQuickConvert,
-        ns="outliner",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "add_quick_convert_failed"),
+        errors=("add_quick_convert_failed",),
         generated=True,
         positional=1,
         declares=("op:string", "target:string"),
     ),
-    Op(
+    _editor_op(
         request=RemoveQuickConvert,
-        ns="outliner",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "remove_quick_convert_failed"),
+        errors=("remove_quick_convert_failed",),
         generated=True,
         positional=1,
         declares=("op:string", "target:string"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request, doc
@@ -106,87 +107,17 @@ class ReplayStop(Request[ReplayStopOk], tag="replay_stop", kw_only=True):
 
 
 # The plugin declares no reply fields for these ops.
+_recording_op = partial(Op, ns="recording", needs=Needs.MANAGER, declares=())
+_replay_op = partial(Op, ns="replay", needs=Needs.MANAGER, declares=())
+
 OPS: Final = (
-    Op(
-        request=RecordingStart,
-        ns="recording",
-        method="start",
-        needs=Needs.MANAGER,
-        infinite=("max_duration_s",),
-        errors=("not_ready", "recording_already_active"),
-        declares=(),
-    ),
-    Op(
-        request=RecordingStop,
-        ns="recording",
-        method="stop",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "recording_not_active"),
-        returns=RecordingSummary,
-        declares=(),
-    ),
-    Op(
-        request=RecordingSave,
-        ns="recording",
-        method="save",
-        needs=Needs.MANAGER,
-        timeout=60.0,
-        errors=("not_ready", "path_not_writable"),
-        declares=(),
-    ),
-    Op(
-        request=RecordingClear,
-        ns="recording",
-        method="clear",
-        needs=Needs.MANAGER,
-        errors=("not_ready",),
-        declares=(),
-    ),
-    Op(
-        request=ReplayLoad,
-        ns="replay",
-        method="load",
-        needs=Needs.MANAGER,
-        timeout=60.0,
-        errors=("not_ready", "missing_field", "path_not_readable"),
-        undeclared=("path",),
-        declares=(),
-    ),
-    Op(
-        request=ReplayListSessions,
-        ns="replay",
-        method="list_sessions",
-        needs=Needs.MANAGER,
-        effect=Effect.READ,
-        errors=("not_ready",),
-        generated=True,
-        returns="sessions",
-        declares=(),
-    ),
-    Op(
-        request=ReplaySetActive,
-        ns="replay",
-        method="set_active",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "replay_session_not_found"),
-        undeclared=("name",),
-        declares=(),
-    ),
-    Op(
-        request=ReplayStart,
-        ns="replay",
-        method="start",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "replay_requires_stepped"),
-        returns=ReplayStatus,
-        declares=(),
-    ),
-    Op(
-        request=ReplayStop,
-        ns="replay",
-        method="stop",
-        needs=Needs.MANAGER,
-        errors=("not_ready",),
-        declares=(),
-    ),
+    _recording_op(request=RecordingStart, infinite=("max_duration_s",), errors=("recording_already_active",)),
+    _recording_op(request=RecordingStop, errors=("recording_not_active",), returns=RecordingSummary),
+    _recording_op(request=RecordingSave, timeout=60.0, errors=("path_not_writable",)),
+    _recording_op(request=RecordingClear),
+    _replay_op(request=ReplayLoad, timeout=60.0, errors=("path_not_readable",), undeclared=("path",)),
+    _replay_op(request=ReplayListSessions, effect=Effect.READ, generated=True, returns="sessions"),
+    _replay_op(request=ReplaySetActive, errors=("replay_session_not_found",), undeclared=("name",)),
+    _replay_op(request=ReplayStart, errors=("replay_requires_stepped",), returns=ReplayStatus),
+    _replay_op(request=ReplayStop),
 )

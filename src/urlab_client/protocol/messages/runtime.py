@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, Final
 
 from msgspec import Struct
@@ -254,74 +255,37 @@ class SetSimOptions(Request[SetSimOptionsOk], tag="set_sim_options", kw_only=Tru
     options: Annotated[SimOptions, doc("Fields to change; None keeps a field.")]
 
 
+_play_op = partial(Op, ns="runtime", needs=Needs.MANAGER)
+
 OPS: Final = (
-    Op(
-        request=SetMode,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "mode_locked_by_server", "missing_field", "bad_mode"),
-        undeclared=("mode",),
-    ),
-    Op(
-        request=SetPaused,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field"),
-    ),
-    Op(
+    _play_op(request=SetMode, errors=("mode_locked_by_server", "bad_mode"), undeclared=("mode",)),
+    _play_op(request=SetPaused),
+    _play_op(
         request=ConfigureController,
-        ns="runtime",
-        needs=Needs.MANAGER,
         infinite=("params",),
-        errors=(
-            "not_ready",
-            "missing_field",
-            "unknown_articulation",
-            "no_controller",
-            "controller_schema_violation",
-        ),
+        errors=("unknown_articulation", "no_controller", "controller_schema_violation"),
     ),
-    Op(
-        request=SetSimOptions,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "bad_value"),
-        undeclared=("options",),
-        declares=("op:string",),
-    ),
-    Op(
-        request=SetSimSpeed,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field"),
-        returns="percent",
-        positional=1,
-    ),
-    Op(
+    _play_op(request=SetSimOptions, errors=("bad_value",), undeclared=("options",), declares=("op:string",)),
+    _play_op(request=SetSimSpeed, returns="percent", positional=1),
+    _play_op(
         request=SetControlSource,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "bad_value", "unknown_articulation", "not_control_owner"),
+        errors=("bad_value", "unknown_articulation", "not_control_owner"),
         generated=True,
         positional=1,
         undeclared=("source",),
         declares=("op:string",),
     ),
-    Op(
+    _play_op(
         request=SetTwist,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_twist_controller"),
+        errors=("unknown_articulation", "not_control_owner", "no_twist_controller"),
         generated=True,
         positional=1,
         undeclared=("articulation",),
         declares=("op:string",),
     ),
-    Op(
+    _play_op(
         request=SetQpos,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_joints", "dim_mismatch"),
+        errors=("unknown_articulation", "not_control_owner", "no_joints", "dim_mismatch"),
         declares=(
             "op:string",
             "target:string",
@@ -331,54 +295,20 @@ OPS: Final = (
             "free_base_shortcut:bool",
         ),
     ),
-    Op(
-        request=SetMocapPose,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
-        generated=True,
-        returns=MocapPose,
-        positional=1,
+    _play_op(
+        request=SetMocapPose, errors=("unknown_body", "not_mocap_body"), generated=True, returns=MocapPose, positional=1
     ),
-    Op(
+    _play_op(
         request=ReadMocapPose,
-        ns="runtime",
-        needs=Needs.MANAGER,
         effect=Effect.READ,
-        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
+        errors=("unknown_body", "not_mocap_body"),
         generated=True,
         returns=MocapPose,
         positional=1,
     ),
-    Op(request=GetContacts, ns="runtime", needs=Needs.MANAGER, effect=Effect.READ, errors=("not_ready",)),
-    Op(
-        request=ListKeyframes,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        effect=Effect.READ,
-        errors=("not_ready",),
-        generated=True,
-        returns="keyframes",
-    ),
-    Op(
-        request=SetUserChannels,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready",),
-        dialects=("beta",),
-    ),
-    Op(
-        request=ClaimControl,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "control_claimed"),
-        dialects=("beta",),
-    ),
-    Op(
-        request=ReleaseControl,
-        ns="runtime",
-        needs=Needs.MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner"),
-        dialects=("beta",),
-    ),
+    _play_op(request=GetContacts, effect=Effect.READ),
+    _play_op(request=ListKeyframes, effect=Effect.READ, generated=True, returns="keyframes"),
+    _play_op(request=SetUserChannels, dialects=("beta",)),
+    _play_op(request=ClaimControl, errors=("unknown_articulation", "control_claimed"), dialects=("beta",)),
+    _play_op(request=ReleaseControl, errors=("unknown_articulation", "not_control_owner"), dialects=("beta",)),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from msgspec import Struct, field
@@ -309,65 +310,31 @@ class Snapshot(Request[SnapshotOk], tag="snapshot", kw_only=True):
     """Describe every visible actor with articulation metadata."""
 
 
+_editor_op = partial(Op, ns="scene", timeout=EDITOR_TIMEOUT_S)
+
 OPS: Final = (
-    Op(
-        request=ImportXml,
-        job=True,
-        ns="scene",
-        timeout=120.0,
-        errors=("missing_field", "import_failed"),
-    ),
-    Op(
-        request=CreateLevel,
-        job=True,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "create_level_failed"),
-        generated=True,
-        positional=1,
-    ),
-    Op(
-        request=LoadLevel,
-        job=True,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "load_level_failed"),
-        generated=True,
-        positional=1,
-    ),
-    Op(
-        request=SaveLevel, job=True, ns="scene", timeout=EDITOR_TIMEOUT_S, errors=("save_level_failed",), generated=True
-    ),
-    Op(
+    _editor_op(request=ImportXml, job=True, timeout=120.0, errors=("import_failed",)),
+    _editor_op(request=CreateLevel, job=True, errors=("create_level_failed",), generated=True, positional=1),
+    _editor_op(request=LoadLevel, job=True, errors=("load_level_failed",), generated=True, positional=1),
+    _editor_op(request=SaveLevel, job=True, errors=("save_level_failed",), generated=True),
+    _editor_op(
         request=CurrentLevel,
-        ns="scene",
         effect=Effect.READ,
-        timeout=EDITOR_TIMEOUT_S,
         errors=("not_in_editor", "no_world"),
         generated=True,
         returns="level_path",
     ),
-    Op(
+    _editor_op(
         request=EnsureManager,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
         errors=("not_in_editor", "no_world", "spawn_failed"),
         generated=True,
         returns="was_existing",
     ),
-    Op(request=SpawnActor, job=True, ns="scene", timeout=EDITOR_TIMEOUT_S, errors=("missing_field", "spawn_failed")),
-    Op(
-        request=SpawnGrid,
-        job=True,
-        ns="scene",
-        timeout=60.0,
-        errors=("missing_field", "invalid_count", "too_many_cells", "spawn_failed"),
-    ),
-    Op(
+    _editor_op(request=SpawnActor, job=True, errors=("spawn_failed",)),
+    _editor_op(request=SpawnGrid, job=True, timeout=60.0, errors=("invalid_count", "too_many_cells", "spawn_failed")),
+    _editor_op(
         request=SpawnLight,
         job=True,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
         errors=("spawn_failed",),
         declares=(
             "op:string",
@@ -381,55 +348,26 @@ OPS: Final = (
             "requires_pie_restart:bool",
         ),
     ),
-    Op(
-        request=DestroyActor,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "destroy_failed"),
-        dialects=("alpha",),
+    _editor_op(request=DestroyActor, errors=("destroy_failed",), dialects=("alpha",)),
+    _editor_op(request=RemoveActor, errors=("destroy_failed",), dialects=("beta",), job=True),
+    _editor_op(
+        request=DestroyAsset, errors=("destroy_asset_failed",), generated=True, returns="was_found", positional=1
     ),
-    Op(
-        request=RemoveActor,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "destroy_failed"),
-        dialects=("beta",),
-        job=True,
-    ),
-    Op(
-        request=DestroyAsset,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "destroy_asset_failed"),
-        generated=True,
-        returns="was_found",
-        positional=1,
-    ),
-    Op(
+    _editor_op(
         request=SetActorTransform,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "set_actor_transform_failed"),
+        errors=("set_actor_transform_failed",),
         generated=True,
         positional=1,
         declares=("op:string", "target:string", "actor_name:string", "requires_pie_restart:bool"),
     ),
-    Op(
-        request=DuplicateActor,
-        job=True,
-        ns="scene",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "duplicate_failed"),
-    ),
-    Op(
+    _editor_op(request=DuplicateActor, job=True, errors=("duplicate_failed",)),
+    _editor_op(
         request=ActorHierarchy,
-        ns="scene",
         effect=Effect.READ,
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "actor_hierarchy_failed"),
+        errors=("actor_hierarchy_failed",),
         generated=True,
         returns="root",
         positional=1,
     ),
-    Op(request=Snapshot, ns="scene", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("snapshot_failed",)),
+    _editor_op(request=Snapshot, effect=Effect.READ, errors=("snapshot_failed",)),
 )

@@ -411,7 +411,7 @@ OPS: Final = (
         # Above the server's own limit of 5 s; otherwise its step_timeout would arrive too late.
         timeout=6.5,
         hot=True,
-        errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
+        errors=("not_control_owner", "step_timeout"),
         declares=(
             "op:string",
             "time:float",
@@ -424,7 +424,7 @@ OPS: Final = (
     Op(
         request=Reset,
         needs=Needs.MANAGER,
-        errors=("not_ready", "unknown_keyframe"),
+        errors=("unknown_keyframe",),
         declares=("op:string", "time:float", "step:int"),
     ),
     Op(
@@ -433,7 +433,6 @@ OPS: Final = (
         needs=Needs.MANAGER,
         # Computes derived quantities and leaves the state unchanged, so repeating it has no effect.
         effect=Effect.READ,
-        errors=("not_ready",),
         declares=("op:string", "time:float", "step:int", "per_articulation:object"),
     ),
 )

@@ -51,7 +51,7 @@ OPS: Final = (
         ns="sim",
         method="start",
         timeout=45.0,
-        errors=("shutting_down", "load_level_failed"),
+        errors=("load_level_failed",),
         declares=("op:string", "state:string", "compile_error:string", "handshake_payload:object?"),
     ),
     Op(request=StopPie, ns="sim", method="stop", timeout=EDITOR_TIMEOUT_S, errors=("timeout",)),

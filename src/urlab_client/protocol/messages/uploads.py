@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from msgspec import Struct, field
@@ -87,13 +88,12 @@ class UploadModelCommit(Request[UploadModelCommitOk], tag="upload_model_commit",
     upload_id: Annotated[str, doc("Id of the upload.")]
 
 
+_upload_op = partial(Op, ns="scene", needs=Needs.NOTHING, dialects=("beta",))
+
 OPS: Final = (
-    Op(
+    _upload_op(
         request=UploadModelManifest,
-        ns="scene",
-        needs=Needs.NOTHING,
-        errors=("bad_request", "payload_too_large"),
-        dialects=("beta",),
+        errors=("payload_too_large",),
         declares=(
             "op:string",
             "upload_id:string",
@@ -103,23 +103,17 @@ OPS: Final = (
             "max_total_bytes:int",
         ),
     ),
-    Op(
+    _upload_op(
         request=UploadModelChunk,
-        ns="scene",
-        needs=Needs.NOTHING,
         timeout=60.0,
         hot=True,
-        errors=("bad_request", "payload_too_large", "unknown_upload", "hash_mismatch"),
+        errors=("payload_too_large", "unknown_upload", "hash_mismatch"),
         undeclared=("data",),
-        dialects=("beta",),
     ),
-    Op(
+    _upload_op(
         request=UploadModelCommit,
-        ns="scene",
-        needs=Needs.NOTHING,
         timeout=600.0,
-        errors=("bad_request", "unknown_upload", "import_failed", "shutting_down"),
-        dialects=("beta",),
+        errors=("unknown_upload", "import_failed"),
         declares=(
             "op:string",
             "imported:bool",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import (
@@ -101,52 +102,21 @@ class Untrack(Request[UntrackOk], tag="untrack", kw_only=True):
     """Stop tracking, and return whether it was active."""
 
 
+_editor_op = partial(Op, ns="viewport", timeout=EDITOR_TIMEOUT_S, generated=True)
+
 OPS: Final = (
-    Op(
-        request=SetCamera,
-        ns="viewport",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "no_viewport"),
-        generated=True,
-        returns=CameraPose,
-        positional=1,
+    _editor_op(request=SetCamera, errors=("no_viewport",), returns=CameraPose, positional=1),
+    _editor_op(request=GetCamera, effect=Effect.READ, errors=("no_viewport",), returns=CameraPose),
+    _editor_op(
+        request=FrameActor, errors=("unknown_actor", "no_bounds", "no_viewport"), returns=CameraPose, positional=1
     ),
-    Op(
-        request=GetCamera,
-        ns="viewport",
-        effect=Effect.READ,
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("no_viewport",),
-        generated=True,
-        returns=CameraPose,
-    ),
-    Op(
-        request=FrameActor,
-        ns="viewport",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "unknown_actor", "no_bounds", "no_viewport"),
-        generated=True,
-        returns=CameraPose,
-        positional=1,
-    ),
-    Op(
+    _editor_op(
         request=SetViewportMode,
-        ns="viewport",
         method="set_mode",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "invalid_mode", "no_viewport", "unsupported"),
-        generated=True,
+        errors=("invalid_mode", "no_viewport", "unsupported"),
         returns="mode",
         positional=1,
     ),
-    Op(
-        request=TrackActor,
-        ns="viewport",
-        timeout=EDITOR_TIMEOUT_S,
-        errors=("missing_field", "unknown_actor", "no_viewport"),
-        generated=True,
-        returns="tracked_actor_path",
-        positional=1,
-    ),
-    Op(request=Untrack, ns="viewport", timeout=EDITOR_TIMEOUT_S, generated=True, returns="was_tracking"),
+    _editor_op(request=TrackActor, errors=("unknown_actor", "no_viewport"), returns="tracked_actor_path", positional=1),
+    _editor_op(request=Untrack, returns="was_tracking"),
 )
