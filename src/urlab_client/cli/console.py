@@ -19,10 +19,9 @@ from urllib.parse import urlsplit
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_page,
+    PAGE,
+    WATCHER,
+    address_usage,
     check_page,
     host_names,
     make_client,
@@ -34,28 +33,19 @@ _PORT = 8355
 _KEY = "URLAB_CONSOLE_KEY"
 _KEY_CHARACTERS = 16
 
-
-EXAMPLES = (
-    ("urlab console", "the server on this machine, at a link for your browser"),
-    ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
-    ("urlab console --port 0", "any free port for the page"),
-    ("urlab console --handshake robot.hello", "watch alongside the driving client"),
-    ("urlab console --public-url https://lab.example/robots/", "behind a proxy, which has that address"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    add_client(parser, handshake=True)
-    add_page(parser, _PORT)
-    parser.add_argument(
-        "--public-url",
-        type=_public_url,
-        metavar="URL",
-        help="URL by which browsers reach the page through a proxy, which removes its path",
-    )
-    parser.add_argument("--json-log", action="store_true", help="write the log as lines of JSON")
+USAGE = f"""
+{address_usage()}
+{PAGE.format(_PORT)}
+--public-url URL  URL by which browsers reach the page through a proxy, which removes its path
+--json-log  write the log as lines of JSON
+{WATCHER}
+examples:
+urlab console  the server on this machine, at a link for your browser
+urlab console sim://quadruped --open  a simulated robot, opened in the browser
+urlab console --port 0  any free port for the page
+urlab console --handshake robot.hello  watch alongside the driving client
+urlab console --public-url https://lab.example/robots/  behind a proxy, which has that address
+"""
 
 
 def _public_url(text: str) -> str:
@@ -63,6 +53,9 @@ def _public_url(text: str) -> str:
     if parts.scheme not in {"http", "https"} or not parts.hostname or parts.query or parts.fragment:
         raise ArgumentTypeError(f"{text!r} is not a URL of a page, such as https://lab.example/robots/")
     return text.rstrip("/")
+
+
+KINDS = {"public_url": _public_url}
 
 
 def run(arguments: Namespace) -> int:

@@ -25,7 +25,7 @@ import numpy as np
 
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import Parser, add_dialect, count
+from urlab_client.cli._arguments import DIALECT
 from urlab_client.cli._common import CommandError, import_mujoco, one_line, output, table
 
 if TYPE_CHECKING:
@@ -44,34 +44,17 @@ _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 _PACKAGES = ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")
 
-EXAMPLES = (
-    ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
-    ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
-    ("urlab demo arm --no-render", "without a picture of the last state"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "model",
-        nargs="?",
-        default="quadruped",
-        metavar="MODEL",
-        help="an MJCF file or the name of a bundled robot (default: %(default)s)",
-    )
-    add_dialect(parser)
-    parser.add_argument(
-        "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=2000,
-        metavar="N",
-        help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
-    )
-    parser.add_argument("--no-render", action="store_true", help="do not draw the picture of the last state")
+USAGE = f"""
+MODEL=quadruped  an MJCF file or the name of a bundled robot
+{DIALECT}
+--output DIR=urlab-demo  where to write
+--steps N=2000  steps of the blocking run; the async run takes a quarter
+--no-render  do not draw the picture of the last state
+examples:
+urlab demo  the bundled quadruped; results in urlab-demo/
+urlab demo robot.xml --steps 500 --output run1  your own model
+urlab demo arm --no-render  without a picture of the last state
+"""
 
 
 def run(arguments: Namespace) -> int:

@@ -10,7 +10,7 @@ from argparse import Namespace
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Parser, add_recording
+from urlab_client.cli._arguments import RECORDING
 from urlab_client.cli._common import counted, json_line, output, progress_bar, table
 
 if TYPE_CHECKING:
@@ -18,21 +18,15 @@ if TYPE_CHECKING:
 
 _UNFINISHED = 1
 
-
-EXAMPLES = (
-    ("urlab info run.mcap", "duration, topics, rates and gaps"),
-    ("urlab info run.mcap --json", "the same for programs"),
-    ("urlab info run.mcap --verify", "also look for damage"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_recording(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
-        "--verify", action="store_true", help="read the whole file and compare checksums, not only its index"
-    )
+USAGE = f"""
+{RECORDING}
+--json  print JSON
+--verify  read the whole file and compare checksums, not only its index
+examples:
+urlab info run.mcap  duration, topics, rates and gaps
+urlab info run.mcap --json  the same for programs
+urlab info run.mcap --verify  also look for damage
+"""
 
 
 def run(arguments: Namespace) -> int:

@@ -20,7 +20,7 @@ from msgspec import Struct
 from urlab_client.aio import URLabArticulation, URLabClient
 from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
-from urlab_client.cli._arguments import Parser, add_address, add_client, count, make_client, seconds
+from urlab_client.cli._arguments import SESSIONLESS, address_usage, make_client
 from urlab_client.cli._common import aligned, counted, import_mujoco, json_line
 from urlab_client.errors import (
     ModeLocked,
@@ -102,31 +102,20 @@ class RegisteredServer(Struct):
     answers: bool | None
 
 
-EXAMPLES = (
-    ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
-    ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
-    ("urlab ping --all", "every server that this machine's registry lists"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument(
-        "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="how long to wait for each reply (default: 2)"
-    )
-    parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
-    parser.add_argument(
-        "--no-session", action="store_true", help="do not open a session, so that no client is disturbed"
-    )
-    parser.add_argument(
-        "--all",
-        action="store_true",
-        help="list the servers in this machine's registry (which the plugin's beta writes), and check whether each "
-        "answers; does not disturb other clients",
-    )
-    parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    add_client(parser, state=False)
+USAGE = f"""
+{address_usage()}
+--timeout SECONDS=2  how long to wait for each reply
+--count N=5  round trips to time
+--no-session  do not open a session, so that no client is disturbed
+--all  list the servers in this machine's registry (which the plugin's beta writes), and check whether each answers;
+    does not disturb other clients
+--json  print one line of JSON
+{SESSIONLESS}
+examples:
+urlab ping  the server on this machine: versions, play state, robots, round trip
+urlab ping 192.168.1.20:5559 --no-session  another machine, without taking over its session
+urlab ping --all  every server that this machine's registry lists
+"""
 
 
 def run(arguments: Namespace) -> int:

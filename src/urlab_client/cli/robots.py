@@ -11,7 +11,6 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import aligned, import_mujoco, json_line
 
 
@@ -27,16 +26,13 @@ class Robot(Struct):
     path: str
 
 
-EXAMPLES = (
-    ("urlab robots", "a table"),
-    ("urlab serve arm --play", "serve one of them"),
-    ("urlab robots --json", "the same for programs, with the path of each file"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
+USAGE = """
+--json  print JSON
+examples:
+urlab robots  a table
+urlab serve arm --play  serve one of them
+urlab robots --json  the same for programs, with the path of each file
+"""
 
 
 def run(arguments: Namespace) -> int:

@@ -22,19 +22,7 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_policy,
-    add_record,
-    add_task,
-    cameras,
-    make_client,
-    one_of,
-    seconds,
-    task_named,
-)
+from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, task_named
 from urlab_client.cli._common import (
     CommandError,
     check_recording,
@@ -57,58 +45,27 @@ _FELL = 1
 _SEED = 0
 _ROUNDING_S = 1e-9
 
-
-EXAMPLES = (
-    ("urlab run-policy walk.onnx", "simulates the robot that walk.toml beside it names"),
-    (
-        "urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare",
-        "walk forward at 0.5 m/s; compare with zero and random outputs",
-    ),
-    ("urlab run-policy go.onnx --task my_tasks:Go", "an episode of a task of your own, by a network trained for it"),
-    (
-        "urlab run-policy walk.onnx tcp://localhost --record walk.mcap",
-        "drive the robot of a running server, and record it",
-    ),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_policy(
-        parser,
-        "an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive "
-        "(default: as declared)",
-    )
-    add_address(parser, default=None, otherwise="a simulated server for --robot or --task")
-    add_task(parser)
-    parser.add_argument(
-        "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--command",
-        dest="twist",
-        type=float,
-        nargs=3,
-        metavar=("VX", "VY", "WZ"),
-        help="velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)",
-    )
-    parser.add_argument(
-        "--goal",
-        type=float,
-        nargs="+",
-        metavar="NUMBER",
-        help="goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)",
-    )
-    parser.add_argument(
-        "--step-mode",
-        type=one_of(StepMode.DIRECT, StepMode.LIVE),
-        metavar="MODE",
-        help="direct or live (default: the first mode that the declaration allows)",
-    )
-    parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
-    add_record(parser, hz=None)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    add_client(parser)
+USAGE = f"""
+{POLICY}
+{address_usage("ADDRESS?", "a simulated server for --robot or --task")}
+--robot ROBOT  an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive
+    (default: as declared)
+{TASK}
+--seconds S=10  simulated seconds
+--command VX VY WZ  velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)
+--goal NUMBER+  goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)
+--step-mode direct|live  what advances physics (default: the first mode that the declaration allows)
+--compare  run zero and random outputs first, for comparison
+{RECORD}
+--json  print JSON
+{CLIENT}
+examples:
+urlab run-policy walk.onnx  simulates the robot that walk.toml beside it names
+urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare
+    walk forward at 0.5 m/s; compare with zero and random outputs
+urlab run-policy go.onnx --task my_tasks:Go  an episode of a task of your own, by a network trained for it
+urlab run-policy walk.onnx tcp://localhost --record walk.mcap  drive the robot of a running server, and record it
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -120,7 +77,7 @@ def run(arguments: Namespace) -> int:
     from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
-    for name, given in (("command", arguments.twist), ("goal", arguments.goal)):
+    for name, given in (("command", arguments.command), ("goal", arguments.goal)):
         if given is not None:
             with refusing(ValueError, option=f"--{name}"):
                 setattr(policy, name, given)
@@ -173,7 +130,7 @@ def _in_task(arguments: Namespace) -> int:
 
 def _options_of_a_declaration(arguments: Namespace) -> dict[str, Any]:
     named = {name: getattr(arguments, name) for name in ("declaration", "robot", "goal", "compare")}
-    return {**named, "command": arguments.twist, "step-mode": arguments.step_mode}
+    return {**named, "command": arguments.command, "step-mode": arguments.step_mode}
 
 
 async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:

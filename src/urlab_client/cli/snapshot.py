@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import (
-    Parser,
-    add_client,
-    add_mjcf_options,
-    handshake,
-    image_size,
-    make_client,
-    seconds,
-)
+from urlab_client.cli._arguments import MJCF_OPTIONS, WATCHER, handshake, make_client
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabTimeoutError
@@ -38,64 +30,26 @@ _TIMEOUT_S = 5.0
 _CHUNK = 100  # physics steps per request, for which the server allows 5 s
 _BEYOND_M = 1e5  # farther than any ray can hit
 
-
-EXAMPLES = (
-    ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
-    (
-        "urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg",
-        "your own model, one second after its keyframe, as JPEG",
-    ),
-    ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
-    ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
-    ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "alongside its client"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "sources",
-        nargs="+",
-        metavar="SOURCE",
-        help="MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the "
-        "address of a running server, tcp://HOST[:PORT] or ipc://PATH",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("snapshot.png"),
-        metavar="FILE",
-        help="a .png, .jpg or .webp file (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--camera",
-        metavar="ARTICULATION/CAMERA",
-        help="show what this camera sees (default: the whole scene, from outside)",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=(*_VIEW_MODES, *CameraMode),
-        metavar="MODE",
-        help=f"{', '.join(_VIEW_MODES)}; with --camera {', '.join(CameraMode)} (default: lit, or real)",
-    )
-    parser.add_argument(
-        "--size",
-        type=image_size,
-        default=(1280, 720),
-        metavar="WxH",
-        help="size in pixels, also of a camera without a resolution (default: 1280x720)",
-    )
-    parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long first")
-    add_mjcf_options(parser, "for models")
-    parser.add_argument(
-        "--timeout",
-        type=seconds,
-        metavar="S",
-        help="how long to wait for a running server (default: 5, and 30 for its first picture)",
-    )
-    add_client(parser, handshake=True)
+USAGE = f"""
+SOURCE+  MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the address
+    of a running server, tcp://HOST[:PORT] or ipc://PATH
+-o --output FILE=snapshot.png  a .png, .jpg or .webp file
+--camera ARTICULATION/CAMERA  show what this camera sees (default: the whole scene, from outside)
+--mode {"|".join((*_VIEW_MODES, *CameraMode))}  the view mode; with --camera the camera's mode (default: lit, or real)
+--size WxH=1280x720  size in pixels, also of a camera without a resolution
+--keyframe NAME  start play at this keyframe
+--seconds S  simulate for this long first
+{MJCF_OPTIONS.format("for models")}
+--timeout S  how long to wait for a running server (default: 5, and 30 for its first picture)
+{WATCHER}
+examples:
+urlab snapshot quadruped -o quadruped.png  a bundled robot
+urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg
+    your own model, one second after its keyframe, as JPEG
+urlab snapshot arm --camera arm/wrist --mode depth  what a camera of the model sees
+urlab snapshot tcp://localhost --camera arm/overview  what a camera of a running server sees
+urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello  alongside its client
+"""
 
 
 def run(arguments: Namespace) -> int:
