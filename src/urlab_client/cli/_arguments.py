@@ -27,6 +27,7 @@ Kinds: TypeAlias = Mapping[str, Callable[[str], Any]]
 C = TypeVar("C")
 
 _LARGEST_IMAGE = 16384
+_LARGEST = 1e6
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -283,36 +284,6 @@ def address(text: str) -> str:
     return f"tcp://{text}"
 
 
-def port(text: str) -> int:
-    """Parse a TCP port, 0 to 65535."""
-    return _whole(text, 0, 65535, "a port is a whole number from 0 (any free one) to 65535")
-
-
-def index(text: str) -> int:
-    """Parse the number of a server among several, 0 or more."""
-    return _whole(text, 0, 5000, "an index is a whole number from 0 to 5000")
-
-
-def seed(text: str) -> int:
-    """Parse the seed of a random generator, 0 or more."""
-    return _whole(text, 0, 2**63, "a seed must be at least 0")
-
-
-def count(text: str) -> int:
-    """Parse a count, 1 or more."""
-    return _whole(text, 1, 10**9, "give a whole number above 0")
-
-
-def seconds(text: str) -> float:
-    """Parse a duration in seconds, above 0."""
-    return _number(text, lambda value: 0 < value < 1e6, "give a number of seconds above 0")
-
-
-def hertz(text: str) -> float:
-    """Parse a rate per second, above 0."""
-    return _number(text, lambda value: 0 < value < 1e6, "give a number per second, above 0")
-
-
 def image_size(text: str) -> tuple[int, int]:
     """Parse width and height of an image, pixels."""
     width, cross, height = text.lower().partition("x")
@@ -327,36 +298,46 @@ def _not_one_of(value: str, known: Sequence[str]) -> str:
     return f"{value!r} is not one of {', '.join(known)}.{did_you_mean(value, known)}"
 
 
-def _whole(text: str, low: int, high: int, advice: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = low - 1
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
-    return value
+def _whole(low: int, high: int, advice: str) -> Callable[[str], int]:
+    """Return what parses a whole number in a range."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
+        return value
+
+    return parse
 
 
-def _number(text: str, fits: Callable[[float], bool], advice: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not fits(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
-    return value
+def _positive(advice: str) -> Callable[[str], float]:
+    """Return what parses a number above 0."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < _LARGEST:
+            raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
+        return value
+
+    return parse
 
 
 _KINDS: Final[Kinds] = {
     "ADDRESS": address,
-    "PORT": port,
-    "N": count,
-    "SEED": seed,
-    "S": seconds,
-    "SECONDS": seconds,
-    **dict.fromkeys(("HZ", "M/S", "RAD/S"), hertz),
-    **dict.fromkeys(("NUMBER", "P", "VX"), float),
     "WxH": image_size,
+    "PORT": _whole(0, 65535, "a port is a whole number from 0 (any free one) to 65535"),
+    "INDEX": _whole(0, 5000, "an index is a whole number from 0 to 5000"),
+    "SEED": _whole(0, 2**63, "a seed must be at least 0"),
+    "N": _whole(1, 10**9, "give a whole number above 0"),
+    **dict.fromkeys(("S", "SECONDS"), _positive("give a number of seconds above 0")),
+    **dict.fromkeys(("HZ", "M/S", "RAD/S"), _positive("give a number per second, above 0")),
+    **dict.fromkeys(("NUMBER", "P", "VX"), float),
     **dict.fromkeys(("FILE", "PATH", "DIR", "FOLDER", "OUTPUT", "POLICY", "RECORDING"), Path),
 }
 """How a value is read, by its name; others are text."""

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
 from urlab_client._platform.windows import read_aside
-from urlab_client.cli._arguments import DIALECT, index
+from urlab_client.cli._arguments import DIALECT
 from urlab_client.cli._common import CommandError, import_mujoco, in_background
 from urlab_client.enums import CameraMode
 from urlab_client.simulation.controller_config import ControllerConfig
@@ -68,7 +68,7 @@ network:
 --info-port PORT  default 5557; 0: any free one
 --camera-port PORT  default 5558; 0: any free one
 {DIALECT}
---instance-index N  number of this server among several: ports not given are 5559 + 10 N and the next two
+--instance-index INDEX  number of this server among several: ports not given are 5559 + 10 N and the next two
 --instance-id NAME=  name of this server among several
 --metrics-port PORT  also serve metrics for Prometheus at http://127.0.0.1:PORT/metrics; 0: any free one
 | --shm-dir DIR  also serve over shared memory, in a new directory below DIR (on Linux, /dev/shm avoids the disk)
@@ -126,7 +126,7 @@ def _camera_mode(text: str) -> tuple[str, CameraMode]:
     return camera, CameraMode(mode)
 
 
-KINDS = {"controller": _controller, "camera_mode": _camera_mode, "instance_index": index}
+KINDS = {"controller": _controller, "camera_mode": _camera_mode}
 
 
 def run(arguments: Namespace) -> int:
