@@ -224,6 +224,7 @@ CAMERA_HZ = "--camera-hz HZ={}  pictures per second"
 RECORD = f"""
 --record FILE  record into a .mcap file (extra 'mcap')
 {CAMERA.format("with --record: a camera to record")}
+{CAMERA_HZ.format(30)}
 --overwrite  with --record: replace FILE if it exists
 """
 DIALECT = "--dialect alpha|beta=alpha  plugin generation to simulate: alpha (June 2026) or beta (August 2026)"

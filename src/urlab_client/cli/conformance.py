@@ -21,14 +21,13 @@ from urlab_client.aio.transport.connection import client_keys
 from urlab_client.cli._arguments import CLIENT, address_usage
 from urlab_client.cli._common import (
     CommandError,
+    aligned,
     check_ending,
     import_mujoco,
     json_line,
-    output,
     progress_bar,
     refusing,
     sigterm_interrupts,
-    table,
 )
 from urlab_client.conformance.bench import Bench, write_robot
 from urlab_client.conformance.declarations import Differs, Group, Verdict, statement_titles
@@ -151,18 +150,15 @@ def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
 
 
 def _print(arguments: Namespace, report: Report) -> None:
-    console = output()
-    found = table(("statement", "verdict", "what was checked"), ())
-    for row in differences_first(report):
-        if row.verdict is not Verdict.NOT_TRIED or arguments.all:
-            found.add_row(row.id, WORDS[row.verdict], row.detail)
-    console.print(found)
+    shown = [row for row in differences_first(report) if row.verdict is not Verdict.NOT_TRIED or arguments.all]
+    rows = [(row.id, WORDS[row.verdict], row.detail) for row in shown]
+    print(aligned([("statement", "verdict", "what was checked"), *rows]))
     server = report.server
     generation = f", generation {server['generation']}" if server["generation"] else ""
-    console.print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")
-    console.print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
+    print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")
+    print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
     if not arguments.all:
-        console.print("--all also prints what was not tried, and what that needs.")
+        print("--all also prints what was not tried, and what that needs.")
     for line in report.left:
         sys.stderr.write(f"urlab conformance: not put back: {line}\n")
     if report.stopped:

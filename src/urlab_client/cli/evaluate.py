@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options, with_option
 from urlab_client.cli._arguments import POLICY, TASK, task_named
-from urlab_client.cli._common import CommandError, import_mujoco, json_line, output, progress_bar, refusing, table
+from urlab_client.cli._common import CommandError, aligned, import_mujoco, json_line, progress_bar, refusing
 
 if TYPE_CHECKING:
     from urlab_client.integrations.policy import Evaluation, Outcome
@@ -129,9 +129,9 @@ async def _on_robot(arguments: Namespace, declared: Randomisation | None, option
 
 def _print(arguments: Namespace, found: Evaluation) -> None:
     title = f"{arguments.policy.name}, {len(found.outcomes)} episodes, seed {arguments.seed}"
-    estimates = table([""], ["mean", f"{found.confidence:.0%} interval"], title)
+    rows = [("", "mean", f"{found.confidence:.0%} interval")]
     if (rate := found.success_rate) is not None:
-        estimates.add_row("success rate", f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}")
+        rows.append(("success rate", f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}"))
     for name, estimate in (("return", found.mean_return), ("actions", found.mean_actions)):
-        estimates.add_row(name, f"{estimate.value:.2f}", f"{estimate.low:.2f} to {estimate.high:.2f}")
-    output().print(estimates)
+        rows.append((name, f"{estimate.value:.2f}", f"{estimate.low:.2f} to {estimate.high:.2f}"))
+    print(title, aligned(rows, right=(1, 2)), sep="\n")

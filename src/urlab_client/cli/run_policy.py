@@ -25,13 +25,12 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, task_named
 from urlab_client.cli._common import (
     CommandError,
+    aligned,
     check_recording,
     import_mujoco,
     json_line,
-    output,
     progress_bar,
     refusing,
-    table,
 )
 from urlab_client.cli._watching import recorded
 from urlab_client.enums import StepMode
@@ -121,10 +120,9 @@ def _in_task(arguments: Namespace) -> int:
     if arguments.json:
         print(json_line({**found, "terminated": terminated}))
     else:
-        title = f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation"
-        results = table([], ["actions", "return", "success", "terminated"], title)
-        results.add_row(str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated))
-        output().print(results)
+        print(f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation")
+        row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
+        print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0
 
 
@@ -197,21 +195,16 @@ def _print(runs: dict[str, PolicyRun]) -> None:
     last = runs["policy"]
     live = last.step_mode is StepMode.LIVE
     walks = any(found.distance for found in runs.values())  # a fixed base neither walks nor falls
-    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"] if walks else []
-    headings += ["goal\nerror"] if last.goal_error is not None else []
-    headings += ["actions/s", "late\nactions" if live else "physics\nsteps/s"]
-    title = f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation"
-    results = table(["outputs"], headings, title)
+    rows: list[list[str]] = []
     for name, found in runs.items():
-        results.add_row(
-            name,
-            *(
-                (f"{found.reward:.3f}", f"{found.forward:.2f}", f"{found.velocity_error:.3f}", str(found.falls))
-                if walks
-                else ()
-            ),
-            *((f"{found.goal_error:.4f}",) if found.goal_error is not None else ()),
-            f"{found.actions / found.wall_time:.0f}",
-            str(found.late) if live else f"{found.steps_per_second:.0f}",
-        )
-    output().print(results)
+        cells = {"outputs": name}
+        if walks:
+            cells |= {"mean reward": f"{found.reward:.3f}", "forward (m)": f"{found.forward:.2f}"}
+            cells |= {"velocity error (m/s)": f"{found.velocity_error:.3f}", "falls": str(found.falls)}
+        if found.goal_error is not None:
+            cells["goal error"] = f"{found.goal_error:.4f}"
+        cells["actions/s"] = f"{found.actions / found.wall_time:.0f}"
+        cells |= {"late actions": str(found.late)} if live else {"physics steps/s": f"{found.steps_per_second:.0f}"}
+        rows += [[*cells.values()]] if rows else [[*cells], [*cells.values()]]
+    print(f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation")
+    print(aligned(rows, right=range(1, len(rows[0]))))

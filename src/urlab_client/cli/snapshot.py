@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> int:
         image = _of_running_server(arguments)
     else:
         image = _of_models(arguments)
-    _write(arguments.output, image)
+    write_picture(arguments.output, image)
     print(f"{arguments.output}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
@@ -163,7 +163,8 @@ def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
     return image
 
 
-def _write(path: Path, image: NDArray[np.uint8]) -> None:
+def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a picture in the format that the file's ending names."""
     from PIL import Image
 
     kind = _FORMATS[path.suffix.lower()]

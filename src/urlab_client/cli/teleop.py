@@ -24,7 +24,7 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import CAMERA_HZ, CLIENT, RECORD, TASK, address_usage, make_client, task_named
+from urlab_client.cli._arguments import CLIENT, RECORD, TASK, address_usage, make_client, task_named
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
 from urlab_client.cli._watching import interruptible, recorded
 
@@ -47,7 +47,6 @@ USAGE = f"""
 --seconds S  simulated seconds after which an episode ends
 --seed SEED=0  seed of initial states and goals
 {RECORD}
-{CAMERA_HZ.format(30)}
 {CLIENT}
 examples:
 urlab teleop --task urlab/Reach-v0 --record reach.mcap  a task on a simulated robot, recorded
