@@ -3,22 +3,21 @@
 Relay between clients and a server, and print each op with its sizes and its time. Clients connect to the port that is
 printed instead of the server's; requests, state and pictures pass unchanged, except for the ports that replies name.
 --save keeps every frame, without pixels unless --images is given, and --replay answers requests from such a file,
-without a server. Shared memory goes past the relay.
+without a server. Shared memory goes past the relay: leave clients at transport="zmq", which is the default.
 """
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any, Final, cast
 
 from urlab_client.aio.transport.connection import client_keys
 from urlab_client.cli._arguments import CLIENT, address_usage
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
-from urlab_client.conformance.sessions import Passed, Ports, Relay
+from urlab_client.conformance.sessions import Passed, Ports, Relay, Replay, SessionWriter, read_session
 from urlab_client.conformance.wire import oddities, plain, reply_oddities
 from urlab_client.keys import KeyPair, read_pair
 from urlab_client.protocol.registry import OPS
@@ -61,8 +60,6 @@ def _key(arguments: Namespace) -> KeyPair | None:
 
 
 def _replay(path: Path, ports: Ports, own: dict[str, int]) -> int:
-    from urlab_client.conformance.sessions import Replay, read_session
-
     with refusing(ValueError):
         session = read_session(path)
     with Replay(session, ports, **own) as replay:
@@ -89,27 +86,19 @@ def _relay(arguments: Namespace, ports: Ports, own: dict[str, int]) -> int:
     return 0
 
 
-@contextmanager
-def _saved(arguments: Namespace) -> Generator[Any]:
+def _saved(arguments: Namespace) -> AbstractContextManager[SessionWriter | None]:
     if arguments.save is None:
-        yield None
-        return
-    from urlab_client.conformance.sessions import SessionWriter
-
+        return nullcontext()
     check_ending(arguments.save, ".mcap")
     if arguments.save.exists():
         raise CommandError(f"{arguments.save} exists; choose another name")
-    writer = SessionWriter(arguments.save, images=arguments.images)
-    try:
-        yield writer
-    finally:
-        writer.close()
+    return closing(SessionWriter(arguments.save, images=arguments.images))
 
 
 class _Tap(Relay):
     """A relay that prints, judges and records."""
 
-    def __init__(self, arguments: Namespace, writer: Any, *args: Any, **options: Any) -> None:
+    def __init__(self, arguments: Namespace, writer: SessionWriter | None, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._quiet, self._strict, self._writer = arguments.quiet, arguments.strict, writer
         self._known: set[str] = set()
