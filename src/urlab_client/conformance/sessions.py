@@ -120,7 +120,6 @@ class Service(ABC):
     """A thread that answers at ports of its own, until it is closed or fails.
 
     Args:
-        name: Name of the thread.
         ports: Where to listen.
         port: Port for requests; 0 for any.
 
@@ -130,7 +129,7 @@ class Service(ABC):
         failure: Why it ended; None while it runs.
     """
 
-    def __init__(self, name: str, ports: Ports, port: int) -> None:
+    def __init__(self, ports: Ports, port: int) -> None:
         self.failure: URLabError | None = None
         self.port: int
         self.state_port: int = 0
@@ -139,7 +138,9 @@ class Service(ABC):
         self._front, self.port = ports.bind(zmq.ROUTER, port)
         self._poller.register(self._front, zmq.POLLIN)
         self._ended = threading.Event()
-        self._thread = background_thread(name, self._run, failed=self._fail)
+
+    _thread: threading.Thread
+    """Runs `_run`."""
 
     @abstractmethod
     def take(self, socket: Socket) -> None:
@@ -207,7 +208,8 @@ class Relay(Service):
         port: int = 0,
         state_port: int = 0,
     ) -> None:
-        super().__init__("urlab-relay", ports, port)
+        super().__init__(ports, port)
+        self._thread = background_thread("urlab-relay", self._run, failed=self._fail)
         self._host = endpoint.partition("://")[2].rpartition(":")[0]
         self._keys = keys
         self._back = self._connected(zmq.DEALER, endpoint)
@@ -454,7 +456,8 @@ class Replay(Service):
     """
 
     def __init__(self, session: list[Passed], ports: Ports, *, port: int = 0, state_port: int = 0) -> None:
-        super().__init__("urlab-replay", ports, port)
+        super().__init__(ports, port)
+        self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
         self.unknown: Counter[str] = Counter()
         self._state, self.state_port = ports.bind(zmq.PUB, state_port)
         self._cameras: dict[str, int] = {}
