@@ -123,10 +123,7 @@ async def _checked(
             await bench.open()
         except Differs as error:
             raise CommandError(f"{arguments.address} cannot be checked: {error}") from error
-        if arguments.state_port is not None:
-            bench.state_port = arguments.state_port
-        elif wire.state_port is not None:
-            bench.state_port = wire.state_port
+        bench.state_port = arguments.state_port or wire.transport.state_port or bench.state_port
         with progress_bar("checking", 1.0) as show:
             return bench, await run_checks(bench, choice, lambda _, done, whole: show(done / max(whole, 1)))
     finally:
