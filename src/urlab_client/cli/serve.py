@@ -139,7 +139,9 @@ def run(arguments: Namespace) -> int:
     if arguments.until_eof:
         watch_input(events)
     import_mujoco()
-    _check_paths(arguments)
+    for folder in arguments.model_root:
+        if not folder.is_dir():
+            raise CommandError(f"--model-root {folder}: no such folder")
     from urlab_client.server.system.temporary_folder import TemporaryFolder
     from urlab_client.server.system.threads import limit_arenas
 
@@ -264,18 +266,6 @@ def _settle_ports(arguments: Namespace) -> None:
         if number and number in users:
             raise CommandError(f"--{users[number]}-port and --{name}-port are both {number}; each needs its own")
         users[number] = name
-
-
-def _check_paths(arguments: Namespace) -> None:
-    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
-
-    bundled = bundled_models()
-    for model in arguments.models:
-        if model not in bundled and not Path(model).is_file():
-            raise CommandError(unknown_model(model))
-    for folder in arguments.model_root:
-        if not folder.is_dir():
-            raise CommandError(f"--model-root {folder}: no such folder")
 
 
 class Event(Enum):
