@@ -155,7 +155,7 @@ def _draw(server: SimulatedServer, file: Path) -> str:
     except RenderingUnavailable as reason:
         file.unlink(missing_ok=True)  # one of an earlier run would show another state
         return f"not drawn: {one_line(reason)}"
-    write_picture(file, picture[:, :, :3])
+    write_picture(file, picture)
     return "last state of the blocking run"
 
 

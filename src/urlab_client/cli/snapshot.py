@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from urlab_client.cli._arguments import MJCF_OPTIONS, WATCHER, handshake, make_c
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabTimeoutError
+from urlab_client.values.pictures import to_rgb
 
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient
@@ -28,7 +29,6 @@ _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
 _CHUNK = 100  # physics steps per request, for which the server allows 5 s
-_BEYOND_M = 1e5  # farther than any ray can hit
 
 USAGE = f"""
 SOURCE+  MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the address
@@ -146,29 +146,16 @@ def _of_running_server(arguments: Namespace) -> NDArray[np.uint8]:
 
 
 def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
-    """Return red, green, blue and alpha of the newest frame; depth as grey, half as bright at twice the distance."""
-    frame: NDArray[Any] | None = view.latest_frame
+    """Return the newest frame as red, green and blue; depth as grey."""
+    frame = view.latest_frame
     if frame is None:
         raise CommandError(f"camera {view.name} delivered no picture")
-    if view.mode == CameraMode.REAL:
-        return frame
-    if view.mode != CameraMode.DEPTH:
-        return frame[:, :, [2, 1, 0, 3]]
-    image = np.zeros((*frame.shape, 4), np.uint8)
-    image[:, :, 3] = 255
-    hit = frame < _BEYOND_M
-    if hit.any():
-        near = max(float(frame[hit].min()), 1e-6)
-        image[hit, :3] = (255.0 * near / frame[hit]).clip(1.0, 255.0).astype(np.uint8)[:, None]
-    return image
+    return to_rgb(frame, view.mode)
 
 
 def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
     """Write a picture in the format that the file's ending names."""
     from PIL import Image
 
-    kind = _FORMATS[path.suffix.lower()]
-    picture = Image.fromarray(image)
     with replaced(path) as temporary:
-        # JPEG has no transparency, and camera pictures do not use any.
-        (picture.convert("RGB") if kind == "jpeg" else picture).save(temporary, format=kind)
+        Image.fromarray(image[:, :, :3]).save(temporary, format=_FORMATS[path.suffix.lower()])  # all are opaque
