@@ -92,7 +92,7 @@ KILLED = {
     },
     "tests/mcp/test_mcp_failures.py": {"urlab-mcp-progress", "urlab-mcp-stdin"},
     "tests/conformance/test_tap.py": {"urlab-relay", "urlab-replay"},
-    "tests/cli/test_cli_failures.py": {"urlab-end", "urlab-start", "urlab-stdin"},
+    "tests/cli/test_cli_failures.py": {"urlab-start", "urlab-stdin"},
 }
 
 

@@ -13,6 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self, TypeAlias, cast
 
@@ -284,7 +285,7 @@ class Relay(Service):
                 passed = Passed(op, request, reply, time.perf_counter() - began, at)
                 answer = self.on_exchange(passed)
                 if op in _PORTS:
-                    answer = with_ports(answer, self.own_ports)
+                    answer = _edited(answer, partial(_replace_ports, self.own_ports))
                 self._front.send_multipart([*envelope, answer])
 
     def _take_messages(self, socket: Socket) -> None:
@@ -319,29 +320,29 @@ _MESSAGE: Final = 2
 OwnPorts: TypeAlias = Callable[[dict[str, Any], str], None]
 
 
-def with_ports(reply: bytes, own: OwnPorts) -> bytes:
-    """Return a reply with other ports, and everything else as it was."""
+def _edited(reply: bytes, change: Callable[[dict[str, Any]], bool]) -> bytes:
+    """Return a reply as a function changes it, which returns whether it has; as it is, if it cannot be read."""
     try:
         value = plain(reply)
     except ValueError:
         return reply
-    return codec_of(reply).encode(value) if _replace_ports(value, own) else reply
+    return codec_of(reply).encode(value) if change(value) else reply
 
 
-def _replace_ports(place: Any, own: OwnPorts) -> bool:
+def _replace_ports(own: OwnPorts, place: Any) -> bool:
     """Replace the ports in a value; return whether there are any."""
-    changed = False
     if isinstance(place, list):
-        for item in cast("list[Any]", place):
-            changed |= _replace_ports(item, own)
-    elif isinstance(place, dict):
+        found = [_replace_ports(own, item) for item in cast("list[Any]", place)]  # in all of them
+        return any(found)
+    changed = False
+    if isinstance(place, dict):
         fields = cast("dict[str, Any]", place)
         for name, item in list(fields.items()):
             if name in {"zmq_endpoint", "state_port", "step_port"}:
                 own(fields, name)
                 changed = True
             elif name not in {"vfs_assets", "arts", "per_articulation"}:
-                changed |= _replace_ports(item, own)
+                changed |= _replace_ports(own, item)
     return changed
 
 
@@ -372,7 +373,7 @@ class SessionWriter:
         self._count += 1
         reply = passed.reply
         if not self._images and b"cameras" in reply:
-            reply = without_pixels(reply)
+            reply = _edited(reply, _drop_pixels)
         self._write(_REQUEST, passed.request, passed.at)
         self._write(_REPLY, reply, passed.at + int(passed.seconds * 1e9))
 
@@ -393,15 +394,10 @@ class SessionWriter:
         self._writer.add_message(self._channels[topic], at, data, at, self._count)
 
 
-def without_pixels(reply: bytes) -> bytes:
-    """Return a reply without the pixels of its pictures."""
-    try:
-        value = plain(reply)
-    except ValueError:
-        return reply
-    for picture in _pictures(value):
+def _drop_pixels(reply: dict[str, Any]) -> bool:
+    for picture in _pictures(reply):
         picture["data"] = b""
-    return codec_of(reply).encode(value)
+    return True
 
 
 def _pictures(value: dict[str, Any]) -> list[dict[str, Any]]:
@@ -490,10 +486,10 @@ class Replay(Service):
 
     def _answer(self, row: Passed) -> bytes:
         if row.op == "step" and b"cameras" in row.reply:
-            return _with_black_pixels(row.reply)
+            return _edited(row.reply, _blacken_pixels)
         if row.op not in _PORTS:
             return row.reply
-        return _without_regions(with_ports(row.reply, self.own_ports))
+        return _edited(_edited(row.reply, partial(_replace_ports, self.own_ports)), _drop_regions)
 
     def camera_port(self, told: str) -> int:
         """See `Service.camera_port`; a replay publishes no pictures."""
@@ -512,19 +508,17 @@ def _key(request: bytes) -> Any:
     return msgspec.json.encode(kept, order="deterministic")
 
 
-def _without_regions(reply: bytes) -> bytes:
-    """Return a handshake that names no shared memory, which a recording has not."""
-    value = plain(reply)
-    for place in (value, value.get("handshake_payload")):
+def _drop_regions(reply: dict[str, Any]) -> bool:
+    """Drop the shared memory that a handshake names, which a recording has not."""
+    for place in (reply, reply.get("handshake_payload")):
         if isinstance(place, dict):
             for name in ("shm_session_dir", "shm_rpc"):
                 cast("dict[str, Any]", place).pop(name, None)
-    return codec_of(reply).encode(value)
+    return True
 
 
-def _with_black_pixels(reply: bytes) -> bytes:
-    """Return a reply with black pixels in the place of those that were not kept."""
-    value = plain(reply)
-    for picture in _pictures(value):
+def _blacken_pixels(reply: dict[str, Any]) -> bool:
+    """Put black pixels in the place of those that were not kept."""
+    for picture in _pictures(reply):
         picture["data"] = picture["data"] or bytes(4 * int(picture["width"]) * int(picture["height"]))
-    return codec_of(reply).encode(value)
+    return True
