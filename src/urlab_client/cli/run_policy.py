@@ -90,9 +90,9 @@ def run(arguments: Namespace) -> int:
 
 def _in_task(arguments: Namespace) -> int:
     """Run one episode of a task; return 1 if it was terminated without success, else 0."""
-    for name, given in _options_of_a_declaration(arguments).items():
-        if given:
-            raise CommandError(f"--{name} cannot be combined with --task, which determines it")
+    for name in ("declaration", "robot", "command", "goal", "step_mode", "compare"):
+        if getattr(arguments, name):
+            raise CommandError(f"--{name.replace('_', '-')} cannot be combined with --task, which determines it")
     kind = task_named(arguments.task)
     from urlab_client.integrations.gym import URLabEnv
     from urlab_client.integrations.policy import task_network
@@ -124,11 +124,6 @@ def _in_task(arguments: Namespace) -> int:
         row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
         print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0
-
-
-def _options_of_a_declaration(arguments: Namespace) -> dict[str, Any]:
-    named = {name: getattr(arguments, name) for name in ("declaration", "robot", "goal", "compare")}
-    return {**named, "command": arguments.command, "step-mode": arguments.step_mode}
 
 
 async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
