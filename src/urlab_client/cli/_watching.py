@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import signal
 import sys
 from argparse import Namespace
@@ -75,14 +76,15 @@ async def run_session(
         URLabError: The server refused a request, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
-    start = client.sim_time
+    start = math.inf
     lost_at: float | None = None
     async with client.events() as events:
         if not direct:
             await client.runtime.set_paused(False)
         while not over():
-            start = min(start, client.sim_time)  # a reset puts the clock back
-            done = client.sim_time - start
+            if direct or client.recv_wall_time_ns:  # otherwise no state has come yet
+                start = min(start, client.sim_time)  # a reset puts the clock back
+            done = max(0.0, client.sim_time - start)
             progress(done)
             if seconds is not None and done >= seconds - 1e-9:
                 return
