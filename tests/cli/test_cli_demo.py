@@ -85,8 +85,7 @@ def test_the_quadruped_walks_and_does_not_fall(record: dict[str, Any]) -> None:
 
 def test_prints_a_table_and_what_it_wrote(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
     _, text = demonstration
-    assert "1200/1200" in text
-    assert "300/300" in text
+    assert text.startswith("quadruped, direct mode\n")
     for heading in ("robots", "steps", "sim (s)", "steps/s", "factor", "final base pose"):
         assert heading in text
     x = record["runs"][0]["final_base_poses"][0][0]
@@ -178,11 +177,11 @@ def test_goes_on_without_opengl(tmp_path: Path) -> None:
 def test_a_missing_extra_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rich" else object())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "matplotlib" else object())
     assert main(["demo", "--output", str(tmp_path)]) == 2
     command = install_command("demo")
     assert "[demo]" in command
-    assert capsys.readouterr() == ("", f"urlab demo: rich is not installed; run: {command}\n")
+    assert capsys.readouterr() == ("", f"urlab demo: matplotlib is not installed; run: {command}\n")
 
 
 def test_a_model_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import queue
 from typing import Any
 
 import pytest
-from starlette.applications import Starlette
-from waiting import DEADLINE_S, until
+from waiting import DEADLINE_S
 
 from urlab_client.cli import serve as serve_command
-from urlab_client.cli._pages import bound, serve
 from urlab_client.cli.serve import Event, Events, next_event, start_aside, watch_input
 
 
@@ -39,17 +36,3 @@ def test_the_thread_that_waits_for_the_end_of_input(
     assert events.get(timeout=DEADLINE_S) is Event.STOP
     (record,) = [one for one in caplog.records if "standard input can no longer be read" in one.getMessage()]
     assert record.threadName == "urlab-stdin"
-
-
-async def test_the_task_that_waits_for_the_end_of_an_agent(caplog: pytest.LogCaptureFixture) -> None:
-    class Deadly(asyncio.Event):
-        async def wait(self) -> Any:
-            raise MemoryError("none left")
-
-    started = asyncio.Event()
-    with bound("127.0.0.1", 0) as listener:
-        serving = asyncio.create_task(serve(Starlette(), listener, started.set, Deadly()))
-        async with asyncio.timeout(DEADLINE_S):
-            await serving
-    assert "urlab-end ended unexpectedly" in caplog.text
-    await until(started.is_set)

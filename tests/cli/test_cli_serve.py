@@ -189,9 +189,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 
 def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
-    line = refused(capsys, "robbot.xml")
-    assert line.startswith("urlab serve: robbot.xml is neither a file nor a bundled robot")
+    line = refused(capsys, "robbot")
+    assert line.startswith("urlab serve: robbot is neither a file nor a bundled robot")
     assert "quadruped" in line
+    assert refused(capsys, "robbot.xml").endswith("robbot.xml does not exist")
 
 
 def test_a_broken_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

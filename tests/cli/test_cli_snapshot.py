@@ -35,7 +35,7 @@ def picture(*arguments: str) -> np.ndarray[Any, Any]:
 def test_models_in_a_process_of_its_own(tmp_path: Path) -> None:
     done = urlab("snapshot", "quadruped", "arm", "--size", "160x90", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "snapshot.png: 160x90\n", "")
-    assert np.asarray(Image.open(tmp_path / "snapshot.png")).shape == (90, 160, 4)
+    assert np.asarray(Image.open(tmp_path / "snapshot.png")).shape == (90, 160, 3)
 
 
 @pytest.mark.opengl
@@ -74,7 +74,7 @@ def test_cameras_and_what_their_pixels_mean() -> None:
     assert real.shape == depth.shape == semantic.shape
     assert (depth[:, :, 0] == depth[:, :, 1]).all()
     assert depth[:, :, 0].max() > 0.99
-    assert len(np.unique(semantic.reshape(-1, 4), axis=0)) == 2
+    assert len(np.unique(semantic.reshape(-1, 3), axis=0)) == 2
 
 
 @pytest.mark.opengl
@@ -85,7 +85,7 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
         assert "--camera, one of arm/overview, arm/wrist" in capsys.readouterr().err
         assert main(["snapshot", address, "--camera", "arm/wirst"]) == 2
         assert "Did you mean 'arm/wrist'" in capsys.readouterr().err
-        assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 4)
+        assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 3)
         assert main(["snapshot", address, "--camera", "arm/overview", "--seconds", "1"]) == 2
         assert "--seconds are for models" in capsys.readouterr().err
 
@@ -94,7 +94,7 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
 def test_a_camera_of_a_paused_beta_whose_streams_are_silent() -> None:
     with SimulatedServer("arm", play=True, dialect="beta") as server:
         address = f"{server.address}:{server.step_port}"
-        assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 4)
+        assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 3)
 
 
 @pytest.mark.opengl
@@ -107,7 +107,7 @@ def test_a_camera_of_a_server_that_somebody_steps(dialect: DialectName) -> None:
         client.discover()
         client.call(SetMode(mode="direct"))
         address = f"{server.address}:{server.step_port}"
-        assert picture(address, "--camera", "arm/wrist").shape == (480, 640, 4)
+        assert picture(address, "--camera", "arm/wrist").shape == (480, 640, 3)
         # It is left as it was: in direct mode, where time stands still.
         client.discover()
         assert client.call(SetMode(mode="direct")).previous_mode == StepMode.DIRECT
@@ -131,7 +131,7 @@ def test_a_picture_beside_the_client_that_drives(tmp_path: Path) -> None:
         driver.discover()
         (tmp_path / "arm.hello").write_bytes(driver.handshake())
         options = ["--camera", "arm/wrist", "--handshake", "arm.hello", "--state-port", str(server.state_port)]
-        assert picture(f"{server.address}:{server.step_port}", *options).shape == (480, 640, 4)
+        assert picture(f"{server.address}:{server.step_port}", *options).shape == (480, 640, 3)
         driver.step()
 
 

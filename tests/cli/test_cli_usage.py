@@ -153,6 +153,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["ping", "--timeout", "soon"], ["--timeout", "'soon'", "seconds"]),
         (["ping", "--timeout", "inf"], ["--timeout", "'inf'"]),
         (["demo", "--steps", "-5"], ["--steps", "'-5'"]),
+        (["evaluate", "walk.onnx", "--seed", "-1"], ["--seed", "'-1'", "at least 0"]),
+        (["teleop", "--seed", "-1"], ["--seed", "'-1'", "at least 0"]),
         (["view", "--max-hz", "0"], ["--max-hz", "'0'", "per second"]),
         (["record", "sim://arm", "a.mcap", "--step-mode", "puppet"], ["--step-mode", "puppet", "live"]),
     ],

@@ -64,7 +64,7 @@ def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: py
     told: list[Namespace] = []
     monkeypatch.setattr(console, "run", lambda arguments: told.append(arguments) or 0)
     assert main(["view", "sim://arm", "--web", "--port", "0"]) == 0
-    names = set(vars(_parser("console").parse_args(["console"]))) - {"command", "run", "version"}
+    names = set(vars(_parser("console").parse_args(["console"]))) - {"name", "run", "version"}
     assert {name: getattr(told[0], name) for name in names} == {
         "address": "sim://arm", "host": "127.0.0.1", "port": 0, "allow_host": [], "open": False, "handshake": None,
         "recordings": Path("recordings"), "mjcf_options": False, "server_key": None, "client_key": None,

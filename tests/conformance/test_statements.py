@@ -32,7 +32,7 @@ async def test_our_server_passes_every_check(generation: str, way: str, tmp_path
             assert (await made.ask("pie_status"))["state"] == "ready"
             blueprints = (await made.ask("list_blueprints"))["blueprints"]
             assert [row["blueprint_short_name"] for row in blueprints] == ["bot"]
-            assert made.wire.over_shm > 100 if shm else made.wire.over_shm == 0
+            assert made.wire.transport.stats.over_shm > 100 if shm else made.wire.transport.stats.over_shm == 0
     results = [*before.checks, *report.checks]
     assert [(one.title, one.detail) for one in results if one.verdict is Verdict.DIFFERS] == []
     wanted = {one.title for one in CHECKS if generation in one.dialects and (shm or "shm" not in one.needs)}

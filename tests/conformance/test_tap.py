@@ -16,8 +16,8 @@ from targets import BOT
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
 from urlab_client.cli.tap import departures, described
-from urlab_client.conformance.sessions import Passed, Ports, Recorded, Relay, Replay, SessionWriter, read_session
-from urlab_client.errors import URLabError, URLabTimeoutError
+from urlab_client.conformance.sessions import Passed, Ports, Relay, Replay, SessionWriter, read_session
+from urlab_client.errors import URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.keys import KeyPair
 from urlab_client.server import SimulatedServer
 
@@ -141,9 +141,9 @@ async def test_the_state_stream_passes(tmp_path: Path) -> None:
 
 
 async def asked(port: int) -> None:
-    """Send a request whose reply never comes."""
+    """Send a request that gets no reply."""
     async with URLabClient(f"tcp://127.0.0.1:{port}", rcv_timeout_ms=300, local_model=False) as client:
-        with pytest.raises(URLabTimeoutError):
+        with pytest.raises((URLabConnectionError, URLabTimeoutError)):
             await client.meta()
 
 
@@ -159,24 +159,17 @@ async def test_a_relay_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> No
             await asked(relay.port)
             with pytest.raises(URLabError, match="urlab-relay"):
                 relay.join()
-    session = [Recorded("meta", msgspec.msgpack.encode({"op": "meta", "session_id": ""}), b"x")]
+    session = [Passed("meta", msgspec.msgpack.encode({"op": "meta", "session_id": ""}), b"x")]
     with Replay(session, Ports("127.0.0.1", None)) as replay:
         await asked(replay.port)
         with pytest.raises(URLabError, match="urlab-replay"):
             replay.join()
 
 
-def test_a_session_that_cannot_be_written_says_so(tmp_path: Path) -> None:
-    writer = SessionWriter(tmp_path / "session.mcap")
-    writer.exchange(Passed("meta", "not bytes", b"", 0.0, 0))  # type: ignore[arg-type]
-    with pytest.raises(URLabError, match="urlab-tap"):
-        writer.close()
-
-
 def test_a_request_that_was_not_recorded_is_refused() -> None:
     import zmq
 
-    session = [Recorded("meta", msgspec.msgpack.encode({"op": "meta"}), msgspec.msgpack.encode({"op": "meta_ok"}))]
+    session = [Passed("meta", msgspec.msgpack.encode({"op": "meta"}), msgspec.msgpack.encode({"op": "meta_ok"}))]
     with Replay(session, Ports("127.0.0.1", None)) as replay, zmq.Context() as context:
         socket = context.socket(zmq.REQ)
         socket.linger, socket.rcvtimeo = 0, 30_000

@@ -1,6 +1,6 @@
 """The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
-Each command has a module with its `EXAMPLES`, `add_arguments(parser)` and `run(arguments)`; its docstring, without the
+Each command has a module with its `USAGE`, which `add_usage` reads, and `run(arguments)`; its docstring, without the
 first line, describes the command to users. Only the module of the command that is run is imported, because every
 `sim://` server is an `urlab serve`, and none for `urlab --help`. An expected failure prints one line on standard error
 and exits with code 2.
@@ -20,7 +20,7 @@ from importlib import import_module
 
 import urlab_client
 from urlab_client._installation import MissingExtra
-from urlab_client.cli._arguments import Parser
+from urlab_client.cli._arguments import Parser, add_usage
 from urlab_client.cli._common import CommandError, one_line
 from urlab_client.errors import URLabError
 from urlab_client.values.names import UnknownName
@@ -50,6 +50,13 @@ COMMANDS = {
     "teleop": "move a robot's hand with the keyboard, and record episodes",
     "view": "show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
 }
+
+_USAGE = """
+examples:
+urlab demo  see a robot move; needs no Unreal
+urlab robots  list the bundled robots
+urlab COMMAND --help  show the options and examples of a command
+"""
 
 _FAILED = 2
 _INTERRUPTED = 128 + signal.SIGINT
@@ -96,7 +103,7 @@ def _run(argv: Sequence[str]) -> int:
     parser = _parser(next((word for word in argv if not word.startswith("-")), ""))
     arguments = parser.parse_args(argv)
     run: Callable[[object], int] = arguments.run
-    name = f"{parser.prog} {arguments.command}"
+    name = f"{parser.prog} {arguments.name}"
     handler = _StderrHandler(name)
     logging.getLogger("urlab_client").addHandler(handler)
     try:
@@ -139,23 +146,21 @@ def _parser(command: str | None = None) -> Parser:
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
         epilog="Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
         "failure explained on standard error, 130 Ctrl-C, 141 the output's reader has gone.",
-        examples=(
-            ("urlab demo", "see a robot move; needs no Unreal"),
-            ("urlab robots", "list the bundled robots"),
-            ("urlab COMMAND --help", "show the options and examples of a command"),
-        ),
     )
+    add_usage(parser, _USAGE)
     parser.add_argument("-V", "--version", action=_Version, nargs=0, help="show program's version number and exit")
-    subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(title="commands", dest="name", metavar="COMMAND", required=True)
     for name, brief in COMMANDS.items():
         if command not in (None, name):
             subparsers.add_parser(name, help=brief)
             continue
         module = import_module(f"{__name__}.{name.replace('-', '_')}")
         description = (module.__doc__ or "").partition("\n\n")[2]  # none with python -OO
-        own = subparsers.add_parser(name, help=brief, description=description, examples=module.EXAMPLES)
-        module.add_arguments(own)
+        own = subparsers.add_parser(name, help=brief, description=description)
         own.set_defaults(run=module.run)
+        add_usage(own, module.USAGE, getattr(module, "KINDS", {}))
+        if hasattr(module, "add_actions"):
+            module.add_actions(own)
     return parser
 
 

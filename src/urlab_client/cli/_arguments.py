@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Sequence
-from enum import StrEnum
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeAlias, TypeVar, cast
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, TypeAlias, TypeVar, cast
 from urllib.parse import urlsplit
 
 from urlab_client._installation import need
 from urlab_client.cli._common import CommandError, joined, refusing
-from urlab_client.enums import StepMode
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 Example = tuple[str, str]
 """A command line, and what it does."""
 
-Options: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
-"""What an option can be added to: a parser or one of its groups."""
+Kinds: TypeAlias = Mapping[str, Callable[[str], Any]]
+"""How values are read, by the names of arguments and options as attributes."""
 
 C = TypeVar("C")
-E = TypeVar("E", bound=StrEnum)
 
 _LARGEST_IMAGE = 16384
+_LARGEST = 1e6
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -39,10 +39,10 @@ class Parser(argparse.ArgumentParser):
         examples: Shown at the end of the help.
     """
 
-    def __init__(self, *, examples: Sequence[Example] = (), **options: Any) -> None:
+    def __init__(self, **options: Any) -> None:
         # An abbreviation that works today could become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
-        self.examples = examples
+        self.examples: list[Example] = []
 
     @property
     def commands(self) -> dict[str, Parser]:
@@ -82,6 +82,73 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, _not_one_of(str(value), known))
 
 
+def add_usage(parser: Parser, usage: str, kinds: Kinds = MappingProxyType({})) -> None:
+    """Add the arguments, options and examples that a text declares.
+
+    An entry is what the user writes, two spaces, and what it means; indented lines continue it. A line such as
+    `network:` begins a group, and `options:` ends it. Command lines stand below `examples:`, at the end.
+
+    `NAME=5` is a value with its default, `NAME?` a value that can be left out, `NAME+` several of them, and `NAME...`
+    the value of an option that can be repeated; `a|b` lists the values there are. The name says how the value is read:
+    see `_KINDS`. An option without a value is a flag, and `--[no-]name` one with two names. Options that begin with
+    `| `, one after another, exclude each other.
+
+    Args:
+        parser: The command's parser.
+        usage: The text.
+        kinds: How further values are read.
+    """
+    text, _, examples = usage.partition("\nexamples:\n")
+    parser.examples += _entries(examples)
+    group: Any = parser
+    exclusive: Any = None
+    for head, meaning in _entries(text):
+        if not meaning:
+            group = parser if head == "options:" else parser.add_argument_group(head.removesuffix(":"))
+            continue
+        exclusive = (exclusive or group.add_mutually_exclusive_group()) if head.startswith("| ") else None
+        names, options = _argument(head.removeprefix("| "), meaning, kinds)
+        (exclusive or group).add_argument(*names, **options)
+
+
+def _entries(usage: str) -> Iterator[tuple[str, str]]:
+    """Yield what the user writes and what it means, which a group's line lacks."""
+    for entry in re.split(r"\n+(?=\S)", usage.strip()):
+        head, _, meaning = entry.partition("  ")
+        yield head.strip(), " ".join(meaning.split())
+
+
+def _argument(signature: str, meaning: str, kinds: Kinds) -> tuple[list[str], dict[str, Any]]:
+    """Return the names of an argument or option, and what argparse has to know of it."""
+    words = signature.split()
+    names = [word for word in words if word.startswith("-")]
+    values = words[len(names) :]
+    if not values:
+        action = argparse.BooleanOptionalAction if "[no-]" in signature else "store_true"
+        return [name.replace("[no-]", "") for name in names], {"help": meaning, "action": action, "default": False}
+    options: dict[str, Any] = {"const": ""} if values[0].endswith("?") else {}
+    if repeated := signature.endswith("..."):
+        options |= {"action": "append", "default": []}
+    value, equals, default = (values[0].removesuffix("..."), "", "") if repeated else values[0].partition("=")
+    if value.endswith(("?", "+")):
+        value, options["nargs"] = value[:-1], value[-1]
+    if equals:
+        options["default"] = default
+        meaning += " (default: %(default)s)" if default and "(default" not in meaning else ""
+    if "|" in value:
+        options["choices"] = value.split("|")
+    elif len(values) > 1:
+        options |= {"metavar": tuple(values), "nargs": len(values)}
+    else:
+        options["metavar"] = value
+    if not names:
+        names = [value.lower() + ("s" if options.get("nargs") == "+" else "")]
+        options |= {"nargs": "?"} if equals else {}
+    attribute = names[-1].lstrip("-").replace("-", "_")
+    options["type"] = kinds.get(attribute) or _KINDS.get(value, str)
+    return names, {"help": meaning, **options}
+
+
 def make_client(flavour: Callable[..., C], address: str, arguments: Namespace, **options: Any) -> C:
     """Return a client of one of the two classes for the server that the arguments name.
 
@@ -93,11 +160,11 @@ def make_client(flavour: Callable[..., C], address: str, arguments: Namespace, *
                 f"--mjcf-options is for sim://MODEL; {address} is already running, and takes the option at its start"
             )
         address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
-    if arguments.handshake is not None:
+    if getattr(arguments, "handshake", None) is not None:
         if address.startswith("sim://"):
             raise CommandError("--handshake is for a server that another client drives, not for sim://MODEL")
         options = {**options, "read_only": True}
-    if arguments.state_port is not None:
+    if getattr(arguments, "state_port", None) is not None:
         options = {**options, "state_port": arguments.state_port}
     try:
         return flavour(
@@ -111,75 +178,65 @@ def make_client(flavour: Callable[..., C], address: str, arguments: Namespace, *
         raise CommandError(str(error)) from None
 
 
-def add_address(parser: Parser, default: str | None = "tcp://localhost", otherwise: str = "") -> None:
-    """Add the server's address, and `--mjcf-options` for a server that the command starts.
+def address_usage(value: str = "ADDRESS=tcp://localhost", otherwise: str = "") -> str:
+    """Return the usage of the server's address, and of `--mjcf-options` for a server that the command starts.
 
     Args:
-        parser: The command's parser.
-        default: Address without the argument.
-        otherwise: What happens without the argument, if that is not the default address.
+        value: The argument, with its default.
+        otherwise: What happens without it, if it has no default.
     """
-    parser.add_argument(
-        "address",
-        nargs="?",
-        type=address,
-        default=default,
-        metavar="ADDRESS",
-        help="HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this "
-        f"command (default: {otherwise or '%(default)s'})",
-    )
-    add_mjcf_options(parser, "with sim://MODEL")
+    default = f"(default: {otherwise})" if otherwise else ""
+    return f"""
+{value}  HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command
+    {default}
+{MJCF_OPTIONS.format("with sim://MODEL")}
+"""
 
 
-def add_mjcf_options(parser: Parser, when: str) -> None:
-    """Add `--mjcf-options`, which applies when a model is loaded."""
-    parser.add_argument(
-        "--mjcf-options",
-        action="store_true",
-        help=f"{when}: use the <option> of each model (timestep, integrator, ...) instead of the plugin's defaults",
-    )
-
-
-def add_client(parser: Parser, *, state: bool = True, handshake: bool = False) -> None:
-    """Add how to reach a server besides its address: ports and CURVE keys.
-
-    Args:
-        parser: The command's parser.
-        state: Whether the command uses the state stream.
-        handshake: Whether the command can watch alongside the driving client.
-    """
-    group = parser.add_argument_group("connection")
-    parser.set_defaults(handshake=None, state_port=None)
-    group.add_argument(
-        "--step-port",
-        type=port,
-        default=5559,
-        metavar="PORT",
-        help="RPC port of the server, if the address has none (default: %(default)s)",
-    )
-    if state:
-        group.add_argument(
-            "--state-port",
-            type=port,
-            metavar="PORT",
-            help="port of the server's state stream (default: the one that the server announces, otherwise 5555)",
-        )
-    group.add_argument(
-        "--server-key", metavar="FILE", help="public key of a server that uses keys (default: $URLAB_SERVER_KEY)"
-    )
-    group.add_argument(
-        "--client-key",
-        metavar="FILE",
-        help="this client's secret key, if the server requires one (default: $URLAB_CLIENT_KEY)",
-    )
-    if handshake:
-        group.add_argument(
-            "--handshake",
-            type=Path,
-            metavar="FILE",
-            help="watch alongside the driving client, without taking over its session: FILE holds what its "
-            "client.handshake() returns, or GET /api/handshake of its console",
-        )
+MJCF_OPTIONS = (
+    "--mjcf-options  {}: use the <option> of each model (timestep, integrator, ...) instead of the plugin's defaults"
+)
+SESSIONLESS = """
+connection:
+--step-port PORT=5559  RPC port of the server, if the address has none
+--server-key KEY_FILE  public key of a server that uses keys (default: $URLAB_SERVER_KEY)
+--client-key KEY_FILE  this client's secret key, if the server requires one (default: $URLAB_CLIENT_KEY)
+"""
+"""How to reach a server besides its address, for a command that does not use the state stream."""
+CLIENT = f"""{SESSIONLESS}
+--state-port PORT  port of the server's state stream (default: the one that the server announces, otherwise 5555)
+"""
+WATCHER = f"""{CLIENT}
+--handshake FILE  watch alongside the driving client, without taking over its session: FILE holds what its
+    client.handshake() returns, or GET /api/handshake of its console
+"""
+PAGE = """
+--recordings FOLDER=recordings  folder for recordings, created with the first one
+network:
+--port PORT  port to serve at; 0: any free one (default: {})
+--host HOST=127.0.0.1  interface to bind (default: %(default)s); others need --allow-host. Nothing is encrypted: use a
+    TLS proxy or an SSH tunnel
+--allow-host NAME...  host name by which browsers and programs reach the page, besides localhost; repeatable
+--public-url URL  URL by which browsers and programs reach the page through a proxy, which removes its path
+--open  open the page in the browser
+options:
+"""
+CAMERA = "--camera NAME...  {}, as ARTICULATION/CAMERA, or 'all'; may be repeated"
+CAMERA_HZ = "--camera-hz HZ={}  pictures per second"
+RECORD = f"""
+--record FILE  record into a .mcap file (extra 'mcap')
+{CAMERA.format("with --record: a camera to record")}
+{CAMERA_HZ.format(30)}
+--overwrite  with --record: replace FILE if it exists
+"""
+DIALECT = "--dialect alpha|beta=alpha  plugin generation to simulate: alpha (June 2026) or beta (August 2026)"
+STEP_MODE = "--step-mode live|direct=live  whether physics runs by itself, or this command steps it"
+RECORDING = "RECORDING  a .mcap file, or a server's .json recording"
+POLICY = """
+POLICY  the network, a .onnx file
+--declaration FILE  the .toml file (default: the one beside POLICY with the same name)
+"""
+TASK = "--task TASK  a task, such as urlab/Reach-v0, or module:Class of your own, found from the current folder"
 
 
 def handshake(arguments: Namespace) -> bytes | None:
@@ -187,86 +244,9 @@ def handshake(arguments: Namespace) -> bytes | None:
     return None if arguments.handshake is None else arguments.handshake.read_bytes()
 
 
-def add_dialect(parser: Options) -> None:
-    """Add `--dialect` to a command that starts a simulated server."""
-    parser.add_argument(
-        "--dialect",
-        choices=("alpha", "beta"),
-        default="alpha",
-        metavar="NAME",
-        help="plugin generation to simulate: alpha (June 2026) or beta (August 2026) (default: alpha)",
-    )
-
-
-def add_step_mode(parser: Parser) -> None:
-    """Add the choice between watching physics run and stepping it."""
-    parser.add_argument(
-        "--step-mode",
-        type=one_of(StepMode.LIVE, StepMode.DIRECT),
-        metavar="MODE",
-        default=StepMode.LIVE,
-        help="live or direct (default: %(default)s)",
-    )
-
-
-def add_cameras(parser: Parser, what: str, hz: float | None = 30.0) -> None:
-    """Add `--camera`, which may be repeated and whose values `cameras` interprets, and `--camera-hz`.
-
-    Args:
-        parser: The command's parser.
-        what: What the camera is used for.
-        hz: Default rate; None for a command without the option, which takes 30.
-    """
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help=f"{what}, as ARTICULATION/CAMERA, or 'all'; may be repeated",
-    )
-    parser.set_defaults(camera_hz=30.0)
-    if hz is not None:
-        parser.add_argument(
-            "--camera-hz", type=hertz, default=hz, metavar="HZ", help="pictures per second (default: %(default)s)"
-        )
-
-
-def add_record(parser: Parser, hz: float | None = 30.0) -> None:
-    """Add `--record` and what belongs to it; see `recorded`."""
-    parser.add_argument("--record", type=Path, metavar="FILE", help="record into a .mcap file (extra 'mcap')")
-    add_cameras(parser, "with --record: a camera to record", hz)
-    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
-
-
 def cameras(given: list[str]) -> list[str] | Literal["all"]:
     """Return the cameras that were given with `--camera`."""
     return "all" if "all" in given else given
-
-
-def add_recording(parser: Parser) -> None:
-    """Add the recording that a command reads."""
-    parser.add_argument("recording", type=Path, metavar="FILE", help="a .mcap file, or a server's .json recording")
-
-
-def add_policy(parser: Parser, robot: str) -> None:
-    """Add the policy that a command runs, its declaration and `--robot`."""
-    parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
-    parser.add_argument(
-        "--declaration",
-        type=Path,
-        metavar="FILE",
-        help="the .toml file (default: the one beside POLICY with the same name)",
-    )
-    parser.add_argument("--robot", metavar="ROBOT", help=robot)
-
-
-def add_task(parser: Parser) -> None:
-    """Add `--task`, which `task_named` resolves."""
-    parser.add_argument(
-        "--task",
-        metavar="TASK",
-        help="a task, such as urlab/Reach-v0, or module:Class of your own, found from the current folder",
-    )
 
 
 def task_named(name: str) -> type[Task]:
@@ -278,39 +258,6 @@ def task_named(name: str) -> type[Task]:
         sys.path.insert(0, here)  # an installed command does not look there
     with refusing(ValueError, option="--task"):
         return found(name)
-
-
-def add_page(parser: Parser, default_port: int) -> None:
-    """Add the options of a page that the command serves."""
-    parser.add_argument(
-        "--recordings",
-        type=Path,
-        default=Path("recordings"),
-        metavar="FOLDER",
-        help="folder for recordings, created with the first one (default: %(default)s)",
-    )
-    network = parser.add_argument_group("network")
-    network.add_argument("--port", type=port, help=f"port to serve at; 0: any free one (default: {default_port})")
-    network.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="interface to bind (default: %(default)s); others need --allow-host. Nothing is encrypted: use a TLS "
-        "proxy or an SSH tunnel",
-    )
-    network.add_argument(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="host name by which browsers and programs reach the page, besides localhost; repeatable",
-    )
-    network.add_argument(
-        "--public-url",
-        type=_public_url,
-        metavar="URL",
-        help="URL by which browsers and programs reach the page through a proxy, which removes its path",
-    )
-    network.add_argument("--open", action="store_true", help="open the page in the browser")
 
 
 def _public_url(text: str) -> str:
@@ -349,46 +296,6 @@ def address(text: str) -> str:
     return f"tcp://{text}"
 
 
-def one_of(*allowed: E) -> Callable[[str], E]:
-    """Return a function that parses one of the given members of an enumeration."""
-
-    def parse(text: str) -> E:
-        try:
-            found = type(allowed[0])(text)  # the enumeration may accept aliases
-        except ValueError:
-            found = None
-        if found not in allowed:
-            raise argparse.ArgumentTypeError(_not_one_of(text, [str(member) for member in allowed]))
-        return found
-
-    return parse
-
-
-def port(text: str) -> int:
-    """Parse a TCP port, 0 to 65535."""
-    return _whole(text, 0, 65535, "a port is a whole number from 0 (any free one) to 65535")
-
-
-def index(text: str) -> int:
-    """Parse the number of a server among several, 0 or more."""
-    return _whole(text, 0, 5000, "an index is a whole number from 0 to 5000")
-
-
-def count(text: str) -> int:
-    """Parse a count, 1 or more."""
-    return _whole(text, 1, 10**9, "give a whole number above 0")
-
-
-def seconds(text: str) -> float:
-    """Parse a duration in seconds, above 0."""
-    return _number(text, lambda value: 0 < value < 1e6, "give a number of seconds above 0")
-
-
-def hertz(text: str) -> float:
-    """Parse a rate per second, above 0."""
-    return _number(text, lambda value: 0 < value < 1e6, "give a number per second, above 0")
-
-
 def image_size(text: str) -> tuple[int, int]:
     """Parse width and height of an image, pixels."""
     width, cross, height = text.lower().partition("x")
@@ -403,21 +310,47 @@ def _not_one_of(value: str, known: Sequence[str]) -> str:
     return f"{value!r} is not one of {', '.join(known)}.{did_you_mean(value, known)}"
 
 
-def _whole(text: str, low: int, high: int, advice: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = low - 1
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
-    return value
+def _whole(low: int, high: int, advice: str) -> Callable[[str], int]:
+    """Return what parses a whole number in a range."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
+        return value
+
+    return parse
 
 
-def _number(text: str, fits: Callable[[float], bool], advice: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not fits(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
-    return value
+def _positive(advice: str) -> Callable[[str], float]:
+    """Return what parses a number above 0."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < _LARGEST:
+            raise argparse.ArgumentTypeError(f"{text!r}: {advice}")
+        return value
+
+    return parse
+
+
+_KINDS: Final[Kinds] = {
+    "ADDRESS": address,
+    "URL": _public_url,
+    "WxH": image_size,
+    "PORT": _whole(0, 65535, "a port is a whole number from 0 (any free one) to 65535"),
+    "INDEX": _whole(0, 5000, "an index is a whole number from 0 to 5000"),
+    "SEED": _whole(0, 2**63, "a seed must be at least 0"),
+    "N": _whole(1, 10**9, "give a whole number above 0"),
+    **dict.fromkeys(("S", "SECONDS"), _positive("give a number of seconds above 0")),
+    **dict.fromkeys(("HZ", "M/S", "RAD/S"), _positive("give a number per second, above 0")),
+    **dict.fromkeys(("NUMBER", "P", "VX"), float),
+    **dict.fromkeys(("FILE", "PATH", "DIR", "FOLDER", "OUTPUT", "POLICY", "RECORDING"), Path),
+}
+"""How a value is read, by its name; others are text."""

@@ -9,16 +9,10 @@ import signal
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Container, Generator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-
-_COLUMNS = 120  # where the output is not a terminal
 _VARIABLE = "MUJOCO_GL"
 
 
@@ -97,8 +91,8 @@ def check_recording(path: Path | None, arguments: Namespace) -> None:
 
 @contextlib.contextmanager
 def progress_bar(description: str, total: float) -> Generator[Callable[[float], None]]:
-    """Show a bar while the block runs, if standard error is a terminal; yields a callback that sets its position."""
-    if not sys.stderr.isatty():
+    """Show a bar while the block runs, on a terminal where Rich is; yields a callback that sets its position."""
+    if not sys.stderr.isatty() or find_spec("rich") is None:
         yield lambda _: None
         return
     from rich.console import Console
@@ -108,29 +102,6 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(description, total=total)
         yield lambda done: progress.update(task, completed=done)
-
-
-def table(left: Sequence[str], right: Sequence[str], title: str | None = None) -> Table:
-    """Return a table with the given headings, of columns aligned to the left and then to the right."""
-    from rich import box
-    from rich.table import Table
-
-    made = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    for heading in left:
-        made.add_column(heading, overflow="fold")
-    for heading in right:
-        made.add_column(heading, justify="right", no_wrap=True)
-    return made
-
-
-def output() -> Console:
-    """Return a console that writes tables to standard output, with brackets and colons in names as they are."""
-    from rich.console import Console
-
-    console = Console(markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = _COLUMNS
-    return console
 
 
 def aligned(rows: Sequence[Sequence[str]], right: Container[int] = ()) -> str:

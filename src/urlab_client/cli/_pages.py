@@ -21,7 +21,6 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from urlab_client.aio.background import background_task
 from urlab_client.cli._common import in_background, sigterm_interrupts
 from urlab_client.web.endpoints import JOB
 
@@ -122,26 +121,17 @@ async def serve(
             finally:
                 cancelling.cancel()
 
-    server = Server(config)
+        async def on_tick(self, counter: int) -> bool:
+            return await super().on_tick(counter) or (ended is not None and ended.is_set())
 
-    async def end(event: asyncio.Event) -> None:
-        try:
-            await event.wait()
-        finally:
-            server.should_exit = True
-
-    ending = None if ended is None else background_task("urlab-end", end(ended))
     try:
-        await server.serve(sockets=[listener])
+        await Server(config).serve(sockets=[listener])
         await asyncio.sleep(0)
     except asyncio.CancelledError:
         # uvicorn raises the signal that ended it again, and asyncio's cancellation must not interrupt the clean-up.
         task = asyncio.current_task()
         if task is None or task.uncancel():
             raise
-    finally:
-        if ending is not None:
-            ending.cancel()
 
 
 def bounded_connections(head_s: float, body_s: float, most: int) -> type[H11Protocol]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import signal
 import sys
 from argparse import Namespace
@@ -75,13 +76,15 @@ async def run_session(
         URLabError: The server refused a request, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
-    clock = _Clock(client, known=direct)
+    start = math.inf
+    lost_at: float | None = None
     async with client.events() as events:
-        watch = _Watch(events)
         if not direct:
             await client.runtime.set_paused(False)
         while not over():
-            done = clock.passed()
+            if direct or client.recv_wall_time_ns:  # otherwise no state has come yet
+                start = min(start, client.sim_time)  # a reset puts the clock back
+            done = max(0.0, client.sim_time - start)
             progress(done)
             if seconds is not None and done >= seconds - 1e-9:
                 return
@@ -89,7 +92,7 @@ async def run_session(
                 await _step(client)
             else:
                 await asyncio.sleep(_LOOK_S)
-                watch.check()
+                lost_at = _lost_at(events, lost_at)
 
 
 @contextlib.asynccontextmanager
@@ -117,46 +120,25 @@ async def _step(client: URLabClient) -> None:
             raise CommandError("the server restarted, or another client took the session over") from None
 
 
-class _Clock:
-    """Simulation time since the start, or since the first state if the client has none yet."""
+def _lost_at(events: Stream[ClientEvent], lost_at: float | None) -> float | None:
+    """Return when the server was lost, unless it has come back.
 
-    def __init__(self, client: URLabClient, *, known: bool) -> None:
-        self._client = client
-        self._before = client.recv_wall_time_ns
-        self._start = client.sim_time if known else None
-
-    def passed(self) -> float:
-        """Return the seconds that have passed."""
-        now = self._client.sim_time
-        if self._start is None:
-            if self._client.recv_wall_time_ns == self._before:
-                return 0.0
-            self._start = now
-        self._start = min(self._start, now)  # a reset puts the clock back
-        return now - self._start
-
-
-class _Watch:
-    """Detects events that end live mode, after which a client that only watches would wait forever."""
-
-    def __init__(self, events: Stream[ClientEvent]) -> None:
-        self._events = events
-        self._lost_at: float | None = None
-
-    def check(self) -> None:
-        """Raise an error if no further state will arrive."""
-        now = asyncio.get_running_loop().time()
-        while (event := self._events.receive_nowait()) is not None:
-            match event:
-                case ServerLost():
-                    self._lost_at = now
-                case ServerReconnected():
-                    self._lost_at = None
-                case PlayEnded():
-                    raise CommandError(f"play has ended: {event.reason}")
-                case SessionLost():
-                    raise CommandError(f"the session is lost: {event.reason}")
-                case _:
-                    pass
-        if self._lost_at is not None and now - self._lost_at > _AWAY_S:
-            raise CommandError(f"the server has been unreachable for {_AWAY_S:g} s")
+    Raises:
+        CommandError: No further state will arrive: a client that only watches would wait forever.
+    """
+    now = asyncio.get_running_loop().time()
+    while (event := events.receive_nowait()) is not None:
+        match event:
+            case ServerLost():
+                lost_at = now
+            case ServerReconnected():
+                lost_at = None
+            case PlayEnded():
+                raise CommandError(f"play has ended: {event.reason}")
+            case SessionLost():
+                raise CommandError(f"the session is lost: {event.reason}")
+            case _:
+                pass
+    if lost_at is not None and now - lost_at > _AWAY_S:
+        raise CommandError(f"the server has been unreachable for {_AWAY_S:g} s")
+    return lost_at

@@ -1,4 +1,11 @@
-"""`urlab conformance`: find out whether a server keeps to the wire."""
+"""`urlab conformance`: find out whether a server keeps to the wire.
+
+Check a server against the statements about the wire that this project rests on, and say of each whether it holds,
+differs (with what was expected and what came), or was not tried. Without options it only reads, but it opens a session,
+which takes the server over from the client that drives it. --play drives the robots of a play session, and begins one
+if none runs. --author makes a level of its own, and opens yours again: save yours first. Exits with 0 if nothing
+differs, with 1 if something does, and with 2 if the server cannot be checked.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +13,21 @@ import asyncio
 import sys
 import tempfile
 from argparse import Namespace
-from pathlib import Path
 from typing import Final
 from urllib.parse import urlencode
 
 from urlab_client.aio.launch import SCHEME
 from urlab_client.aio.transport.connection import client_keys
-from urlab_client.cli._arguments import Parser, add_address, add_client, seconds
+from urlab_client.cli._arguments import CLIENT, address_usage
 from urlab_client.cli._common import (
     CommandError,
+    aligned,
     check_ending,
     import_mujoco,
     json_line,
-    output,
     progress_bar,
     refusing,
     sigterm_interrupts,
-    table,
 )
 from urlab_client.conformance.bench import Bench, write_robot
 from urlab_client.conformance.declarations import Differs, Group, Verdict, statement_titles
@@ -40,63 +45,30 @@ from urlab_client.conformance.runner import run as run_checks
 from urlab_client.conformance.wire import Wire
 from urlab_client.values.names import did_you_mean
 
-DESCRIPTION = (
-    "Check a server against the statements about the wire that this project rests on, and say of each whether it "
-    "holds, differs (with what was expected and what came), or was not tried. Without options it only reads, but it "
-    "opens a session, which takes the server over from the client that drives it. --play drives the robots of a play "
-    "session, and begins one if none runs. --author makes a level of its own, and opens yours again: save yours first. "
-    "Exits with 0 if nothing differs, with 1 if something does, and with 2 if the server cannot be checked."
-)
-EXAMPLES = (
-    ("urlab conformance", "read from the editor on this machine; changes nothing"),
-    ("urlab conformance --play --author --bundle report.zip", "everything; keep a file to attach to an issue"),
-    ("urlab conformance sim://arm --play --html report.html", "the same on a simulated server, as one page"),
-)
+USAGE = f"""
+{address_usage()}
+--play  also drive the robots of a play session
+--author  also edit, in a level that is removed afterwards
+--only WORD...  checks with this word in their title
+--statement NAME...  checks that prove this statement, such as 'Beta 12'; a number alone is one of the beta's
+--no-measurements  do not measure times and rates
+--transport zmq|shm=zmq  way of the requests
+--import MJCF  with --author: model on the server's machine to import (default: a small robot in a temporary folder)
+--timeout SECONDS=10  how long to wait for each reply
+--trust-server  load the binary model of a server on another machine that has no key; it is trusted with one
+report:
+--all  also print the statements that were not tried
+--json FILE  write the report as JSON; - for standard output
+--html FILE  write the report as one page
+--bundle FILE  write report, versions and exchanges to a ZIP file
+--with-names  keep paths, host, user and robot names in these files, and add the raw frames to the bundle
+{CLIENT}
+examples:
+urlab conformance  read from the editor on this machine; changes nothing
+urlab conformance --play --author --bundle report.zip  everything; keep a file to attach to an issue
+urlab conformance sim://arm --play --html report.html  the same on a simulated server, as one page
+"""
 _FAILED: Final = 2
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument("--play", action="store_true", help="also drive the robots of a play session")
-    parser.add_argument("--author", action="store_true", help="also edit, in a level that is removed afterwards")
-    parser.add_argument(
-        "--only", action="append", default=[], metavar="WORD", help="checks with this word in their title"
-    )
-    parser.add_argument(
-        "--statement",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="checks that prove this statement, such as 'Beta 12'; a number alone is one of the beta's",
-    )
-    parser.add_argument("--no-measurements", action="store_true", help="do not measure times and rates")
-    parser.add_argument("--transport", choices=("zmq", "shm"), default="zmq", help="way of the requests (default: zmq)")
-    parser.add_argument(
-        "--import",
-        dest="import_file",
-        metavar="FILE",
-        help="with --author: MJCF on the server's machine to import (default: a small robot in a temporary folder)",
-    )
-    parser.add_argument(
-        "--timeout", type=seconds, default=10.0, metavar="SECONDS", help="how long to wait for each reply (default: 10)"
-    )
-    parser.add_argument(
-        "--trust-server",
-        action="store_true",
-        help="load the binary model of a server on another machine that has no key; it is trusted with one",
-    )
-    group = parser.add_argument_group("report")
-    group.add_argument("--all", action="store_true", help="also print the statements that were not tried")
-    group.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON; - for standard output")
-    group.add_argument("--html", type=Path, metavar="FILE", help="write the report as one page")
-    group.add_argument("--bundle", type=Path, metavar="FILE", help="write report, versions and exchanges to a ZIP file")
-    group.add_argument(
-        "--with-names",
-        action="store_true",
-        help="keep paths, host, user and robot names in these files, and add the raw frames to the bundle",
-    )
-    add_client(parser)
 
 
 def run(arguments: Namespace) -> int:
@@ -144,17 +116,14 @@ async def _checked(
         shm = arguments.transport == "shm"
         wire = Wire(address, arguments.step_port, keys, shm=shm, timeout=arguments.timeout)
     trusted = True if arguments.trust_server or keys is not None else None
-    file = arguments.import_file or own_robot
+    file = getattr(arguments, "import") or own_robot
     bench = Bench(wire, own_server=own_robot is not None, trusted=trusted, import_file=file)
     try:
         try:
             await bench.open()
         except Differs as error:
             raise CommandError(f"{arguments.address} cannot be checked: {error}") from error
-        if arguments.state_port is not None:
-            bench.state_port = arguments.state_port
-        elif wire.state_port is not None:
-            bench.state_port = wire.state_port
+        bench.state_port = arguments.state_port or wire.transport.state_port or bench.state_port
         with progress_bar("checking", 1.0) as show:
             return bench, await run_checks(bench, choice, lambda _, done, whole: show(done / max(whole, 1)))
     finally:
@@ -178,18 +147,15 @@ def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
 
 
 def _print(arguments: Namespace, report: Report) -> None:
-    console = output()
-    found = table(("statement", "verdict", "what was checked"), ())
-    for row in differences_first(report):
-        if row.verdict is not Verdict.NOT_TRIED or arguments.all:
-            found.add_row(row.id, WORDS[row.verdict], row.detail)
-    console.print(found)
+    shown = [row for row in differences_first(report) if row.verdict is not Verdict.NOT_TRIED or arguments.all]
+    rows = [(row.id, WORDS[row.verdict], row.detail) for row in shown]
+    print(aligned([("statement", "verdict", "what was checked"), *rows]))
     server = report.server
     generation = f", generation {server['generation']}" if server["generation"] else ""
-    console.print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")
-    console.print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
+    print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")
+    print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
     if not arguments.all:
-        console.print("--all also prints what was not tried, and what that needs.")
+        print("--all also prints what was not tried, and what that needs.")
     for line in report.left:
         sys.stderr.write(f"urlab conformance: not put back: {line}\n")
     if report.stopped:

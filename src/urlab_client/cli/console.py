@@ -18,10 +18,9 @@ from datetime import UTC, datetime
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_page,
+    PAGE,
+    WATCHER,
+    address_usage,
     check_page,
     host_names,
     make_client,
@@ -33,22 +32,18 @@ _PORT = 8355
 _KEY = "URLAB_CONSOLE_KEY"
 _KEY_CHARACTERS = 16
 
-
-EXAMPLES = (
-    ("urlab console", "the server on this machine, at a link for your browser"),
-    ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
-    ("urlab console --port 0", "any free port for the page"),
-    ("urlab console --handshake robot.hello", "watch alongside the driving client"),
-    ("urlab console --public-url https://lab.example/robots/", "behind a proxy, which has that address"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    add_client(parser, handshake=True)
-    add_page(parser, _PORT)
-    parser.add_argument("--json-log", action="store_true", help="write the log as lines of JSON")
+USAGE = f"""
+{address_usage()}
+{PAGE.format(_PORT)}
+--json-log  write the log as lines of JSON
+{WATCHER}
+examples:
+urlab console  the server on this machine, at a link for your browser
+urlab console sim://quadruped --open  a simulated robot, opened in the browser
+urlab console --port 0  any free port for the page
+urlab console --handshake robot.hello  watch alongside the driving client
+urlab console --public-url https://lab.example/robots/  behind a proxy, which has that address
+"""
 
 
 def run(arguments: Namespace) -> int:

@@ -10,10 +10,9 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Parser, add_recording, count, seconds
+from urlab_client.cli._arguments import RECORDING
 from urlab_client.cli._common import CommandError, progress_bar, refusing, sigterm_interrupts
 
 if TYPE_CHECKING:
@@ -21,51 +20,27 @@ if TYPE_CHECKING:
 
 _FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
 
-
-EXAMPLES = (
-    ("urlab convert run.mcap run.csv", "states as a table"),
-    ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
-    ("urlab convert run.mcap run.npz --camera arm/wrist", "states and pictures as NumPy arrays"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_recording(parser)
-    parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending selects the format")
-    parser.add_argument("--format", choices=_FORMATS, help="the format, if the ending does not select it")
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a camera, as ARTICULATION/CAMERA: for mp4 the one to show, for npz and lerobot those to add; may be "
-        "repeated",
-    )
-    parser.add_argument(
-        "--episodes",
-        choices=("kept", "success", "all"),
-        default="kept",
-        help="which marked episodes to write to tables and LeRobot datasets: those that were not discarded, successes, "
-        "or all (default: %(default)s)",
-    )
-    lerobot = parser.add_argument_group("LeRobot datasets")
-    lerobot.add_argument(
-        "--fps", type=count, metavar="N", help="frames per second (default: the rate of the pictures or states)"
-    )
-    lerobot.add_argument("--task", default="", metavar="TEXT", help="what the robot does")
-    lerobot.add_argument("--robot-type", metavar="TEXT", help="kind of robot (default: the articulations' names)")
-    lerobot.add_argument("--images", action="store_true", help="store pictures as PNG files instead of video")
-    lerobot.add_argument(
-        "--max-picture-age",
-        type=seconds,
-        metavar="SECONDS",
-        help="how much older than its state a picture may be (default: one frame)",
-    )
-    lerobot.add_argument(
-        "--python", metavar="PATH", help="a Python interpreter that has LeRobot; this one does not need it"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace OUTPUT if it exists")
+USAGE = f"""
+{RECORDING}
+OUTPUT  the file to write; its ending selects the format
+--format {"|".join(_FORMATS)}  the format, if the ending does not select it
+--camera NAME...  a camera, as ARTICULATION/CAMERA: for mp4 the one to show, for npz and lerobot those to add; may be
+    repeated
+--episodes kept|success|all=kept  which marked episodes to write to tables and LeRobot datasets: those that were not
+    discarded, successes, or all
+--overwrite  replace OUTPUT if it exists
+LeRobot datasets:
+--fps N  frames per second (default: the rate of the pictures or states)
+--task TEXT=  what the robot does
+--robot-type TEXT  kind of robot (default: the articulations' names)
+--images  store pictures as PNG files instead of video
+--max-picture-age SECONDS  how much older than its state a picture may be (default: one frame)
+--python INTERPRETER  a Python interpreter that has LeRobot; this one does not need it
+examples:
+urlab convert run.mcap run.csv  states as a table
+urlab convert run.mcap run.mp4 --camera arm/overview  the pictures of one camera as a video
+urlab convert run.mcap run.npz --camera arm/wrist  states and pictures as NumPy arrays
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -115,7 +90,7 @@ def _writer(kind: str, recording: Run, arguments: Namespace) -> tuple[Callable[.
         case _:
             if not arguments.task or not arguments.python:
                 raise CommandError(
-                    "a LeRobot dataset needs --task TEXT, and --python PATH of an interpreter that has LeRobot"
+                    "a LeRobot dataset needs --task TEXT, and --python INTERPRETER of an interpreter that has LeRobot"
                 )
             return partial(
                 export.write_lerobot,

@@ -14,7 +14,7 @@ import math
 import platform
 import time
 from argparse import Namespace
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -25,12 +25,11 @@ import numpy as np
 
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import Parser, add_dialect, count
-from urlab_client.cli._common import CommandError, import_mujoco, one_line, output, table
+from urlab_client.cli._arguments import DIALECT
+from urlab_client.cli._common import CommandError, aligned, import_mujoco, one_line, progress_bar
+from urlab_client.cli.snapshot import write_picture
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from urlab_client import URLabArticulation, URLabClient, aio
     from urlab_client.protocol.base import DialectName, Floats
     from urlab_client.server import SimulatedServer
@@ -44,95 +43,73 @@ _FREE = 0  # MuJoCo's number of a free joint
 _LABELS = {3: "hinge joints (rad)", 2: "slide joints (m)"}
 _PACKAGES = ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")
 
-EXAMPLES = (
-    ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
-    ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
-    ("urlab demo arm --no-render", "without a picture of the last state"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "model",
-        nargs="?",
-        default="quadruped",
-        metavar="MODEL",
-        help="an MJCF file or the name of a bundled robot (default: %(default)s)",
-    )
-    add_dialect(parser)
-    parser.add_argument(
-        "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=2000,
-        metavar="N",
-        help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
-    )
-    parser.add_argument("--no-render", action="store_true", help="do not draw the picture of the last state")
+USAGE = f"""
+MODEL=quadruped  an MJCF file or the name of a bundled robot
+{DIALECT}
+--output DIR=urlab-demo  where to write
+--steps N=2000  steps of the blocking run; the async run takes a quarter
+--no-render  do not draw the picture of the last state
+examples:
+urlab demo  the bundled quadruped; results in urlab-demo/
+urlab demo robot.xml --steps 500 --output run1  your own model
+urlab demo arm --no-render  without a picture of the last state
+"""
 
 
 def run(arguments: Namespace) -> int:
     """Run the demonstration."""
-    need("matplotlib", "PIL", "rich", extra="demo")
+    need("matplotlib", "PIL", extra="demo")
     import_mujoco()
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from urlab_client import URLabClient
 
-    file = _model(arguments.model)
-    folder, steps, console = arguments.output, arguments.steps, output()
+    file, floor = _scene(arguments.model)
+    folder, steps = arguments.output, arguments.steps
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CommandError(f"--output {folder}: cannot write there: {error.strerror or error}") from None
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console) as progress:
-        with _serving(file, 1, arguments.dialect) as (server, options), URLabClient(**options) as client:
-            client.discover()
-            client.reset(seed=_SEED)
-            one = Run(client, progress, "blocking client, one robot", steps)
+    with _serving([str(file), *floor], arguments.dialect) as (server, options), URLabClient(**options) as client:
+        client.discover()
+        client.reset(seed=_SEED)
+        with progress_bar("blocking client, one robot", steps) as progress:
+            one = Run(client, progress)
             for _ in range(steps):
                 one.act()
                 client.step()
                 one.note()
             runs = [one.outcome("blocking")]
-            picture = "not drawn: --no-render" if arguments.no_render else _draw(server, folder / "last_state.png")
-        with _serving(file, 2, arguments.dialect) as (_, options):
-            runs.append(asyncio.run(_drive_two(options, progress, max(1, steps // _ASYNC_SHARE))))
-    console.print(_table(file.stem, runs))
+        picture = "not drawn: --no-render" if arguments.no_render else _draw(server, folder / "last_state.png")
+    with _serving([str(file), str(file), *floor], arguments.dialect) as (_, options):
+        runs.append(asyncio.run(_drive_two(options, max(1, steps // _ASYNC_SHARE))))
+    print(f"{file.stem}, direct mode", _table(runs), sep="\n")
     if runs[0]["controllers"] == ["none"]:
-        console.print(f"{file.stem}: 0 actuators: nothing is driven; gravity alone moves it.", soft_wrap=True)
+        print(f"{file.stem}: 0 actuators: nothing is driven; gravity alone moves it.")
     one.plot(f"{file.stem}, {steps} steps through the blocking client", folder / "joints.png")
     with replaced(folder / "run.json") as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(_record(file, client, runs)), indent=2) + b"\n")
-    for name, note in (
-        ("joints.png", f"joint positions over the {runs[0]['sim_time']:.3f} s of the blocking run"),
-        ("last_state.png", picture),
-        ("run.json", "versions, model, options, seed and results"),
-    ):
-        console.print(f"{folder / name}  {note}", soft_wrap=True, highlight=False)
+    print(f"{folder / 'joints.png'}  joint positions over the {runs[0]['sim_time']:.3f} s of the blocking run")
+    print(f"{folder / 'last_state.png'}  {picture}")
+    print(f"{folder / 'run.json'}  versions, model, options, seed and results")
     return 0
 
 
-async def _drive_two(options: dict[str, Any], progress: Progress, steps: int) -> dict[str, Any]:
+async def _drive_two(options: dict[str, Any], steps: int) -> dict[str, Any]:
     from urlab_client import aio
 
     async with aio.URLabClient(**options) as client:
         await client.discover()
         await client.reset(seed=_SEED)
-        two = Run(client, progress, "async client, two robots", steps)
-        for _ in range(steps):
-            two.act()
-            await client.step()
-            two.note()
-        return two.outcome("async")
+        with progress_bar("async client, two robots", steps) as progress:
+            two = Run(client, progress)
+            for _ in range(steps):
+                two.act()
+                await client.step()
+                two.note()
+            return two.outcome("async")
 
 
-def _model(given: str) -> Path:
-    """Return the file of a robot that can move."""
+def _scene(given: str) -> tuple[Path, list[str]]:
+    """Return the file of a robot that can move, and the floor that it needs if it can fall and brings none."""
     import mujoco
 
     from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
@@ -148,25 +125,21 @@ def _model(given: str) -> Path:
         raise CommandError(f"MuJoCo rejects {path}: {one_line(error)}") from None
     if not model.njnt:
         raise CommandError(f"{path} has no joints, so nothing in it can move; name a robot")
-    return path.resolve()
+    falls = (model.jnt_type == _FREE).any() and not model.nhfield
+    grounded = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any()
+    return path.resolve(), ["floor"] if falls and not grounded else []
 
 
 @contextlib.contextmanager
-def _serving(file: Path, number: int, dialect: DialectName) -> Generator[tuple[SimulatedServer, dict[str, Any]]]:
-    """Serve a number of equal robots, in play, on a floor if they can fall and bring none; yield a client's options."""
-    import mujoco
-
+def _serving(models: list[str], dialect: DialectName) -> Generator[tuple[SimulatedServer, dict[str, Any]]]:
+    """Serve models, in play; yield the server and a client's options."""
     from urlab_client.server import SimulatedServer, bundled_models
 
-    model = mujoco.MjModel.from_xml_path(str(file))
-    falls = (model.jnt_type == _FREE).any() and not model.nhfield
-    floor = ["floor"] if falls and not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any() else []
     logger = logging.getLogger("urlab_client.server")
     before = logger.level
-    if file.stem in bundled_models():
+    if Path(models[0]).stem in bundled_models():
         logger.setLevel(logging.ERROR)  # the only warning would be about the floor in each copy
     try:
-        models = *[str(file)] * number, *floor
         with SimulatedServer(*models, play=True, mjcf_options=True, render_quality="high", dialect=dialect) as server:
             yield server, {**server.client_options(), "step_mode": "direct"}
     finally:
@@ -175,8 +148,6 @@ def _serving(file: Path, number: int, dialect: DialectName) -> Generator[tuple[S
 
 def _draw(server: SimulatedServer, file: Path) -> str:
     """Draw the robot as the editor's viewport would show it; return what is in the picture, or why there is none."""
-    from PIL import Image
-
     from urlab_client.server import RenderingUnavailable
 
     try:
@@ -184,21 +155,19 @@ def _draw(server: SimulatedServer, file: Path) -> str:
     except RenderingUnavailable as reason:
         file.unlink(missing_ok=True)  # one of an earlier run would show another state
         return f"not drawn: {one_line(reason)}"
-    with replaced(file) as temporary:
-        Image.fromarray(picture).convert("RGB").save(temporary, format="png")
+    write_picture(file, picture)
     return "last state of the blocking run"
 
 
-def _table(name: str, runs: list[dict[str, Any]]) -> Any:
-    columns = "robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"
-    made = table(["client"], columns, f"{name}, direct mode")
-    made.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
+def _table(runs: list[dict[str, Any]]) -> str:
+    headings = "client", "robots", "steps", "sim (s)", "steps/s", "real-time factor"
+    rows = [[*headings, "final base pose: x y z (m), quaternion w x y z"]]
     for one in runs:
         numbers = "{robots} {steps} {sim_time:.3f} {steps_per_second:.0f} {real_time_factor:.2f}".format(**one)
-        rows = [values for pose in one["final_base_poses"] for values in (pose[:3], pose[3:])]
-        poses = "\n".join(" ".join(f"{value:6.3f}" for value in values) for values in rows)
-        made.add_row(one["client"], *numbers.split(), poses)
-    return made
+        first, *others = [" ".join(f"{value:6.3f}" for value in pose) for pose in one["final_base_poses"]]
+        rows.append([one["client"], *numbers.split(), first])
+        rows += [[*[""] * len(headings), pose] for pose in others]
+    return aligned(rows, right=range(1, len(headings)))
 
 
 def _record(file: Path, client: URLabClient, runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -300,9 +269,8 @@ class Swing:
 class Run:
     """A run under way: the robots with their controllers, and the positions of the first robot."""
 
-    def __init__(self, client: URLabClient | aio.URLabClient, progress: Progress, description: str, steps: int) -> None:
+    def __init__(self, client: URLabClient | aio.URLabClient, progress: Callable[[float], None]) -> None:
         self._client, self._progress = client, progress
-        self._task = progress.add_task(description, total=steps)
         self._robots: list[Robot] = [one for one in client.articulations_by_id.values() if one.joints]  # no floor
         turns = (-0.4, 0.4) if len(self._robots) > 1 else (0.0,)  # the robot on the right walks to the right
         self._controllers = [
@@ -322,7 +290,7 @@ class Run:
         """Note the positions after a step."""
         self._times.append(self._client.sim_time)
         self._positions.append(self._robots[0].qpos_array.copy())
-        self._progress.advance(self._task)
+        self._progress(len(self._times))
 
     def outcome(self, flavour: str) -> dict[str, Any]:
         """Return the result so far: seconds, metres, quaternions (w, x, y, z), world frame."""

@@ -15,36 +15,25 @@ from argparse import Namespace
 from urlab_client._installation import conflict
 from urlab_client.aio import URLabClient
 from urlab_client.aio.client_types import Diagnosis
-from urlab_client.cli._arguments import Parser, add_address, add_client, handshake, make_client, one_of, seconds
+from urlab_client.cli._arguments import WATCHER, address_usage, handshake, make_client
 from urlab_client.cli._common import import_mujoco, json_line
-from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 
 _UNHEALTHY = 1
 
 logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
-
-EXAMPLES = (
-    ("urlab doctor", "the server on this machine"),
-    ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
-    ("urlab doctor --step-mode direct --json", "for a program that steps; print JSON"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument(
-        "--step-mode",
-        type=one_of(*StepMode),
-        metavar="MODE",
-        default=StepMode.AUTO,
-        help="the mode your program asks for: auto, live, direct or puppet (default: %(default)s)",
-    )
-    parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    add_client(parser, handshake=True)
+USAGE = f"""
+{address_usage()}
+--step-mode auto|live|direct|puppet=auto  the mode your program asks for
+--timeout S=2  deadline
+--json  print JSON
+{WATCHER}
+examples:
+urlab doctor  the server on this machine
+urlab doctor 'sim://arm?unpaused'  a simulated server, started for this command
+urlab doctor --step-mode direct --json  for a program that steps; print JSON
+"""
 
 
 def run(arguments: Namespace) -> int:

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options, with_option
-from urlab_client.cli._arguments import Parser, add_policy, add_task, count, seconds, task_named
-from urlab_client.cli._common import CommandError, import_mujoco, json_line, output, progress_bar, refusing, table
+from urlab_client.cli._arguments import POLICY, TASK, task_named
+from urlab_client.cli._common import CommandError, aligned, import_mujoco, json_line, progress_bar, refusing
 
 if TYPE_CHECKING:
     from urlab_client.integrations.policy import Evaluation, Outcome
@@ -32,41 +32,23 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 _MODEST = ""
 _MOST_COPIES = 64
 
-
-EXAMPLES = (
-    ("urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100", "on a task, in a batch"),
-    (
-        "urlab evaluate walk.onnx --randomise",
-        "on the robot of walk.toml, with small variations of masses, friction and more",
-    ),
-    (
-        "urlab evaluate walk.onnx --randomise go.toml --json",
-        "vary as a file declares; all episodes as JSON",
-    ),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_policy(parser, "an MJCF file or the name of a bundled robot (default: as declared)")
-    add_task(parser)
-    parser.add_argument("--episodes", type=count, default=100, metavar="N", help="default: %(default)s")
-    parser.add_argument(
-        "--seconds", type=seconds, metavar="S", help="simulated seconds per episode, without --task (default: 10)"
-    )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the evaluation (default: 0)")
-    parser.add_argument(
-        "--randomise",
-        nargs="?",
-        const=_MODEST,
-        metavar="FILE",
-        help="vary the robot in each episode as a TOML file declares; without FILE, vary friction by 30 %%, damping "
-        "by 20 %%, masses and strengths by 10 %%, and initial joint positions by 0.05",
-    )
-    parser.add_argument(
-        "--confidence", type=float, default=0.95, metavar="P", help="coverage of the intervals (default: %(default)s)"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON, with the outcome and seed of each episode")
+USAGE = f"""
+{POLICY}
+--robot ROBOT  an MJCF file or the name of a bundled robot (default: as declared)
+{TASK}
+--episodes N=100  number of episodes
+--seconds S  simulated seconds per episode, without --task (default: 10)
+--seed SEED=0  seed of the evaluation
+--randomise VARIATION?  vary the robot in each episode as a TOML file declares; without it, vary friction by 30 %%,
+    damping by 20 %%, masses and strengths by 10 %%, and initial joint positions by 0.05
+--confidence P=0.95  coverage of the intervals
+--json  print JSON, with the outcome and seed of each episode
+examples:
+urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100  on a task, in a batch
+urlab evaluate walk.onnx --randomise
+    on the robot of walk.toml, with small variations of masses, friction and more
+urlab evaluate walk.onnx --randomise go.toml --json  vary as a file declares; all episodes as JSON
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -74,8 +56,6 @@ def run(arguments: Namespace) -> int:
     import_mujoco()
     if not 0 < arguments.confidence < 1:
         raise CommandError(f"--confidence must be between 0 and 1, not {arguments.confidence:g}")
-    if arguments.seed < 0:
-        raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
     declared = _declared(arguments.randomise)
     with progress_bar(arguments.policy.name, arguments.episodes) as progress:
         number = itertools.count(1)
@@ -149,9 +129,9 @@ async def _on_robot(arguments: Namespace, declared: Randomisation | None, option
 
 def _print(arguments: Namespace, found: Evaluation) -> None:
     title = f"{arguments.policy.name}, {len(found.outcomes)} episodes, seed {arguments.seed}"
-    estimates = table([""], ["mean", f"{found.confidence:.0%} interval"], title)
+    rows = [("", "mean", f"{found.confidence:.0%} interval")]
     if (rate := found.success_rate) is not None:
-        estimates.add_row("success rate", f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}")
+        rows.append(("success rate", f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}"))
     for name, estimate in (("return", found.mean_return), ("actions", found.mean_actions)):
-        estimates.add_row(name, f"{estimate.value:.2f}", f"{estimate.low:.2f} to {estimate.high:.2f}")
-    output().print(estimates)
+        rows.append((name, f"{estimate.value:.2f}", f"{estimate.low:.2f} to {estimate.high:.2f}"))
+    print(title, aligned(rows, right=(1, 2)), sep="\n")

@@ -10,29 +10,23 @@ from argparse import Namespace
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Parser, add_recording
-from urlab_client.cli._common import counted, json_line, output, progress_bar, table
+from urlab_client.cli._arguments import RECORDING
+from urlab_client.cli._common import aligned, counted, json_line, progress_bar
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary
 
 _UNFINISHED = 1
 
-
-EXAMPLES = (
-    ("urlab info run.mcap", "duration, topics, rates and gaps"),
-    ("urlab info run.mcap --json", "the same for programs"),
-    ("urlab info run.mcap --verify", "also look for damage"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_recording(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
-        "--verify", action="store_true", help="read the whole file and compare checksums, not only its index"
-    )
+USAGE = f"""
+{RECORDING}
+--json  print JSON
+--verify  read the whole file and compare checksums, not only its index
+examples:
+urlab info run.mcap  duration, topics, rates and gaps
+urlab info run.mcap --json  the same for programs
+urlab info run.mcap --verify  also look for damage
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -69,17 +63,12 @@ def _print(summary: Summary) -> None:
         unmarked = summary.episodes - len(summary.outcomes)
         print("outcomes: " + ", ".join(f"{n} {what}" for what, n in (*counts.items(), ("unmarked", unmarked)) if n))
     _print_varied(summary)
-    topics = table(("topic", "schema"), ("messages", "rate (Hz)", "gaps", "longest (s)"))
+    rows = [("topic", "schema", "messages", "rate (Hz)", "gaps", "longest (s)")]
     for topic in summary.topics.values():
-        topics.add_row(
-            topic.name,
-            topic.schema,
-            str(topic.messages),
-            f"{topic.rate_hz:.1f}" if topic.rate_hz else "",
-            str(topic.gaps),
-            f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else "",
-        )
-    output().print(topics)
+        rate = f"{topic.rate_hz:.1f}" if topic.rate_hz else ""
+        longest = f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else ""
+        rows.append((topic.name, topic.schema, str(topic.messages), rate, str(topic.gaps), longest))
+    print(aligned(rows, right=range(2, 6)))
 
 
 def _print_varied(summary: Summary) -> None:

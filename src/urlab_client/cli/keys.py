@@ -7,36 +7,39 @@ public key of each client that it admits.
 from __future__ import annotations
 
 from argparse import Namespace
-from pathlib import Path
 
-from urlab_client.cli._arguments import Parser
+from urlab_client.cli._arguments import Parser, add_usage
 from urlab_client.keys import SECRET_SUFFIX, KeyPair, public_key
 
-EXAMPLES = (
-    ("urlab keys new server ada", "make keys for a server and for a client called ada"),
-    ("urlab keys show server.key", "print a public key"),
-)
+USAGE = """
+examples:
+urlab keys new server ada  make keys for a server and for a client called ada
+urlab keys show server.key  print a public key
+"""
+
+_NEW = """
+NAME+  for example server, or the name of a client
+--dir DIR=.  where to write (default: here)
+examples:
+urlab keys new server  server.key and server.key_secret in this folder
+"""
+_SHOW = """
+FILE+  a .key or .key_secret file
+examples:
+urlab keys show server.key  its public key and kind
+"""
 
 
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
+def add_actions(parser: Parser) -> None:
+    """Add the actions, each with its own arguments."""
     actions = parser.add_subparsers(title="actions", dest="action", metavar="ACTION", required=True)
-    new = actions.add_parser(
-        "new",
-        help="make key pairs",
-        description="Make key pairs: NAME.key, which you can give to anyone, and NAME.key_secret, which only its owner "
-        "can read (mode 0600) and which stays on this machine. Existing files are never overwritten.",
-        examples=[("urlab keys new server", "server.key and server.key_secret in this folder")],
+    about_new = (
+        "Make key pairs: NAME.key, which you can give to anyone, and NAME.key_secret, which only its owner can read "
+        "(mode 0600) and which stays on this machine. Existing files are never overwritten."
     )
-    new.add_argument("names", nargs="+", metavar="NAME", help="for example server, or the name of a client")
-    new.add_argument("--dir", type=Path, default=Path(), metavar="DIR", help="where to write (default: here)")
-    show = actions.add_parser(
-        "show",
-        help="print public keys",
-        description="Print the public key of each file.",
-        examples=[("urlab keys show server.key", "its public key and kind")],
-    )
-    show.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a .key or .key_secret file")
+    add_usage(actions.add_parser("new", help="make key pairs", description=about_new), _NEW)
+    about_show = "Print the public key of each file."
+    add_usage(actions.add_parser("show", help="print public keys", description=about_show), _SHOW)
 
 
 def run(arguments: Namespace) -> int:

@@ -23,19 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
-from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_page,
-    check_page,
-    count,
-    host_names,
-    make_client,
-    one_of,
-    page_url,
-    seconds,
-)
+from urlab_client.cli._arguments import PAGE, WATCHER, address_usage, check_page, host_names, make_client, page_url
 from urlab_client.cli._common import CommandError, import_mujoco, sigterm_interrupts
 from urlab_client.enums import StepMode
 from urlab_client.errors import ServerUnreachable, URLabError
@@ -50,70 +38,30 @@ if TYPE_CHECKING:
 AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
-
-EXAMPLES = (
-    ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
-    ("urlab mcp tcp://localhost --handshake robot.hello", "watch alongside the driving client"),
-    (
-        "urlab mcp tcp://localhost --allow-drive",
-        "drive a running server; another client's session ends",
-    ),
-    ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
-    ("urlab mcp --http --public-url https://lab.example/robots/", "behind a proxy, which has that address"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser, default="sim://arm")
-    add_client(parser, handshake=True)
-    allowed = parser.add_argument_group("what the agent may do")
-    allowed.add_argument("--allow-drive", action="store_true", help="move robots, reset, pause, record")
-    allowed.add_argument("--allow-edit", action="store_true", help="import, place, move and remove robots and bodies")
-    allowed.add_argument(
-        "--take-over",
-        action="store_true",
-        help="without these two: open a session on a running server to look at it; ends another client's session",
-    )
-    allowed.add_argument(
-        "--max-seconds",
-        type=seconds,
-        default=10.0,
-        metavar="S",
-        help="simulated seconds per call (default: %(default)g)",
-    )
-    allowed.add_argument(
-        "--max-wall", type=seconds, default=60.0, metavar="S", help="wall-clock seconds per call (default: %(default)g)"
-    )
-    allowed.add_argument(
-        "--step-mode",
-        type=one_of(StepMode.LIVE, StepMode.DIRECT),
-        metavar="MODE",
-        help="direct: time passes only while a tool steps; live: physics runs by itself (default: with --allow-drive "
-        "direct, otherwise unchanged)",
-    )
-    allowed.add_argument(
-        "--models",
-        type=Path,
-        metavar="FOLDER",
-        help="folder of MJCF files that may be imported by name, besides the bundled robots",
-    )
-    add_page(parser, AGENT_PORT)
-    parser.add_argument(
-        "--http",
-        action="store_true",
-        help="serve streamable HTTP at /mcp, to clients that present the printed token, or one of those in "
-        f"${_TOKEN}, separated by spaces; without --http, the console uses any free port unless you pass --port",
-    )
-    parser.add_argument(
-        "--agents",
-        type=count,
-        default=1,
-        metavar="N",
-        help=f"with --http: print N tokens, one for each agent, unless ${_TOKEN} has them; one agent drives at a time "
-        "(default: %(default)s)",
-    )
-    parser.add_argument("--no-console", dest="console", action="store_false", help="do not serve the console")
+USAGE = f"""
+{address_usage("ADDRESS=sim://arm")}
+{PAGE.format(AGENT_PORT)}
+--http  serve streamable HTTP at /mcp, to clients that present the printed token, or one of those in ${_TOKEN},
+    separated by spaces; without --http, the console uses any free port unless you pass --port
+--agents N=1  with --http: print N tokens, one for each agent, unless ${_TOKEN} has them; one agent drives at a time
+--no-console  do not serve the console
+what the agent may do:
+--allow-drive  move robots, reset, pause, record
+--allow-edit  import, place, move and remove robots and bodies
+--take-over  without these two: open a session on a running server to look at it; ends another client's session
+--max-seconds S=10  simulated seconds per call
+--max-wall S=60  wall-clock seconds per call
+--step-mode live|direct  direct: time passes only while a tool steps; live: physics runs by itself (default: with
+    --allow-drive direct, otherwise unchanged)
+--models FOLDER  folder of MJCF files that may be imported by name, besides the bundled robots
+{WATCHER}
+examples:
+urlab mcp sim://quadruped --allow-drive  a simulated robot for an agent that starts this command
+urlab mcp tcp://localhost --handshake robot.hello  watch alongside the driving client
+urlab mcp tcp://localhost --allow-drive  drive a running server; another client's session ends
+urlab mcp --http --allow-drive --allow-edit  at an address, with all tools
+urlab mcp --http --public-url https://lab.example/robots/  behind a proxy, which has that address
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -166,7 +114,7 @@ async def _serve(arguments: Namespace) -> None:
         async with session.open():
             if arguments.http:
                 serving = _serve_http(arguments, agent, session)
-            elif arguments.console:
+            elif not arguments.no_console:
                 serving = _serve_stdio_and_console(arguments, agent, session)
             else:
                 serving = serve_stdio(agent)
@@ -248,11 +196,11 @@ async def _serve_http(arguments: Namespace, agent: Agent, session: ConsoleSessio
             shown = [f"a token of ${_TOKEN}"] if given else [f"Authorization: Bearer {token}" for token in tokens]
             for one in shown:
                 print(f"Agent: {url}/mcp with {one}", file=sys.stderr, flush=True)
-            if arguments.console:
+            if not arguments.no_console:
                 _print_link(arguments, url, access)
 
         own = Access(hosts=access.hosts, keys=tokens)
-        application = http_application(agent, console if arguments.console else None, own)
+        application = http_application(agent, None if arguments.no_console else console, own)
         await serve(application, listener, started, public_url=arguments.public_url or "")
 
 

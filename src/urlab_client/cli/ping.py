@@ -15,12 +15,10 @@ from argparse import Namespace
 from contextlib import suppress
 from typing import Any
 
-from msgspec import Struct
-
 from urlab_client.aio import URLabArticulation, URLabClient
 from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
-from urlab_client.cli._arguments import Parser, add_address, add_client, count, make_client, seconds
+from urlab_client.cli._arguments import SESSIONLESS, address_usage, make_client
 from urlab_client.cli._common import aligned, counted, import_mujoco, json_line
 from urlab_client.errors import (
     ModeLocked,
@@ -34,124 +32,49 @@ from urlab_client.protocol.messages.runtime import SetMode
 
 _CONCURRENT = 16
 
-
-class RoundTrips(Struct):
-    """Times from a request to its reply, milliseconds."""
-
-    count: int
-    min: float
-    median: float
-    max: float
-
-
-class ArticulationReport(Struct):
-    """One articulation; `joints` and `sensors` are None if the model could not be loaded locally."""
-
-    key: str
-    actor_id: str
-    joints: int | None
-    actuators: int
-    sensors: int | None
-    cameras: int
-    controller: str | None
-
-
-class PlayReport(Struct):
-    """The play session.
-
-    `physics` is `advancing`, `standing still` or None without a model. `step_mode` is None if only the driving client
-    knows it.
-    """
-
-    state: str
-    sim_time: float | None = None
-    physics: str | None = None
-    step_mode: str | None = None
-    step_mode_pinned: bool = False
-
-
-class Identity(Struct):
-    """What a session reveals about the server."""
-
-    urlab_version: str
-    mujoco_version: str
-    local_mujoco_version: str
-    same_mujoco_build: bool
-    play: PlayReport
-    articulations: list[ArticulationReport]
-    entities: list[str]
-
-
-class Report(Struct):
-    """What `--json` prints; `server` is None without a session."""
-
-    address: str
-    ops: int
-    round_trip_ms: RoundTrips
-    server: Identity | None = None
-
-
-class RegisteredServer(Struct):
-    """A server of the registry; `answers` is None for a server on another machine, which is not contacted."""
-
-    instance_id: str
-    address: str
-    pid: int
-    seen_s_ago: float
-    busy: bool
-    answers: bool | None
-
-
-EXAMPLES = (
-    ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
-    ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
-    ("urlab ping --all", "every server that this machine's registry lists"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument(
-        "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="how long to wait for each reply (default: 2)"
-    )
-    parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
-    parser.add_argument(
-        "--no-session", action="store_true", help="do not open a session, so that no client is disturbed"
-    )
-    parser.add_argument(
-        "--all",
-        action="store_true",
-        help="list the servers in this machine's registry (which the plugin's beta writes), and check whether each "
-        "answers; does not disturb other clients",
-    )
-    parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    add_client(parser, state=False)
+USAGE = f"""
+{address_usage()}
+--timeout SECONDS=2  how long to wait for each reply
+--count N=5  round trips to time
+--no-session  do not open a session, so that no client is disturbed
+--all  list the servers in this machine's registry (which the plugin's beta writes), and check whether each answers;
+    does not disturb other clients
+--json  print one line of JSON
+{SESSIONLESS}
+examples:
+urlab ping  the server on this machine: versions, play state, robots, round trip
+urlab ping 192.168.1.20:5559 --no-session  another machine, without taking over its session
+urlab ping --all  every server that this machine's registry lists
+"""
 
 
 def run(arguments: Namespace) -> int:
     """Print a report on the server, or on those of the registry."""
-    if arguments.all:
-        servers = asyncio.run(_registered(arguments.timeout))
-        print(json_line(servers) if arguments.json else _list(servers))
-        return 0
-    if not arguments.no_session:
+    if not (arguments.all or arguments.no_session):
         import_mujoco()  # beforehand: a slow import would block the event loop
-    report = asyncio.run(_ping(arguments))
-    print(json_line(report) if arguments.json else _text(report))
+    look, show = (_registered, _list) if arguments.all else (_ping, _text)
+    found: Any = asyncio.run(look(arguments))
+    print(json_line(found) if arguments.json else show(found))
     return 0
 
 
-async def _registered(timeout: float) -> list[RegisteredServer]:
+async def _registered(arguments: Namespace) -> list[dict[str, Any]]:
+    """Return the servers of the registry; `answers` is None for one on another machine, which is not contacted."""
     concurrent = asyncio.Semaphore(_CONCURRENT)  # one by one, the timeouts of dead servers would add up
 
-    async def server(instance: RegisteredInstance, written: float) -> RegisteredServer:
+    async def server(instance: RegisteredInstance, written: float) -> dict[str, Any]:
         local = instance.host in ("", socket.gethostname())
         address = f"tcp://{'127.0.0.1' if local else instance.host}:{instance.step_port}"
         async with concurrent:
-            answers = await _answers(address, timeout) if local else None
-        seen = round(max(0.0, time.time() - written), 1)
-        return RegisteredServer(instance.instance_id, address, instance.pid, seen, instance.busy, answers)
+            answers = await _answers(address, arguments.timeout) if local else None
+        return {
+            "instance_id": instance.instance_id,
+            "address": address,
+            "pid": instance.pid,
+            "seen_s_ago": round(max(0.0, time.time() - written), 1),
+            "busy": instance.busy,
+            "answers": answers,
+        }
 
     entries: list[tuple[RegisteredInstance, float]] = []
     for path in sorted(registry_directory().glob("*.json")):
@@ -169,99 +92,104 @@ async def _answers(address: str, timeout: float) -> bool:
     return True
 
 
-def _list(servers: list[RegisteredServer]) -> str:
+def _list(servers: list[dict[str, Any]]) -> str:
     if not servers:
         return f"The registry {registry_directory()} lists no servers."
-    answer_texts = {True: "answers", False: "does not answer", None: "on another machine"}
+    answers = {True: "answers", False: "does not answer", None: "on another machine"}
     return aligned(
         [
             (
-                server.instance_id,
-                server.address,
-                f"pid {server.pid}",
-                answer_texts[server.answers] + (", in use" if server.busy else ""),
-                f"registered {server.seen_s_ago:.0f} s ago",
+                server["instance_id"],
+                server["address"],
+                f"pid {server['pid']}",
+                answers[server["answers"]] + (", in use" if server["busy"] else ""),
+                f"registered {server['seen_s_ago']:.0f} s ago",
             )
             for server in servers
         ]
     )
 
 
-async def _ping(arguments: Namespace) -> Report:
+async def _ping(arguments: Namespace) -> dict[str, Any]:
+    """Return the report; `server` is None without a session."""
     options: dict[str, Any] = {"rcv_timeout_ms": _milliseconds(arguments.timeout)}
     async with make_client(URLabClient, arguments.address, arguments, **options) as client:
-        ops = await client.meta(timeout=arguments.timeout)
-        report = Report(arguments.address, len(ops), await _round_trips(client, arguments))
+        ops = len(await client.meta(timeout=arguments.timeout))
+        trips = await _round_trips(client, arguments)
+        report = {"address": arguments.address, "ops": ops, "round_trip_ms": trips, "server": None}
         if arguments.no_session:
             return report
         try:
             await client.discover()
-            report.server = await _identity(client)
+            return {**report, "server": await _identity(client)}
         except URLabVersionMismatch:
             async with make_client(URLabClient, arguments.address, arguments, local_model=False, **options) as other:
                 await other.discover()
-                report.server = await _identity(other)
-        return report
+                return {**report, "server": await _identity(other)}
 
 
 def _milliseconds(timeout: float) -> int:
     return max(1, round(timeout * 1000))
 
 
-async def _round_trips(client: URLabClient, arguments: Namespace) -> RoundTrips:
+async def _round_trips(client: URLabClient, arguments: Namespace) -> dict[str, float]:
     times: list[float] = []
     for _ in range(arguments.count):
         start = time.perf_counter()
         await client.meta(timeout=arguments.timeout)
         times.append(1e3 * (time.perf_counter() - start))
-    return RoundTrips(len(times), *(round(f(times), 3) for f in (min, statistics.median, max)))
+    spread = {"min": min(times), "median": statistics.median(times), "max": max(times)}
+    return {"count": len(times), **{name: round(value, 3) for name, value in spread.items()}}
 
 
-async def _identity(client: URLabClient) -> Identity:
+async def _identity(client: URLabClient) -> dict[str, Any]:
     import mujoco
 
     local = mujoco.mj_versionString()
-    return Identity(
-        urlab_version=client.urlab_version,
-        mujoco_version=client.mujoco_version,
-        local_mujoco_version=local,
-        same_mujoco_build=client.mujoco_version == local,
-        play=await _play(client),
-        articulations=[_articulation(art, client.model is not None) for art in client.articulations.values()],
-        entities=[name for name in client.entities if name not in client.articulations],
-    )
+    return {
+        "urlab_version": client.urlab_version,
+        "mujoco_version": client.mujoco_version,
+        "local_mujoco_version": local,
+        "same_mujoco_build": client.mujoco_version == local,
+        "play": await _play(client),
+        "articulations": [_articulation(art, client.model is not None) for art in client.articulations.values()],
+        "entities": [name for name in client.entities if name not in client.articulations],
+    }
 
 
-def _articulation(articulation: URLabArticulation, with_model: bool) -> ArticulationReport:
+def _articulation(articulation: URLabArticulation, with_model: bool) -> dict[str, Any]:
+    """Return what an articulation has; joints and sensors are None if the model could not be loaded locally."""
     controller = articulation.controller
-    return ArticulationReport(
-        key=articulation.prefix,
-        actor_id=articulation.actor_id,
-        joints=len(articulation.joints) if with_model else None,
-        actuators=len(articulation.actuators),
-        sensors=len(articulation.sensors) if with_model else None,
-        cameras=len(articulation.cameras),
-        controller=None if controller is None else str(controller.kind),
-    )
+    return {
+        "key": articulation.prefix,
+        "actor_id": articulation.actor_id,
+        "joints": len(articulation.joints) if with_model else None,
+        "actuators": len(articulation.actuators),
+        "sensors": len(articulation.sensors) if with_model else None,
+        "cameras": len(articulation.cameras),
+        "controller": None if controller is None else str(controller.kind),
+    }
 
 
-async def _play(client: URLabClient) -> PlayReport:
+async def _play(client: URLabClient) -> dict[str, Any]:
+    """Return the state of play; `step_mode` is None if only the driving client knows it."""
+    play = {"state": "off", "sim_time": None, "physics": None, "step_mode": None, "step_mode_pinned": False}
     try:
         before = await client.sim.status()
     except URLabRPCError:  # a packaged build has no such op
-        return PlayReport("ready" if client.manager_present else "off")
+        return {**play, "state": "ready" if client.manager_present else "off"}
     if before.sim_time is None or not client.manager_present:
-        return PlayReport(before.state, before.sim_time)
+        return {**play, "state": before.state, "sim_time": before.sim_time}
     after = await watched(client.sim.status, before)
     advancing = after.sim_time is not None and after.sim_time > before.sim_time
     pinned = await _pinned_mode(client)
-    return PlayReport(
-        before.state,
-        after.sim_time,
-        physics="advancing" if advancing else "standing still",
-        step_mode=pinned or ("live" if advancing else None),
-        step_mode_pinned=pinned is not None,
-    )
+    return {
+        "state": before.state,
+        "sim_time": after.sim_time,
+        "physics": "advancing" if advancing else "standing still",
+        "step_mode": pinned or ("live" if advancing else None),
+        "step_mode_pinned": pinned is not None,
+    }
 
 
 async def _pinned_mode(client: URLabClient) -> str | None:
@@ -275,22 +203,20 @@ async def _pinned_mode(client: URLabClient) -> str | None:
     return None
 
 
-def _text(report: Report) -> str:
-    rows = [("ops", str(report.ops))]
-    server = report.server
+def _text(report: dict[str, Any]) -> str:
+    rows = [("ops", str(report["ops"]))]
+    server = report["server"]
     if server is not None:
-        here = "same version here" if server.same_mujoco_build else f"{server.local_mujoco_version} here"
-        rows = [("URLab", server.urlab_version), ("MuJoCo", f"{server.mujoco_version} ({here})"), *rows]
-        rows += _play_rows(server.play)
-        for title, texts in (
-            ("articulations", [_articulation_text(art) for art in server.articulations]),
-            ("entities", server.entities),
-        ):
+        here = "same version here" if server["same_mujoco_build"] else f"{server['local_mujoco_version']} here"
+        rows = [("URLab", server["urlab_version"]), ("MuJoCo", f"{server['mujoco_version']} ({here})"), *rows]
+        rows += _play_rows(**server["play"])
+        articulations = [_articulation_text(art) for art in server["articulations"]]
+        for title, texts in (("articulations", articulations), ("entities", server["entities"])):
             rows += [("" if index else title, text) for index, text in enumerate(texts)]
-    trips = report.round_trip_ms
-    times = f"min {trips.min:.2f} ms, median {trips.median:.2f} ms, max {trips.max:.2f} ms ({trips.count} times meta)"
-    lines = [report.address, *(f"  {title:13}  {text}" for title, text in (*rows, ("round trip", times)))]
-    if server is not None and not report.address.startswith(SCHEME):
+    trip = "min {min:.2f} ms, median {median:.2f} ms, max {max:.2f} ms ({count} times meta)"
+    rows.append(("round trip", trip.format(**report["round_trip_ms"])))
+    lines = [report["address"], *(f"  {title:13}  {text}" for title, text in rows)]
+    if server is not None and not report["address"].startswith(SCHEME):
         lines.append(
             "A session was opened: a client that was driving this server has to call discover() again; "
             "--no-session avoids that."
@@ -298,19 +224,21 @@ def _text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def _play_rows(play: PlayReport) -> list[tuple[str, str]]:
-    if play.physics is None:
-        return [("play", play.state)]
-    mode = f"{play.step_mode}, pinned by the server" if play.step_mode_pinned else play.step_mode
+def _play_rows(
+    state: str, sim_time: float, physics: str | None, step_mode: str | None, step_mode_pinned: bool
+) -> list[tuple[str, str]]:
+    if physics is None:
+        return [("play", state)]
+    mode = f"{step_mode}, pinned by the server" if step_mode_pinned else step_mode
     return [
-        ("play", f"{play.state}, sim time {play.sim_time:.3f} s, {play.physics}"),
+        ("play", f"{state}, sim time {sim_time:.3f} s, {physics}"),
         ("step mode", mode or "live and paused, or a mode in which its client steps"),
     ]
 
 
-def _articulation_text(articulation: ArticulationReport) -> str:
-    numbers = ((noun, getattr(articulation, f"{noun}s")) for noun in ("joint", "actuator", "sensor", "camera"))
+def _articulation_text(articulation: dict[str, Any]) -> str:
+    numbers = ((noun, articulation[f"{noun}s"]) for noun in ("joint", "actuator", "sensor", "camera"))
     counts = [counted(number, noun) for noun, number in numbers if number is not None]
-    control = f"{articulation.controller} controller" if articulation.controller else "no controller"
-    actor = f" (actor {articulation.actor_id})" if articulation.actor_id else ""
-    return f"{articulation.key}{actor}: {', '.join([*counts, control])}"
+    control = f"{articulation['controller']} controller" if articulation["controller"] else "no controller"
+    actor = f" (actor {articulation['actor_id']})" if articulation["actor_id"] else ""
+    return f"{articulation['key']}{actor}: {', '.join([*counts, control])}"

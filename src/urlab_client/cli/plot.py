@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import Parser, add_recording
+from urlab_client.cli._arguments import RECORDING
 from urlab_client.cli._common import CommandError, check_ending, progress_bar
 from urlab_client.values.names import did_you_mean
 
@@ -33,28 +33,16 @@ _LEAST = 1e-6  # range of an axis, in the unit of its values, or as a part of la
 _PERIOD = 18.0  # of a dashed line, in line widths
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
-
-EXAMPLES = (
-    ("urlab plot run.mcap", "all joint positions; the picture is run.png"),
-    ("urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png", "velocities of some joints"),
-    ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_recording(parser)
-    parser.add_argument(
-        "--joints",
-        nargs="+",
-        default=["*"],
-        metavar="NAME",
-        help="names, with or without ARTICULATION/ before them; * matches anything (default: all but free bases)",
-    )
-    parser.add_argument("--field", choices=_FIELDS, default="qpos", help="which values to draw (default: %(default)s)")
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="PICTURE", help="a .png, .pdf or .svg file (default: FILE with .png)"
-    )
+USAGE = f"""
+{RECORDING}
+--joints NAME+  names, with or without ARTICULATION/ before them; * matches anything (default: all but free bases)
+--field qpos|qvel|ctrl|set_points|act|sensors|pose=qpos  which values to draw
+-o --output FILE  a .png, .pdf or .svg file (default: RECORDING with .png)
+examples:
+urlab plot run.mcap  all joint positions; the picture is run.png
+urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png  velocities of some joints
+urlab plot run.mcap --field sensors --joints 'imu*'  readings of some sensors
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -91,7 +79,7 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
         if field != arguments.field:
             continue
         there += [f"{owner}/{name}" for name in column.names]
-        plain = arguments.joints == ["*"] and field in {"qpos", "qvel"}
+        plain = arguments.joints is None and field in {"qpos", "qvel"}
         names = joint_columns(column.names, dof=field == "qvel") if plain else column.names
         labels = dict(zip(column.names, column.labels, strict=True))
         found = [
@@ -99,15 +87,15 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
             for name in names
             if any(
                 fnmatchcase(spelled, want)
-                for want in arguments.joints
+                for want in arguments.joints or ["*"]
                 for spelled in (name, f"{owner}/{name}", labels[name], f"{owner}/{labels[name]}")
             )
         ]
         if found:
             chosen[key] = found
     if not chosen or not len(table):
-        wanted = " ".join(arguments.joints)
-        close = did_you_mean(arguments.joints[0], [*there, *(name.rpartition("/")[2] for name in there)])
+        wanted = " ".join(arguments.joints or ["*"])
+        close = did_you_mean(wanted, [*there, *(name.rpartition("/")[2] for name in there)])
         raise CommandError(
             f"{arguments.recording}: no {arguments.field} named {wanted}.{close} "
             f"There are: {', '.join(there) or 'none'}"

@@ -11,20 +11,10 @@ from __future__ import annotations
 
 import asyncio
 from argparse import Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.aio import URLabClient
-from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_cameras,
-    add_client,
-    add_step_mode,
-    cameras,
-    make_client,
-    seconds,
-)
+from urlab_client.cli._arguments import CAMERA, CAMERA_HZ, CLIENT, STEP_MODE, address_usage, cameras, make_client
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, run_session
 from urlab_client.enums import StepMode
@@ -34,39 +24,29 @@ if TYPE_CHECKING:
 
 _INCOMPLETE = 1
 
-
-EXAMPLES = (
-    ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
-    (
-        "urlab record sim://arm run.mcap --step-mode direct --camera all",
-        "a simulated robot, stepped by this command, with every camera",
-    ),
-    (
-        "urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15",
-        "another machine and one of its cameras",
-    ),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument("output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
-    add_step_mode(parser)
-    parser.add_argument(
-        "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
-    )
-    parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
-    add_cameras(parser, "a camera to record")
-    parser.add_argument("--contacts", action="store_true", help="also record contacts")
-    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
-    add_client(parser)
+USAGE = f"""
+{address_usage()}
+OUTPUT  the file to write, a .mcap file
+{STEP_MODE}
+--seconds S=10  simulated seconds
+--keyframe NAME  keyframe to start from, in direct mode
+{CAMERA.format("a camera to record")}
+{CAMERA_HZ.format(30)}
+--contacts  also record contacts
+--overwrite  replace OUTPUT if it exists
+{CLIENT}
+examples:
+urlab record run.mcap --seconds 30  thirty seconds of the server on this machine, in live mode
+urlab record sim://arm run.mcap --step-mode direct --camera all
+    a simulated robot, stepped by this command, with every camera
+urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15  another machine and one of its cameras
+"""
 
 
 def run(arguments: Namespace) -> int:
     """Record; return 1 if states were dropped or a camera sent no picture, else 0."""
     import_mujoco()
-    if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
+    if arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     check_recording(arguments.output, arguments)
     if arguments.camera and arguments.address.startswith("sim://"):
@@ -99,7 +79,7 @@ async def _record(arguments: Namespace) -> AsyncRecorder:
             overwrite=arguments.overwrite,
         )
         with interruptible() as stop:
-            if arguments.step_mode is StepMode.DIRECT:
+            if arguments.step_mode == StepMode.DIRECT:
                 await client.reset(arguments.keyframe)
             async with recorder:
                 with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:

@@ -8,35 +8,17 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
-from msgspec import Struct
-
-from urlab_client.cli._arguments import Parser
 from urlab_client.cli._common import aligned, import_mujoco, json_line
 
-
-class Robot(Struct):
-    """A bundled model; `keyframes` holds their names."""
-
-    name: str
-    joints: int
-    actuators: int
-    sensors: int
-    cameras: int
-    keyframes: list[str]
-    path: str
-
-
-EXAMPLES = (
-    ("urlab robots", "a table"),
-    ("urlab serve arm --play", "serve one of them"),
-    ("urlab robots --json", "the same for programs, with the path of each file"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
+USAGE = """
+--json  print JSON
+examples:
+urlab robots  a table
+urlab serve arm --play  serve one of them
+urlab robots --json  the same for programs, with the path of each file
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -49,7 +31,7 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _read(name: str, path: Path) -> Robot:
+def _read(name: str, path: Path) -> dict[str, Any]:
     import mujoco
 
     from urlab_client._mujoco import actuator_count
@@ -57,20 +39,18 @@ def _read(name: str, path: Path) -> Robot:
 
     with mujoco_messages():
         model = mujoco.MjModel.from_xml_path(str(path))
-    return Robot(
-        name=name,
-        joints=model.njnt,
-        actuators=actuator_count(model),
-        sensors=model.nsensor,
-        cameras=model.ncam,
-        keyframes=[model.key(i).name for i in range(model.nkey)],
-        path=str(path),
-    )
+    return {
+        "name": name,
+        "joints": model.njnt,
+        "actuators": actuator_count(model),
+        "sensors": model.nsensor,
+        "cameras": model.ncam,
+        "keyframes": [model.key(i).name for i in range(model.nkey)],
+        "path": str(path),
+    }
 
 
-def _table(robots: list[Robot]) -> str:
-    counts = ("joints", "actuators", "sensors", "cameras")
-    rows = [
-        (robot.name, *(str(getattr(robot, name)) for name in counts), ", ".join(robot.keyframes)) for robot in robots
-    ]
-    return aligned([("name", *counts, "keyframes"), *rows], right=range(1, len(counts) + 1))
+def _table(robots: list[dict[str, Any]]) -> str:
+    headings = [name for name in robots[0] if name != "path"]
+    rows = [[str(robot[name]) for name in headings[:-1]] + [", ".join(robot["keyframes"])] for robot in robots]
+    return aligned([headings, *rows], right=range(1, len(headings) - 1))

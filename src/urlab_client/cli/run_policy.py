@@ -22,28 +22,15 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_policy,
-    add_record,
-    add_task,
-    cameras,
-    make_client,
-    one_of,
-    seconds,
-    task_named,
-)
+from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, task_named
 from urlab_client.cli._common import (
     CommandError,
+    aligned,
     check_recording,
     import_mujoco,
     json_line,
-    output,
     progress_bar,
     refusing,
-    table,
 )
 from urlab_client.cli._watching import recorded
 from urlab_client.enums import StepMode
@@ -57,58 +44,27 @@ _FELL = 1
 _SEED = 0
 _ROUNDING_S = 1e-9
 
-
-EXAMPLES = (
-    ("urlab run-policy walk.onnx", "simulates the robot that walk.toml beside it names"),
-    (
-        "urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare",
-        "walk forward at 0.5 m/s; compare with zero and random outputs",
-    ),
-    ("urlab run-policy go.onnx --task my_tasks:Go", "an episode of a task of your own, by a network trained for it"),
-    (
-        "urlab run-policy walk.onnx tcp://localhost --record walk.mcap",
-        "drive the robot of a running server, and record it",
-    ),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_policy(
-        parser,
-        "an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive "
-        "(default: as declared)",
-    )
-    add_address(parser, default=None, otherwise="a simulated server for --robot or --task")
-    add_task(parser)
-    parser.add_argument(
-        "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--command",
-        dest="twist",
-        type=float,
-        nargs=3,
-        metavar=("VX", "VY", "WZ"),
-        help="velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)",
-    )
-    parser.add_argument(
-        "--goal",
-        type=float,
-        nargs="+",
-        metavar="NUMBER",
-        help="goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)",
-    )
-    parser.add_argument(
-        "--step-mode",
-        type=one_of(StepMode.DIRECT, StepMode.LIVE),
-        metavar="MODE",
-        help="direct or live (default: the first mode that the declaration allows)",
-    )
-    parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
-    add_record(parser, hz=None)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    add_client(parser)
+USAGE = f"""
+{POLICY}
+{address_usage("ADDRESS?", "a simulated server for --robot or --task")}
+--robot ROBOT  an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive
+    (default: as declared)
+{TASK}
+--seconds S=10  simulated seconds
+--command VX VY WZ  velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)
+--goal NUMBER+  goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)
+--step-mode direct|live  what advances physics (default: the first mode that the declaration allows)
+--compare  run zero and random outputs first, for comparison
+{RECORD}
+--json  print JSON
+{CLIENT}
+examples:
+urlab run-policy walk.onnx  simulates the robot that walk.toml beside it names
+urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare
+    walk forward at 0.5 m/s; compare with zero and random outputs
+urlab run-policy go.onnx --task my_tasks:Go  an episode of a task of your own, by a network trained for it
+urlab run-policy walk.onnx tcp://localhost --record walk.mcap  drive the robot of a running server, and record it
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -120,7 +76,7 @@ def run(arguments: Namespace) -> int:
     from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
-    for name, given in (("command", arguments.twist), ("goal", arguments.goal)):
+    for name, given in (("command", arguments.command), ("goal", arguments.goal)):
         if given is not None:
             with refusing(ValueError, option=f"--{name}"):
                 setattr(policy, name, given)
@@ -134,9 +90,9 @@ def run(arguments: Namespace) -> int:
 
 def _in_task(arguments: Namespace) -> int:
     """Run one episode of a task; return 1 if it was terminated without success, else 0."""
-    for name, given in _options_of_a_declaration(arguments).items():
-        if given:
-            raise CommandError(f"--{name} cannot be combined with --task, which determines it")
+    for name in ("declaration", "robot", "command", "goal", "step_mode", "compare"):
+        if getattr(arguments, name):
+            raise CommandError(f"--{name.replace('_', '-')} cannot be combined with --task, which determines it")
     kind = task_named(arguments.task)
     from urlab_client.integrations.gym import URLabEnv
     from urlab_client.integrations.policy import task_network
@@ -164,16 +120,10 @@ def _in_task(arguments: Namespace) -> int:
     if arguments.json:
         print(json_line({**found, "terminated": terminated}))
     else:
-        title = f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation"
-        results = table([], ["actions", "return", "success", "terminated"], title)
-        results.add_row(str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated))
-        output().print(results)
+        print(f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation")
+        row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
+        print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0
-
-
-def _options_of_a_declaration(arguments: Namespace) -> dict[str, Any]:
-    named = {name: getattr(arguments, name) for name in ("declaration", "robot", "goal", "compare")}
-    return {**named, "command": arguments.twist, "step-mode": arguments.step_mode}
 
 
 async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
@@ -240,21 +190,16 @@ def _print(runs: dict[str, PolicyRun]) -> None:
     last = runs["policy"]
     live = last.step_mode is StepMode.LIVE
     walks = any(found.distance for found in runs.values())  # a fixed base neither walks nor falls
-    headings = ["mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls"] if walks else []
-    headings += ["goal\nerror"] if last.goal_error is not None else []
-    headings += ["actions/s", "late\nactions" if live else "physics\nsteps/s"]
-    title = f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation"
-    results = table(["outputs"], headings, title)
+    rows: list[list[str]] = []
     for name, found in runs.items():
-        results.add_row(
-            name,
-            *(
-                (f"{found.reward:.3f}", f"{found.forward:.2f}", f"{found.velocity_error:.3f}", str(found.falls))
-                if walks
-                else ()
-            ),
-            *((f"{found.goal_error:.4f}",) if found.goal_error is not None else ()),
-            f"{found.actions / found.wall_time:.0f}",
-            str(found.late) if live else f"{found.steps_per_second:.0f}",
-        )
-    output().print(results)
+        cells = {"outputs": name}
+        if walks:
+            cells |= {"mean reward": f"{found.reward:.3f}", "forward (m)": f"{found.forward:.2f}"}
+            cells |= {"velocity error (m/s)": f"{found.velocity_error:.3f}", "falls": str(found.falls)}
+        if found.goal_error is not None:
+            cells["goal error"] = f"{found.goal_error:.4f}"
+        cells["actions/s"] = f"{found.actions / found.wall_time:.0f}"
+        cells |= {"late actions": str(found.late)} if live else {"physics steps/s": f"{found.steps_per_second:.0f}"}
+        rows += [[*cells.values()]] if rows else [[*cells], [*cells.values()]]
+    print(f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation")
+    print(aligned(rows, right=range(1, len(rows[0]))))

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
 from urlab_client._platform.windows import read_aside
-from urlab_client.cli._arguments import Parser, add_dialect, count, image_size, index, port
+from urlab_client.cli._arguments import DIALECT
 from urlab_client.cli._common import CommandError, import_mujoco, in_background
-from urlab_client.enums import CameraMode, StepMode
+from urlab_client.enums import CameraMode
 from urlab_client.simulation.controller_config import ControllerConfig
 
 if TYPE_CHECKING:
@@ -51,169 +51,82 @@ _WAIT_S = 0.1 if sys.platform == "win32" else None
 _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 
+USAGE = f"""
+MODEL+  an MJCF file, the name of a bundled robot (arm, quadruped, ...) or a saved level (.json); each MJCF becomes a
+    blueprint and one actor whose id is the file stem
+network:
+--host HOST=127.0.0.1  interface to bind (default: %(default)s); all but loopback need --server-key or
+    --insecure-no-auth
+--server-key FILE  encrypt everything and prove this server's identity, with a secret key file from `urlab keys new`
+| --allow-client PATH...  with --server-key: admit the client with this public key file, or all clients whose public
+    keys are in this folder; repeatable
+| --allow-any-client  with --server-key: admit every client that has the server's public key
+--insecure-no-auth  serve anyone who can reach the interface: they can read and write files as clients can
+--step-port PORT  default 5559; 0: any free one
+--state-port PORT  default 5555; 0: any free one
+--ctrl-port PORT  default 5556; 0: any free one
+--info-port PORT  default 5557; 0: any free one
+--camera-port PORT  default 5558; 0: any free one
+{DIALECT}
+--instance-index INDEX  number of this server among several: ports not given are 5559 + 10 N and the next two
+--instance-id NAME=  name of this server among several
+--metrics-port PORT  also serve metrics for Prometheus at http://127.0.0.1:PORT/metrics; 0: any free one
+| --shm-dir DIR  also serve over shared memory, in a new directory below DIR (on Linux, /dev/shm avoids the disk)
+| --no-shm  do not use shared memory (default)
+content:
+--saved-dir DIR  folder for levels and imported models (default: a temporary folder)
+--model-root DIR...  folder below which clients may import MJCF files; repeatable (default: the models' folders)
+--actor-names model|plugin=model  keys of articulations: the MJCF model name, or names as the plugin assigns them, such
+    as robot_C_0
+physics:
+--play  start a play session immediately
+--unpaused  let physics run from the start of play
+--step-mode auto|live|direct|puppet=auto  auto: live until a client chooses another mode; live, direct or puppet pin
+    the mode
+--controller ACTOR=KIND...  attach a controller: ACTOR=pd[,kp=N][,kv=N][,torque_limit=N] or ACTOR=passthrough, '*' for
+    all actors; repeatable
+--scene-mib N  memory limit for all models of a level and their simulation, MiB (default 1024)
+--[no-]mjcf-options  use the <option> of the first model; otherwise the alpha ignores them all and the beta merges them
+--randomise VARIATION  vary the model at each reset, with the seed of the reset, as a TOML file (or JSON text) declares
+cameras:
+--camera-mode ACTOR/CAMERA=MODE...  {", ".join(CameraMode)}; repeatable (default: real)
+--camera-size WxH  pixels, for cameras without a resolution
+--render-quality auto|fast|high=auto  fast: no shadows, reflections or smooth edges; high: with them; auto: fast if the
+    CPU renders
+for programs that start a server:
+--json  print one line of JSON when the server is ready
+--until-eof  also exit when standard input closes, so that the server cannot outlive the program that started it; the
+    server then ignores SIGINT, unless standard input is a terminal
+examples:
+urlab serve quadruped --play  a bundled robot at tcp://localhost, in a play session
+urlab serve robot.xml --play --unpaused --mjcf-options  your own model, simulated in real time with its own <option>
+urlab serve arm ball --step-port 0 --json  two models on any free port, printed as one line of JSON
+"""
 
-EXAMPLES = (
-    ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
-    (
-        "urlab serve robot.xml --play --unpaused --mjcf-options",
-        "your own model, simulated in real time with its own <option>",
-    ),
-    ("urlab serve arm ball --step-port 0 --json", "two models on any free port, printed as one line of JSON"),
-)
+
+def _controller(text: str) -> tuple[str, ControllerConfig]:
+    actor, equals, value = text.partition("=")
+    if not actor or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
+    try:
+        return actor, ControllerConfig.parse(value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "models",
-        nargs="+",
-        metavar="MODEL",
-        help="an MJCF file, the name of a bundled robot (arm, quadruped, ...) or a saved level (.json); each MJCF "
-        "becomes a blueprint and one actor whose id is the file stem",
-    )
-    network = parser.add_argument_group("network")
-    network.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="interface to bind (default: %(default)s); all but loopback need --server-key or --insecure-no-auth",
-    )
-    network.add_argument(
-        "--server-key",
-        type=Path,
-        metavar="FILE",
-        help="encrypt everything and prove this server's identity, with a secret key file from `urlab keys new`",
-    )
-    admitted = network.add_mutually_exclusive_group()
-    admitted.add_argument(
-        "--allow-client",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="PATH",
-        help="with --server-key: admit the client with this public key file, or all clients whose public keys are in "
-        "this folder; repeatable",
-    )
-    admitted.add_argument(
-        "--allow-any-client",
-        action="store_true",
-        help="with --server-key: admit every client that has the server's public key",
-    )
-    network.add_argument(
-        "--insecure-no-auth",
-        action="store_true",
-        help="serve anyone who can reach the interface: they can read and write files as clients can",
-    )
-    for name, default in _PORTS.items():
-        network.add_argument(
-            f"--{name}-port", type=port, default=None, metavar="PORT", help=f"default {default}; 0: any free one"
+def _camera_mode(text: str) -> tuple[str, CameraMode]:
+    camera, equals, mode = text.rpartition("=")
+    actor, slash, name = camera.partition("/")
+    if not (equals and actor and slash and name):
+        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR/CAMERA=MODE, for example arm/wrist=depth")
+    if mode not in [*CameraMode]:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: {mode!r} is not a camera mode; the modes are {', '.join(CameraMode)}"
         )
-    add_dialect(network)
-    network.add_argument(
-        "--instance-index",
-        type=index,
-        metavar="N",
-        help="number of this server among several: ports not given are 5559 + 10 N and the next two",
-    )
-    network.add_argument("--instance-id", default="", metavar="NAME", help="name of this server among several")
-    network.add_argument(
-        "--metrics-port",
-        type=port,
-        metavar="PORT",
-        help="also serve metrics for Prometheus at http://127.0.0.1:PORT/metrics; 0: any free one",
-    )
-    memory = network.add_mutually_exclusive_group()
-    memory.add_argument(
-        "--shm-dir",
-        type=Path,
-        metavar="DIR",
-        help="also serve over shared memory, in a new directory below DIR (on Linux, /dev/shm avoids the disk)",
-    )
-    memory.add_argument("--no-shm", action="store_true", help="do not use shared memory (default)")
-    content = parser.add_argument_group("content")
-    content.add_argument(
-        "--saved-dir",
-        type=Path,
-        metavar="DIR",
-        help="folder for levels and imported models (default: a temporary folder)",
-    )
-    content.add_argument(
-        "--model-root",
-        type=Path,
-        action="append",
-        metavar="DIR",
-        help="folder below which clients may import MJCF files; repeatable (default: the models' folders)",
-    )
-    content.add_argument(
-        "--actor-names",
-        choices=("model", "plugin"),
-        default="model",
-        help="keys of articulations: the MJCF model name, or names as the plugin assigns them, such as robot_C_0 "
-        "(default: model)",
-    )
-    physics = parser.add_argument_group("physics")
-    physics.add_argument("--play", action="store_true", help="start a play session immediately")
-    physics.add_argument("--unpaused", action="store_true", help="let physics run from the start of play")
-    physics.add_argument(
-        "--step-mode",
-        choices=[str(mode) for mode in StepMode],
-        default="auto",
-        metavar="MODE",
-        help="auto: live until a client chooses another mode; live, direct or puppet pin the mode (default: auto)",
-    )
-    physics.add_argument(
-        "--controller",
-        type=_controller,
-        action="append",
-        default=[],
-        metavar="ACTOR=KIND",
-        help="attach a controller: ACTOR=pd[,kp=N][,kv=N][,torque_limit=N] or ACTOR=passthrough, '*' for all actors; "
-        "repeatable",
-    )
-    physics.add_argument(
-        "--scene-mib",
-        type=count,
-        metavar="N",
-        help="memory limit for all models of a level and their simulation, MiB (default 1024)",
-    )
-    physics.add_argument(
-        "--mjcf-options",
-        action=argparse.BooleanOptionalAction,
-        default=False,
-        help="use the <option> of the first model; otherwise the alpha ignores them all and the beta merges them",
-    )
-    physics.add_argument(
-        "--randomise",
-        metavar="FILE",
-        help="vary the model at each reset, with the seed of the reset, as a TOML file (or JSON text) declares",
-    )
-    cameras = parser.add_argument_group("cameras")
-    cameras.add_argument(
-        "--camera-mode",
-        type=_camera_mode,
-        action="append",
-        default=[],
-        metavar="ACTOR/CAMERA=MODE",
-        help=f"{', '.join(CameraMode)}; repeatable (default: real)",
-    )
-    cameras.add_argument(
-        "--camera-size", type=image_size, metavar="WxH", help="pixels, for cameras without a resolution"
-    )
-    cameras.add_argument(
-        "--render-quality",
-        choices=("auto", "fast", "high"),
-        default="auto",
-        metavar="QUALITY",
-        help="fast: no shadows, reflections or smooth edges; high: with them; auto: fast if the CPU renders "
-        "(default: auto)",
-    )
-    lifetime = parser.add_argument_group("for programs that start a server")
-    lifetime.add_argument("--json", action="store_true", help="print one line of JSON when the server is ready")
-    lifetime.add_argument(
-        "--until-eof",
-        action="store_true",
-        help="also exit when standard input closes, so that the server cannot outlive the program that started it; "
-        "the server then ignores SIGINT, unless standard input is a terminal",
-    )
+    return camera, CameraMode(mode)
+
+
+KINDS = {"controller": _controller, "camera_mode": _camera_mode}
 
 
 def run(arguments: Namespace) -> int:
@@ -226,7 +139,9 @@ def run(arguments: Namespace) -> int:
     if arguments.until_eof:
         watch_input(events)
     import_mujoco()
-    _check_paths(arguments)
+    for folder in arguments.model_root:
+        if not folder.is_dir():
+            raise CommandError(f"--model-root {folder}: no such folder")
     from urlab_client.server.system.temporary_folder import TemporaryFolder
     from urlab_client.server.system.threads import limit_arenas
 
@@ -262,7 +177,7 @@ def _server(arguments: Namespace, saved_dir: Path) -> SimulatedServer:
             **options,
             curve=_curve(arguments),
             saved_dir=saved_dir,
-            model_roots=arguments.model_root,
+            model_roots=arguments.model_root or None,
             controllers=dict(arguments.controller),
             camera_modes=dict(arguments.camera_mode),
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
@@ -351,40 +266,6 @@ def _settle_ports(arguments: Namespace) -> None:
         if number and number in users:
             raise CommandError(f"--{users[number]}-port and --{name}-port are both {number}; each needs its own")
         users[number] = name
-
-
-def _check_paths(arguments: Namespace) -> None:
-    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
-
-    bundled = bundled_models()
-    for model in arguments.models:
-        if model not in bundled and not Path(model).is_file():
-            raise CommandError(unknown_model(model))
-    for folder in arguments.model_root or ():
-        if not folder.is_dir():
-            raise CommandError(f"--model-root {folder}: no such folder")
-
-
-def _controller(text: str) -> tuple[str, ControllerConfig]:
-    actor, equals, value = text.partition("=")
-    if not actor or not equals:
-        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
-    try:
-        return actor, ControllerConfig.parse(value)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
-
-
-def _camera_mode(text: str) -> tuple[str, CameraMode]:
-    camera, equals, mode = text.rpartition("=")
-    actor, slash, name = camera.partition("/")
-    if not (equals and actor and slash and name):
-        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR/CAMERA=MODE, for example arm/wrist=depth")
-    if mode not in [*CameraMode]:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: {mode!r} is not a camera mode; the modes are {', '.join(CameraMode)}"
-        )
-    return camera, CameraMode(mode)
 
 
 class Event(Enum):

@@ -9,25 +9,18 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
-from urlab_client.cli._arguments import (
-    Parser,
-    add_client,
-    add_mjcf_options,
-    handshake,
-    image_size,
-    make_client,
-    seconds,
-)
+from urlab_client.cli._arguments import MJCF_OPTIONS, WATCHER, handshake, make_client
 from urlab_client.cli._common import CommandError, check_ending, import_mujoco
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabTimeoutError
+from urlab_client.values.pictures import to_rgb
 
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient
@@ -36,66 +29,27 @@ _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
 _CHUNK = 100  # physics steps per request, for which the server allows 5 s
-_BEYOND_M = 1e5  # farther than any ray can hit
 
-
-EXAMPLES = (
-    ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
-    (
-        "urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg",
-        "your own model, one second after its keyframe, as JPEG",
-    ),
-    ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
-    ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
-    ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "alongside its client"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    parser.add_argument(
-        "sources",
-        nargs="+",
-        metavar="SOURCE",
-        help="MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the "
-        "address of a running server, tcp://HOST[:PORT] or ipc://PATH",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=Path("snapshot.png"),
-        metavar="FILE",
-        help="a .png, .jpg or .webp file (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--camera",
-        metavar="ARTICULATION/CAMERA",
-        help="show what this camera sees (default: the whole scene, from outside)",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=(*_VIEW_MODES, *CameraMode),
-        metavar="MODE",
-        help=f"{', '.join(_VIEW_MODES)}; with --camera {', '.join(CameraMode)} (default: lit, or real)",
-    )
-    parser.add_argument(
-        "--size",
-        type=image_size,
-        default=(1280, 720),
-        metavar="WxH",
-        help="size in pixels, also of a camera without a resolution (default: 1280x720)",
-    )
-    parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long first")
-    add_mjcf_options(parser, "for models")
-    parser.add_argument(
-        "--timeout",
-        type=seconds,
-        metavar="S",
-        help="how long to wait for a running server (default: 5, and 30 for its first picture)",
-    )
-    add_client(parser, handshake=True)
+USAGE = f"""
+SOURCE+  MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the address
+    of a running server, tcp://HOST[:PORT] or ipc://PATH
+-o --output FILE=snapshot.png  a .png, .jpg or .webp file
+--camera ARTICULATION/CAMERA  show what this camera sees (default: the whole scene, from outside)
+--mode {"|".join((*_VIEW_MODES, *CameraMode))}  the view mode; with --camera the camera's mode (default: lit, or real)
+--size WxH=1280x720  size in pixels, also of a camera without a resolution
+--keyframe NAME  start play at this keyframe
+--seconds S  simulate for this long first
+{MJCF_OPTIONS.format("for models")}
+--timeout S  how long to wait for a running server (default: 5, and 30 for its first picture)
+{WATCHER}
+examples:
+urlab snapshot quadruped -o quadruped.png  a bundled robot
+urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg
+    your own model, one second after its keyframe, as JPEG
+urlab snapshot arm --camera arm/wrist --mode depth  what a camera of the model sees
+urlab snapshot tcp://localhost --camera arm/overview  what a camera of a running server sees
+urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello  alongside its client
+"""
 
 
 def run(arguments: Namespace) -> int:
@@ -110,7 +64,7 @@ def run(arguments: Namespace) -> int:
         image = _of_running_server(arguments)
     else:
         image = _of_models(arguments)
-    _write(arguments.output, image)
+    write_picture(arguments.output, image)
     print(f"{arguments.output}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
@@ -192,28 +146,16 @@ def _of_running_server(arguments: Namespace) -> NDArray[np.uint8]:
 
 
 def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
-    """Return red, green, blue and alpha of the newest frame; depth as grey, half as bright at twice the distance."""
-    frame: NDArray[Any] | None = view.latest_frame
+    """Return the newest frame as red, green and blue; depth as grey."""
+    frame = view.latest_frame
     if frame is None:
         raise CommandError(f"camera {view.name} delivered no picture")
-    if view.mode == CameraMode.REAL:
-        return frame
-    if view.mode != CameraMode.DEPTH:
-        return frame[:, :, [2, 1, 0, 3]]
-    image = np.zeros((*frame.shape, 4), np.uint8)
-    image[:, :, 3] = 255
-    hit = frame < _BEYOND_M
-    if hit.any():
-        near = max(float(frame[hit].min()), 1e-6)
-        image[hit, :3] = (255.0 * near / frame[hit]).clip(1.0, 255.0).astype(np.uint8)[:, None]
-    return image
+    return to_rgb(frame, view.mode)
 
 
-def _write(path: Path, image: NDArray[np.uint8]) -> None:
+def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a picture in the format that the file's ending names."""
     from PIL import Image
 
-    kind = _FORMATS[path.suffix.lower()]
-    picture = Image.fromarray(image)
     with replaced(path) as temporary:
-        # JPEG has no transparency, and camera pictures do not use any.
-        (picture.convert("RGB") if kind == "jpeg" else picture).save(temporary, format=kind)
+        Image.fromarray(image[:, :, :3]).save(temporary, format=_FORMATS[path.suffix.lower()])  # all are opaque

@@ -1,52 +1,44 @@
-"""`urlab tap`: print and record what clients and a server say to each other, and replay it."""
+"""`urlab tap`: print and record what clients and a server say to each other, and replay it.
+
+Relay between clients and a server, and print each op with its sizes and its time. Clients connect to the port that is
+printed instead of the server's; requests, state and pictures pass unchanged, except for the ports that replies name.
+--save keeps every frame, without pixels unless --images is given, and --replay answers requests from such a file,
+without a server. Shared memory goes past the relay: leave clients at transport="zmq", which is the default.
+"""
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any, Final, cast
 
 from urlab_client.aio.transport.connection import client_keys
-from urlab_client.cli._arguments import Parser, add_address, add_client, port
+from urlab_client.cli._arguments import CLIENT, address_usage
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
-from urlab_client.conformance.sessions import Passed, Ports, Relay
+from urlab_client.conformance.sessions import Passed, Ports, Relay, Replay, SessionWriter, read_session
 from urlab_client.conformance.wire import oddities, plain, reply_oddities
 from urlab_client.keys import KeyPair, read_pair
 from urlab_client.protocol.registry import OPS
 
-DESCRIPTION = (
-    "Relay between clients and a server, and print each op with its sizes and its time. Clients connect to the port "
-    "that is printed instead of the server's; requests, state and pictures pass unchanged, except for the ports that "
-    "replies name. --save keeps every frame, without pixels unless --images is given, and --replay answers requests "
-    "from such a file, without a server. Shared memory goes past the relay."
-)
-EXAMPLES = (
-    ("urlab tap tcp://localhost --listen 6559", "print what a client at port 6559 does with the editor"),
-    ("urlab tap tcp://localhost --listen 6559 --save session.mcap", "record it, to send it"),
-    ("urlab tap --replay session.mcap --listen 6559", "answer a client as the recorded server did"),
-)
+USAGE = f"""
+{address_usage()}
+--listen [HOST:]PORT=6559  where clients connect
+--listen-state PORT  port for the state stream (default: the one after --listen)
+--listen-key KEY_FILE  secret key for clients on other machines, who must know its public half
+--save FILE  keep every frame in this MCAP file
+--images  with --save: keep pixels, too
+--strict  name what our declarations do not know
+--quiet  do not print ops
+--replay FILE  answer from this recorded session
+{CLIENT}
+examples:
+urlab tap tcp://localhost --listen 6559  print what a client at port 6559 does with the editor
+urlab tap tcp://localhost --listen 6559 --save session.mcap  record it, to send it
+urlab tap --replay session.mcap --listen 6559  answer a client as the recorded server did
+"""
 _LONGEST: Final = 100
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    parser.add_argument("--listen", default="6559", metavar="[HOST:]PORT", help="where clients connect (default: 6559)")
-    parser.add_argument(
-        "--listen-state", type=port, metavar="PORT", help="port for the state stream (default: the one after --listen)"
-    )
-    parser.add_argument(
-        "--listen-key", metavar="FILE", help="secret key for clients on other machines, who must know its public half"
-    )
-    parser.add_argument("--save", type=Path, metavar="FILE", help="keep every frame in this MCAP file")
-    parser.add_argument("--images", action="store_true", help="with --save: keep pixels, too")
-    parser.add_argument("--strict", action="store_true", help="name what our declarations do not know")
-    parser.add_argument("--quiet", action="store_true", help="do not print ops")
-    parser.add_argument("--replay", type=Path, metavar="FILE", help="answer from this recorded session")
-    add_client(parser)
 
 
 def run(arguments: Namespace) -> int:
@@ -68,8 +60,6 @@ def _key(arguments: Namespace) -> KeyPair | None:
 
 
 def _replay(path: Path, ports: Ports, own: dict[str, int]) -> int:
-    from urlab_client.conformance.sessions import Replay, read_session
-
     with refusing(ValueError):
         session = read_session(path)
     with Replay(session, ports, **own) as replay:
@@ -96,27 +86,19 @@ def _relay(arguments: Namespace, ports: Ports, own: dict[str, int]) -> int:
     return 0
 
 
-@contextmanager
-def _saved(arguments: Namespace) -> Generator[Any]:
+def _saved(arguments: Namespace) -> AbstractContextManager[SessionWriter | None]:
     if arguments.save is None:
-        yield None
-        return
-    from urlab_client.conformance.sessions import SessionWriter
-
+        return nullcontext()
     check_ending(arguments.save, ".mcap")
     if arguments.save.exists():
         raise CommandError(f"{arguments.save} exists; choose another name")
-    writer = SessionWriter(arguments.save, images=arguments.images)
-    try:
-        yield writer
-    finally:
-        writer.close()
+    return closing(SessionWriter(arguments.save, images=arguments.images))
 
 
 class _Tap(Relay):
     """A relay that prints, judges and records."""
 
-    def __init__(self, arguments: Namespace, writer: Any, *args: Any, **options: Any) -> None:
+    def __init__(self, arguments: Namespace, writer: SessionWriter | None, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._quiet, self._strict, self._writer = arguments.quiet, arguments.strict, writer
         self._known: set[str] = set()

@@ -24,18 +24,7 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import (
-    Parser,
-    add_address,
-    add_client,
-    add_record,
-    add_task,
-    count,
-    hertz,
-    make_client,
-    seconds,
-    task_named,
-)
+from urlab_client.cli._arguments import CLIENT, RECORD, TASK, address_usage, make_client, task_named
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
 from urlab_client.cli._watching import interruptible, recorded
 
@@ -46,51 +35,31 @@ if TYPE_CHECKING:
 _SHOWN_S = 0.1
 _MOST = 1024
 
-
-EXAMPLES = (
-    ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
-    ("urlab teleop sim://arm", "try it, without a recording"),
-    (
-        "urlab teleop tcp://localhost --robot arm --site grip --record run.mcap --camera arm/wrist",
-        "the robot of a running server, with pictures",
-    ),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser, default=None, otherwise="a simulated server for --task, else tcp://localhost")
-    add_task(parser)
-    parser.add_argument("--robot", metavar="KEY", help="the articulation (default: the only one)")
-    parser.add_argument("--site", metavar="NAME", help="the hand, a site of the robot (default: the only one)")
-    parser.add_argument(
-        "--gripper", metavar="NAME", help="actuator of the gripper (default: the one that does not move the hand)"
-    )
-    parser.add_argument(
-        "--speed", type=hertz, default=0.25, metavar="M/S", help="largest speed of the hand (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--turn-speed",
-        type=hertz,
-        default=1.0,
-        metavar="RAD/S",
-        help="largest turn rate of the hand (default: %(default)s)",
-    )
-    parser.add_argument("--episodes", type=count, metavar="N", help="end after N episodes that were not discarded")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds after which an episode ends")
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of initial states and goals (default: 0)"
-    )
-    add_record(parser)
-    add_client(parser)
+USAGE = f"""
+{address_usage("ADDRESS?", "a simulated server for --task, else tcp://localhost")}
+{TASK}
+--robot KEY  the articulation (default: the only one)
+--site NAME  the hand, a site of the robot (default: the only one)
+--gripper NAME  actuator of the gripper (default: the one that does not move the hand)
+--speed M/S=0.25  largest speed of the hand
+--turn-speed RAD/S=1  largest turn rate of the hand
+--episodes N  end after N episodes that were not discarded
+--seconds S  simulated seconds after which an episode ends
+--seed SEED=0  seed of initial states and goals
+{RECORD}
+{CLIENT}
+examples:
+urlab teleop --task urlab/Reach-v0 --record reach.mcap  a task on a simulated robot, recorded
+urlab teleop sim://arm  try it, without a recording
+urlab teleop tcp://localhost --robot arm --site grip --record run.mcap --camera arm/wrist
+    the robot of a running server, with pictures
+"""
 
 
 def run(arguments: Namespace) -> int:
     """Teleoperate; return 0."""
     import_mujoco()
     check_recording(arguments.record, arguments)
-    if arguments.seed < 0:
-        raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
     import urlab_client.integrations.teleop  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
     task = None if arguments.task is None else task_named(arguments.task)()

@@ -10,22 +10,20 @@ from __future__ import annotations
 
 import asyncio
 from argparse import Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
 from urlab_client.cli import console
 from urlab_client.cli._arguments import (
+    CAMERA,
+    CAMERA_HZ,
+    CLIENT,
+    STEP_MODE,
     Parser,
-    add_address,
-    add_cameras,
-    add_client,
-    add_step_mode,
+    add_usage,
+    address_usage,
     cameras,
-    hertz,
     make_client,
-    port,
-    seconds,
 )
 from urlab_client.cli._common import CommandError, import_mujoco, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, run_session
@@ -37,47 +35,34 @@ if TYPE_CHECKING:
 _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
-
-EXAMPLES = (
-    ("urlab view sim://quadruped", "MuJoCo's window"),
-    ("urlab view --rerun --camera all", "the server on this machine in Rerun, with every camera"),
-    ("urlab view sim://arm --rerun --save arm.rrd --seconds 5", "five seconds as a Rerun file"),
-    ("urlab view --foxglove", "a server that Foxglove connects to"),
-)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Add the options."""
-    add_address(parser)
-    where = parser.add_mutually_exclusive_group()
-    parser.set_defaults(where="viewer")
-    for name, text in (
-        ("viewer", "MuJoCo's own window, which needs a display (default)"),
-        ("web", "the console's page with MuJoCo's web viewer, for browsers"),
-        ("rerun", "Rerun's window; with --save a file, with --connect another viewer, with --page a page for browsers"),
-        ("foxglove", "a server that Foxglove connects to"),
-    ):
-        where.add_argument(f"--{name}", dest="where", action="store_const", const=name, help=text)
-    parser.add_argument("--save", type=Path, metavar="FILE", help="with --rerun: write an .rrd file, show nothing")
-    parser.add_argument("--connect", metavar="URL", help="with --rerun: send to a viewer, rerun+http://HOST:9876/proxy")
-    parser.add_argument(
-        "--page",
-        action="store_true",
-        help="with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone",
-    )
-    parser.add_argument("--port", type=port, metavar="PORT", help="port for --web, --foxglove or --page")
-    add_step_mode(parser)
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")
-    add_cameras(parser, "a camera to show in Rerun or Foxglove", hz=10.0)
-    parser.add_argument("--sensors", action="store_true", help="show sensor readings in Rerun or Foxglove")
-    parser.add_argument(
-        "--max-hz", type=hertz, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
-    )
-    add_client(parser)
+USAGE = f"""
+{address_usage()}
+| --viewer  MuJoCo's own window, which needs a display (default)
+| --web  the console's page with MuJoCo's web viewer, for browsers
+| --rerun  Rerun's window; with --save a file, with --connect another viewer, with --page a page for browsers
+| --foxglove  a server that Foxglove connects to
+--save FILE  with --rerun: write an .rrd file, show nothing
+--connect URL  with --rerun: send to a viewer, rerun+http://HOST:9876/proxy
+--page  with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone
+--port PORT  port for --web, --foxglove or --page
+{STEP_MODE}
+--seconds S  simulated seconds (default: until Ctrl-C)
+{CAMERA.format("a camera to show in Rerun or Foxglove")}
+{CAMERA_HZ.format(10)}
+--sensors  show sensor readings in Rerun or Foxglove
+--max-hz HZ=30  states shown per second
+{CLIENT}
+examples:
+urlab view sim://quadruped  MuJoCo's window
+urlab view --rerun --camera all  the server on this machine in Rerun, with every camera
+urlab view sim://arm --rerun --save arm.rrd --seconds 5  five seconds as a Rerun file
+urlab view --foxglove  a server that Foxglove connects to
+"""
 
 
 def run(arguments: Namespace) -> int:
     """Show the simulation until stopped."""
+    arguments.where = next((name for name in ("web", "rerun", "foxglove") if getattr(arguments, name)), "viewer")
     if arguments.where != "rerun" and (arguments.save or arguments.connect or arguments.page):
         raise CommandError("--save, --connect and --page require --rerun")
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
@@ -103,7 +88,7 @@ def _show_console(arguments: Namespace) -> int:
             "--camera, --sensors and --seconds do not apply to --web, which shows everything until Ctrl-C"
         )
     parser = Parser()
-    console.add_arguments(parser)
+    add_usage(parser, console.USAGE)
     return console.run(parser.parse_args([arguments.address], arguments))  # the rest has its default
 
 
@@ -113,7 +98,7 @@ async def _view(arguments: Namespace) -> None:
     async with client:
         with announced_wait(client):
             await client.discover()
-        if arguments.step_mode is StepMode.DIRECT:
+        if arguments.step_mode == StepMode.DIRECT:
             await client.reset()
         view = _make(client, arguments)
         with interruptible() as stop:

@@ -109,7 +109,7 @@ class Bench:
         self.start: dict[str, Any] = {}
         self.blueprint: str = ""
         self.own_server = own_server
-        self.trusted: bool = is_local(wire.endpoint) if trusted is None else trusted
+        self.trusted: bool = is_local(wire.transport.endpoint) if trusted is None else trusted
         self.import_file = import_file
         self.measured: dict[str, Any] = {}
         self._undo: list[tuple[str, dict[str, Any]]] = []
@@ -338,7 +338,7 @@ class Bench:
 
     def endpoint(self, told: str) -> str:
         """Return the address to connect to from an endpoint that the server reports."""
-        host = self.wire.endpoint.partition("://")[2].rpartition(":")[0] or "127.0.0.1"
+        host = self.wire.transport.endpoint.partition("://")[2].rpartition(":")[0] or "127.0.0.1"
         return resolve_endpoint(told, host.strip("[]"))
 
     @property
@@ -442,7 +442,6 @@ NEEDS: Final[Mapping[str, tuple[Callable[[Bench], object], str]]] = {
         "needs a robot with a camera",
     ),
     "keyframe": (lambda bench: bench.model is not None and bench.model.nkey, "needs a model with a keyframe"),
-    "local": (lambda bench: is_local(bench.wire.endpoint), "needs the server on this machine"),
     "shm": (
         lambda bench: bench.hello.shm_session_dir is not None and Path(bench.hello.shm_session_dir).is_dir(),
         "needs a server on this machine that offers shared memory",

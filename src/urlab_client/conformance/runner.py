@@ -215,7 +215,7 @@ def _statements(bench: Bench, results: Sequence[CheckResult]) -> list[StatementR
 def _server(bench: Bench) -> dict[str, Any]:
     hello = bench.plain_hello
     return {
-        "address": bench.wire.endpoint,
+        "address": bench.wire.transport.endpoint,
         "generation": bench.features.generation,
         "urlab_version": hello.get("urlab_version"),
         "mujoco_version": hello.get("mujoco_version"),
@@ -224,7 +224,7 @@ def _server(bench: Bench) -> dict[str, Any]:
         "cameras": sum(len(robot.info.camera_topics) for robot in bench.robots),
         "capabilities": sorted(bench.features.capabilities),
         "requests": bench.wire.count,
-        "over_shared_memory": bench.wire.over_shm,
+        "over_shared_memory": bench.wire.transport.stats.over_shm,
     }
 
 

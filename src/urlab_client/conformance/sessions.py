@@ -8,12 +8,12 @@ with an editor becomes a test that runs anywhere.
 from __future__ import annotations
 
 import contextlib
-import queue
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self, TypeAlias, cast
 
@@ -31,18 +31,19 @@ from urlab_client.protocol.topics import resolve_endpoint
 
 Socket: TypeAlias = zmq.Socket[bytes]
 
-_STOP: Final = "inproc://urlab-stop"
 _PORTS: Final = frozenset({"hello", "begin_pie", "set_camera_streaming"})
 """Ops whose replies name ports."""
 _PREFIX: Final = "urlab/"
 _REQUEST, _REPLY = f"{_PREFIX}request", f"{_PREFIX}reply"
 _HEADER: Final = 40
+_CHUNK: Final = 1 << 16
+"""Bytes that are compressed at a time, while the relay waits."""
 _VARIES: Final = frozenset({"session_id", "control_owner", "client_version"})
 """Request fields that differ from run to run."""
 
 
 class Passed(Struct):
-    """A request and its reply that passed through.
+    """A request and its reply that passed through, or were recorded.
 
     Attributes:
         op: Name of the op; empty if the request has none.
@@ -50,13 +51,15 @@ class Passed(Struct):
         reply: The reply's bytes, as the server sent it.
         seconds: Time from the request to its reply, at the relay.
         at: Unix time of the request, nanoseconds.
+        messages: In a recording, what was published before the next reply: source, topic and payload.
     """
 
     op: str
     request: bytes
     reply: bytes
-    seconds: float
-    at: int
+    seconds: float = 0.0
+    at: int = 0
+    messages: list[tuple[str, bytes, bytes]] = []
 
 
 class _Head(Struct):
@@ -88,11 +91,16 @@ class Ports:
         self.host = host
         self._keys = keys
         self.context: zmq.Context[Socket] = zmq.Context()
+        self.context.setsockopt(zmq.LINGER, 0)
+        self.sockets = contextlib.ExitStack()
+
+    def socket(self, kind: int) -> Socket:
+        """Return a socket, which is among `sockets`."""
+        return self.sockets.enter_context(self.context.socket(kind))
 
     def bind(self, kind: int, port: int = 0) -> tuple[Socket, int]:
         """Return a bound socket and its port."""
-        socket = self.context.socket(kind)
-        socket.linger = 0
+        socket = self.socket(kind)
         if self._keys is not None:
             socket.curve_server = True
             socket.curve_publickey = self._keys.public
@@ -105,51 +113,57 @@ class Ports:
                 return socket, port
             return socket, socket.bind_to_random_port(f"tcp://{host}")
         except zmq.ZMQError as error:
-            socket.close()
+            self.sockets.close()
             raise OSError(f"{host}:{port} cannot be bound: {error}") from error
-
-    def told(self, port: int) -> str:
-        """Return the endpoint of a port as replies name it: clients put in the host that they know."""
-        return f"tcp://0.0.0.0:{port}"
 
 
 class Service(ABC):
     """A thread that answers at ports of its own, until it is closed or fails.
 
+    Args:
+        ports: Where to listen.
+        port: Port for requests; 0 for any.
+
     Attributes:
         port: Port for requests.
+        state_port: Port for the state stream.
         failure: Why it ended; None while it runs.
     """
+
+    def __init__(self, ports: Ports, port: int) -> None:
+        self.failure: URLabError | None = None
+        self.port: int
+        self.state_port: int = 0
+        self._ports = ports
+        self._poller = zmq.Poller()
+        self._front, self.port = ports.bind(zmq.ROUTER, port)
+        self._poller.register(self._front, zmq.POLLIN)
+        self._ended = threading.Event()
 
     _thread: threading.Thread
     """Runs `_run`."""
 
-    def __init__(self, ports: Ports, port: int) -> None:
-        self.failure: URLabError | None = None
-        self._ports = ports
-        self._poller = zmq.Poller()
-        self.port: int
-        self._front, self.port = ports.bind(zmq.ROUTER, port)
-        self._stop = ports.context.socket(zmq.PAIR)
-        self._stop.bind(_STOP)
-        for socket in (self._front, self._stop):
-            self._poller.register(socket, zmq.POLLIN)
-        self._ended = threading.Event()
-
     @abstractmethod
     def take(self, socket: Socket) -> None:
         """Take what has come to a socket; called on the thread."""
+
+    @abstractmethod
+    def camera_port(self, told: str) -> int:
+        """Return the own port in the place of a camera's endpoint, as the server tells it."""
+
+    def own_ports(self, place: dict[str, Any], name: str) -> None:
+        """Put the own port in the place of the server's; clients put in the host that they know."""
+        if name == "zmq_endpoint":
+            place[name] = f"tcp://0.0.0.0:{self.camera_port(str(place[name]))}"
+        else:
+            place[name] = float(self.state_port if name == "state_port" else self.port)
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        stop = self._ports.context.socket(zmq.PAIR)
-        stop.connect(_STOP)
-        stop.send(b"")
-        self._ended.wait()  # an interrupted `Thread.join` takes the thread for ended
-        self._ports.context.destroy(linger=0)
+        self._ports.context.term()  # which ends the thread, and waits until that has closed the sockets
 
     def join(self) -> None:
         """Wait until it fails or is closed."""
@@ -165,10 +179,11 @@ class Service(ABC):
         try:
             while True:
                 for socket, _ in self._poller.poll():
-                    if socket is self._stop:
-                        return
                     self.take(cast("Socket", socket))
+        except zmq.ContextTerminated:
+            pass
         finally:
+            self._ports.sockets.close()
             self._ended.set()
 
 
@@ -182,9 +197,6 @@ class Relay(Service):
         ports: Where to listen.
         port: Port for requests; 0 for any.
         state_port: Port for the state stream; 0 for any.
-
-    Attributes:
-        state_port: Port for the state stream.
     """
 
     def __init__(
@@ -206,7 +218,6 @@ class Relay(Service):
         self._pairs: dict[Socket, tuple[Socket, str]] = {}
         self._cameras: dict[str, int] = {}
         self._pending: dict[tuple[bytes, ...], tuple[bytes, float, int]] = {}
-        self.state_port: int
         self._state, self.state_port = self._publisher(f"tcp://{self._host}:{server_state_port}", "state", state_port)
         self._state_ports = {server_state_port}
 
@@ -233,8 +244,7 @@ class Relay(Service):
     # Sockets
 
     def _connected(self, kind: int, endpoint: str) -> Socket:
-        socket = self._ports.context.socket(kind)
-        socket.linger = 0
+        socket = self._ports.socket(kind)
         socket.heartbeat_ivl, socket.heartbeat_timeout = HEARTBEAT_MS, SILENCE_MS
         if self._keys is not None:
             self._keys.protect(socket)
@@ -275,7 +285,7 @@ class Relay(Service):
                 passed = Passed(op, request, reply, time.perf_counter() - began, at)
                 answer = self.on_exchange(passed)
                 if op in _PORTS:
-                    answer = with_ports(answer, self._own_ports)
+                    answer = _edited(answer, partial(_replace_ports, self.own_ports))
                 self._front.send_multipart([*envelope, answer])
 
     def _take_messages(self, socket: Socket) -> None:
@@ -290,20 +300,19 @@ class Relay(Service):
                     frames = list(changed)
                 other.send_multipart(frames)
 
-    def _own_ports(self, place: dict[str, Any], name: str) -> None:
-        """Put the relay's own port in the place of the server's."""
-        if name == "zmq_endpoint":
-            endpoint = resolve_endpoint(str(place[name]), self._host)
-            if endpoint not in self._cameras:
-                self._cameras[endpoint] = self._publisher(endpoint, "camera")[1]
-            place[name] = self._ports.told(self._cameras[endpoint])
-        elif name == "state_port":
-            if int(place[name]) not in self._state_ports:
-                self._state_ports.add(int(place[name]))
-                self._state.connect(f"tcp://{self._host}:{int(place[name])}")
-            place[name] = float(self.state_port)
-        elif name == "step_port":
-            place[name] = float(self.port)
+    def own_ports(self, place: dict[str, Any], name: str) -> None:
+        """See `Service.own_ports`; the state of a port that a handshake tells is relayed, too."""
+        if name == "state_port" and int(place[name]) not in self._state_ports:
+            self._state_ports.add(int(place[name]))
+            self._state.connect(f"tcp://{self._host}:{int(place[name])}")
+        super().own_ports(place, name)
+
+    def camera_port(self, told: str) -> int:
+        """See `Service.camera_port`."""
+        endpoint = resolve_endpoint(told, self._host)
+        if endpoint not in self._cameras:
+            self._cameras[endpoint] = self._publisher(endpoint, "camera")[1]
+        return self._cameras[endpoint]
 
 
 _MESSAGE: Final = 2
@@ -311,29 +320,29 @@ _MESSAGE: Final = 2
 OwnPorts: TypeAlias = Callable[[dict[str, Any], str], None]
 
 
-def with_ports(reply: bytes, own: OwnPorts) -> bytes:
-    """Return a reply with other ports, and everything else as it was."""
+def _edited(reply: bytes, change: Callable[[dict[str, Any]], bool]) -> bytes:
+    """Return a reply as a function changes it, which returns whether it has; as it is, if it cannot be read."""
     try:
         value = plain(reply)
     except ValueError:
         return reply
-    return codec_of(reply).encode(value) if _replace_ports(value, own) else reply
+    return codec_of(reply).encode(value) if change(value) else reply
 
 
-def _replace_ports(place: Any, own: OwnPorts) -> bool:
+def _replace_ports(own: OwnPorts, place: Any) -> bool:
     """Replace the ports in a value; return whether there are any."""
-    changed = False
     if isinstance(place, list):
-        for item in cast("list[Any]", place):
-            changed |= _replace_ports(item, own)
-    elif isinstance(place, dict):
+        found = [_replace_ports(own, item) for item in cast("list[Any]", place)]  # in all of them
+        return any(found)
+    changed = False
+    if isinstance(place, dict):
         fields = cast("dict[str, Any]", place)
         for name, item in list(fields.items()):
             if name in {"zmq_endpoint", "state_port", "step_port"}:
                 own(fields, name)
                 changed = True
             elif name not in {"vfs_assets", "arts", "per_articulation"}:
-                changed |= _replace_ports(item, own)
+                changed |= _replace_ports(own, item)
     return changed
 
 
@@ -341,7 +350,7 @@ def _replace_ports(place: Any, own: OwnPorts) -> bool:
 
 
 class SessionWriter:
-    """Writes what passes through a relay to a file, in a thread of its own.
+    """Writes what passes through a relay to a file.
 
     Args:
         path: The file.
@@ -352,61 +361,43 @@ class SessionWriter:
         need("mcap", extra="mcap")
         from mcap.writer import Writer
 
-        self.failure: URLabError | None = None
         self._images = images
         self._file = path.open("wb")
-        self._writer = Writer(self._file)
+        self._writer = Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="urlab-session", library="urlab_client")
         self._channels: dict[str, int] = {}
-        self._items: queue.SimpleQueue[tuple[str, bytes, int, int] | None] = queue.SimpleQueue()
         self._count = 0
-        self._thread = background_thread("urlab-tap", self._write, failed=self._fail)
-        self._thread.start()
 
     def exchange(self, passed: Passed) -> None:
         """Keep a request and its reply, under one number."""
         self._count += 1
         reply = passed.reply
         if not self._images and b"cameras" in reply:
-            reply = without_pixels(reply)
-        self._items.put((_REQUEST, passed.request, passed.at, self._count))
-        self._items.put((_REPLY, reply, passed.at + int(passed.seconds * 1e9), self._count))
+            reply = _edited(reply, _drop_pixels)
+        self._write(_REQUEST, passed.request, passed.at)
+        self._write(_REPLY, reply, passed.at + int(passed.seconds * 1e9))
 
     def message(self, source: str, topic: bytes, payload: bytes) -> None:
         """Keep a published message."""
         if source == "camera" and not self._images:
             payload = payload[:_HEADER] if payload.startswith(b"UCM1") else b""
-        self._items.put((f"{_PREFIX}{source}/{topic.decode(errors='replace')}", payload, time.time_ns(), self._count))
+        self._write(f"{_PREFIX}{source}/{topic.decode(errors='replace')}", payload, time.time_ns())
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
-        self._items.put(None)
-        self._thread.join()
-        self._file.close()
-        if self.failure is not None:
-            raise self.failure
+        """Complete the file, and close it."""
+        with self._file:
+            self._writer.finish()
 
-    def _fail(self, error: URLabError) -> None:
-        self.failure = error
-
-    def _write(self) -> None:
-        while (item := self._items.get()) is not None:
-            topic, data, at, number = item
-            if topic not in self._channels:
-                self._channels[topic] = self._writer.register_channel(topic, "", 0)
-            self._writer.add_message(self._channels[topic], at, data, at, number)
-        self._writer.finish()
+    def _write(self, topic: str, data: bytes, at: int) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "", 0)
+        self._writer.add_message(self._channels[topic], at, data, at, self._count)
 
 
-def without_pixels(reply: bytes) -> bytes:
-    """Return a reply without the pixels of its pictures."""
-    try:
-        value = plain(reply)
-    except ValueError:
-        return reply
-    for picture in _pictures(value):
+def _drop_pixels(reply: dict[str, Any]) -> bool:
+    for picture in _pictures(reply):
         picture["data"] = b""
-    return codec_of(reply).encode(value)
+    return True
 
 
 def _pictures(value: dict[str, Any]) -> list[dict[str, Any]]:
@@ -415,16 +406,7 @@ def _pictures(value: dict[str, Any]) -> list[dict[str, Any]]:
     return [picture for picture in found if isinstance(picture, dict) and "data" in picture]
 
 
-class Recorded(Struct):
-    """A recorded exchange, and the messages that were published between its reply and the next."""
-
-    op: str
-    request: bytes
-    reply: bytes
-    messages: list[tuple[str, bytes, bytes]] = []
-
-
-def read_session(path: Path) -> list[Recorded]:
+def read_session(path: Path) -> list[Passed]:
     """Read a recorded session.
 
     Raises:
@@ -434,11 +416,11 @@ def read_session(path: Path) -> list[Recorded]:
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
-    found: dict[int, Recorded] = {}
+    found: dict[int, Passed] = {}
     try:
         with path.open("rb") as file:
             for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
-                row = found.setdefault(message.sequence, Recorded("", b"", b""))
+                row = found.setdefault(message.sequence, Passed("", b"", b""))
                 if channel.topic == _REQUEST:
                     row.request, row.op = message.data, op_name(message.data)
                 elif channel.topic == _REPLY:
@@ -466,19 +448,17 @@ class Replay(Service):
         state_port: Port for the state stream; 0 for any.
 
     Attributes:
-        state_port: Port for the state stream.
         unknown: Requests that the recording has no reply to, by op.
     """
 
-    def __init__(self, session: list[Recorded], ports: Ports, *, port: int = 0, state_port: int = 0) -> None:
+    def __init__(self, session: list[Passed], ports: Ports, *, port: int = 0, state_port: int = 0) -> None:
         super().__init__(ports, port)
         self._thread = background_thread("urlab-replay", self._run, failed=self._fail)
         self.unknown: Counter[str] = Counter()
-        self.state_port: int
         self._state, self.state_port = ports.bind(zmq.PUB, state_port)
-        self._cameras: dict[str, tuple[Socket, int]] = {}
-        self._equal: dict[Any, deque[Recorded]] = defaultdict(deque)
-        self._of_op: dict[str, deque[Recorded]] = defaultdict(deque)
+        self._cameras: dict[str, int] = {}
+        self._equal: dict[Any, deque[Passed]] = defaultdict(deque)
+        self._of_op: dict[str, deque[Passed]] = defaultdict(deque)
         for row in session:
             self._equal[_key(row.request)].append(row)
             self._of_op[row.op].append(row)
@@ -498,29 +478,24 @@ class Replay(Service):
             if source == "state":
                 self._state.send_multipart([topic, payload])
 
-    def _next(self, request: bytes) -> Recorded | None:
+    def _next(self, request: bytes) -> Passed | None:
         for rows in (self._equal.get(_key(request)), self._of_op.get(op_name(request))):
             if rows:
                 return rows.popleft() if len(rows) > 1 else rows[0]
         return None
 
-    def _answer(self, row: Recorded) -> bytes:
+    def _answer(self, row: Passed) -> bytes:
         if row.op == "step" and b"cameras" in row.reply:
-            return _with_black_pixels(row.reply)
-        if row.op not in {"hello", "begin_pie", "set_camera_streaming"}:
+            return _edited(row.reply, _blacken_pixels)
+        if row.op not in _PORTS:
             return row.reply
-        return _without_regions(with_ports(row.reply, self._own_ports))
+        return _edited(_edited(row.reply, partial(_replace_ports, self.own_ports)), _drop_regions)
 
-    def _own_ports(self, place: dict[str, Any], name: str) -> None:
-        if name == "state_port":
-            place[name] = float(self.state_port)
-        elif name == "step_port":
-            place[name] = float(self.port)
-        else:
-            told = str(place[name])
-            if told not in self._cameras:
-                self._cameras[told] = self._ports.bind(zmq.PUB)
-            place[name] = self._ports.told(self._cameras[told][1])
+    def camera_port(self, told: str) -> int:
+        """See `Service.camera_port`; a replay publishes no pictures."""
+        if told not in self._cameras:
+            self._cameras[told] = self._ports.bind(zmq.PUB)[1]
+        return self._cameras[told]
 
 
 def _key(request: bytes) -> Any:
@@ -533,19 +508,17 @@ def _key(request: bytes) -> Any:
     return msgspec.json.encode(kept, order="deterministic")
 
 
-def _without_regions(reply: bytes) -> bytes:
-    """Return a handshake that names no shared memory, which a recording has not."""
-    value = plain(reply)
-    for place in (value, value.get("handshake_payload")):
+def _drop_regions(reply: dict[str, Any]) -> bool:
+    """Drop the shared memory that a handshake names, which a recording has not."""
+    for place in (reply, reply.get("handshake_payload")):
         if isinstance(place, dict):
             for name in ("shm_session_dir", "shm_rpc"):
                 cast("dict[str, Any]", place).pop(name, None)
-    return codec_of(reply).encode(value)
+    return True
 
 
-def _with_black_pixels(reply: bytes) -> bytes:
-    """Return a reply with black pixels in the place of those that were not kept."""
-    value = plain(reply)
-    for picture in _pictures(value):
+def _blacken_pixels(reply: dict[str, Any]) -> bool:
+    """Put black pixels in the place of those that were not kept."""
+    for picture in _pictures(reply):
         picture["data"] = picture["data"] or bytes(4 * int(picture["width"]) * int(picture["height"]))
-    return codec_of(reply).encode(value)
+    return True

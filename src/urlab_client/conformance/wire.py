@@ -19,6 +19,7 @@ from urlab_client.aio.launch import transport_to
 from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
+from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.conformance.declarations import expecting, holds
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import ControlRequest, Needs, Op
@@ -53,6 +54,7 @@ class Wire:
     """A connection whose requests are plain data.
 
     Attributes:
+        transport: Sends the requests.
         session_id: Of the last handshake.
         exchanges: The newest exchanges.
         count: Number of exchanges so far.
@@ -64,7 +66,7 @@ class Wire:
 
     def __init__(self, address: str, step_port: int, keys: ClientKeys | None, *, shm: bool, timeout: float) -> None:
         self.regions: ServerRegions | None = ServerRegions(None) if shm else None
-        self._transport = transport_to(address, step_port, keys, self.regions)
+        self.transport: ZmqTransport = transport_to(address, step_port, keys, self.regions)
         self._subscriptions = Subscriptions(keys)
         self._timeout = timeout
         self.session_id: str = ""
@@ -75,32 +77,17 @@ class Wire:
         self.refusals: dict[str, str] = {}
         self.times: dict[str, list[float]] = {}
 
-    @property
-    def endpoint(self) -> str:
-        """Address that the requests go to."""
-        return self._transport.endpoint
-
-    @property
-    def state_port(self) -> int | None:
-        """Port of the state stream, of a server that this process started."""
-        return self._transport.state_port
-
-    @property
-    def over_shm(self) -> int:
-        """Number of requests that went through shared memory."""
-        return self._transport.stats.over_shm
-
     async def aclose(self) -> None:
         """Close the connection."""
         self._subscriptions.close()
-        await self._transport.aclose()
+        await self.transport.aclose()
 
     async def frame(self, request: bytes, op: Op = _ANY, *, timeout: float | None = None) -> bytes:
         """Send bytes as they are, and return the reply as it is."""
         loop = asyncio.get_running_loop()
         limit = max(self._timeout, op.timeout or 0.0) if timeout is None else timeout
         started = time.perf_counter()
-        reply = await self._transport.request(
+        reply = await self.transport.request(
             request, op, deadline=loop.time() + limit, connect_by=loop.time() + self._timeout
         )
         took = time.perf_counter() - started
@@ -167,7 +154,7 @@ class Wire:
 
     async def follow(self, hello: HelloOk) -> None:
         """Adopt the regions of a handshake."""
-        await self._transport.follow(hello)
+        await self.transport.follow(hello)
 
     async def listen(self, endpoint: str, seconds: float, until: Callable[[list[Message]], bool]) -> list[Message]:
         """Return what a publisher sends, until that suffices or the time is over."""
