@@ -123,13 +123,13 @@ def test_stepping_never_waits_and_the_newest_state_is_shown(
     client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     going = threading.Event()
-    drain: Callable[[Any], None] = viewing.AsyncView._drain
+    drain: Callable[[Any], None] = viewing.Viewing._drain
 
     def slowly(self: Any) -> None:
         assert going.wait(30)
         drain(self)
 
-    monkeypatch.setattr(viewing.AsyncView, "_drain", slowly)
+    monkeypatch.setattr(viewing.Viewing, "_drain", slowly)
     path = tmp_path / "run.rrd"
     with rerun_view(client, save=path) as view:
         for _ in range(100):

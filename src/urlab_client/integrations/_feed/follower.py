@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import copy
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Generic, Literal, Protocol, Self, TypeVar
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeVar, cast, overload
 
 import numpy as np
 from msgspec import Struct
@@ -24,7 +25,9 @@ from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync._portal import Portal
+from urlab_client.sync.client import URLabClient as BlockingClient
 from urlab_client.values.names import did_you_mean
 
 log = logging.getLogger("urlab_client.feed")
@@ -32,6 +35,11 @@ log = logging.getLogger("urlab_client.feed")
 _NS = 1_000_000_000
 
 S = TypeVar("S", bound=Struct)
+P = ParamSpec("P")
+A = TypeVar("A", bound="AsyncBlock")
+B = TypeVar("B", bound="BlockingBlock")
+A_co = TypeVar("A_co", bound="AsyncBlock", covariant=True)
+B_co = TypeVar("B_co", bound="BlockingBlock", covariant=True)
 
 
 class Follower(ClientObserver):
@@ -293,46 +301,83 @@ class Follower(ClientObserver):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
 
 
-class Following(Protocol):
-    """Follows a client for the duration of an `async with` block."""
+class Block(ABC):
+    """Follows a client for the duration of a block, in one of two flavours."""
 
-    async def __aenter__(self) -> Any: ...
+    @abstractmethod
+    async def _begin(self) -> None:
+        """Begin, on the client's loop."""
+
+    @abstractmethod
+    async def _end(self, error: BaseException | None) -> None:
+        """End, on the client's loop; `error` is the exception that ends the block."""
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """End if the client's loop has already ended. Blocks."""
+
+
+class AsyncBlock(Block):
+    """The flavour for `async with`."""
+
+    async def __aenter__(self) -> Self:
+        await self._begin()
+        return self
 
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None: ...
-
-    def finish(self) -> None:
-        """End if the client's loop has already ended. Blocks."""
-        ...
+    ) -> None:
+        await self._end(exc)
 
 
-F = TypeVar("F", bound=Following)
+class BlockingBlock(Block):
+    """The flavour for `with`, which runs on the loop of the followed client."""
 
-
-class BlockingFlavour(Generic[F]):
-    """Runs its async counterpart for the duration of a `with` block, on the loop of the followed client."""
-
-    def __init__(self, aio: F, portal: Portal) -> None:
-        self._aio = aio
-        self._portal = portal
-
-    @property
-    def aio(self) -> F:
-        """The async counterpart."""
-        return self._aio
+    _portal: Portal
 
     def __enter__(self) -> Self:
-        self._portal.call(self._aio.__aenter__)
+        self._portal.call(self._begin)
         return self
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            self._portal.call(self._aio.__aexit__, exc_type, exc, traceback)
+            self._portal.call(self._end, exc)
         except ClientClosed:
-            self._aio.finish()
+            self._finish()
+
+
+class Flavoured(Protocol[P, A_co, B_co]):
+    """A function that returns a block of the client's flavour."""
+
+    @overload
+    def __call__(self, client: URLabClient, /, *args: P.args, **kwargs: P.kwargs) -> A_co: ...
+    @overload
+    def __call__(self, client: BlockingClient, /, *args: P.args, **kwargs: P.kwargs) -> B_co: ...
+
+
+def flavoured(
+    aio: type[A_co], blocking: type[B_co]
+) -> Callable[[Callable[Concatenate[Any, P], A_co | B_co]], Flavoured[P, A_co, B_co]]:
+    """Declare which flavour a function returns for which client."""
+    del aio, blocking
+    return lambda function: cast("Flavoured[P, A_co, B_co]", function)
+
+
+def in_flavour(
+    client: URLabClient | BlockingClient,
+    aio: Callable[Concatenate[URLabClient, P], A],
+    blocking: Callable[Concatenate[URLabClient, P], B],
+    *args: P.args,
+    **kwargs: P.kwargs,
+) -> A | B:
+    """Return a block of the client's flavour."""
+    if not isinstance(client, BlockingClient):
+        return aio(client, *args, **kwargs)
+    made = blocking(aio_of(client), *args, **kwargs)
+    made._portal = portal_of(client)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+    return made
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:

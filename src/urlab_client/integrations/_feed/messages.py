@@ -93,9 +93,9 @@ class EntityMessage(Struct, kw_only=True, omit_defaults=True):
     sample: Count
     step: Count
     episode: Count
-    position: list[float]
-    orientation: list[float]
-    qvel: list[float] = []
+    position: Annotated[list[float], Meta(min_length=3, max_length=3)]
+    orientation: Annotated[list[float], Meta(min_length=4, max_length=4)]
+    qvel: Annotated[list[float], Meta(max_length=6)] = []
 
 
 class JointState(Struct, frozen=True):

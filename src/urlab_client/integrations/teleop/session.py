@@ -101,7 +101,7 @@ async def teleoperate(
     *,
     hand: HandControl | None = None,
     task: Task | None = None,
-    recorder: AsyncRecorder | None = None,
+    recorder: AsyncRecorder | Recorder | None = None,
     episodes: int | None = None,
     seconds: float | None = None,
     hz: float = 50.0,
@@ -161,7 +161,7 @@ def teleoperate_blocking(
         operator,
         hand=hand,
         task=task,
-        recorder=None if recorder is None else recorder.aio,
+        recorder=recorder,
         episodes=episodes,
         seconds=seconds,
         hz=hz,
@@ -180,7 +180,7 @@ class _Session:
         *,
         hand: HandControl | None,
         task: Task | None,
-        recorder: AsyncRecorder | None,
+        recorder: AsyncRecorder | Recorder | None,
         hz: float,
         seed: int,
         paced: bool,
@@ -266,7 +266,9 @@ class _Session:
         self._episode += 1
         self._tally = self._tally.replace(**{verdict: getattr(self._tally, verdict) + 1})
         if self._recorder is not None:
-            await self._recorder.mark(verdict, goal=self._goal_and_success()[0])
+            marking = self._recorder.mark(verdict, goal=self._goal_and_success()[0])
+            if inspect.isawaitable(marking):
+                await marking
 
     async def _reset(self) -> None:
         if self._starts is None:

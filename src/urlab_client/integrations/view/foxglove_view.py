@@ -6,7 +6,7 @@ import functools
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from msgspec import Struct
@@ -14,6 +14,7 @@ from msgspec import Struct
 from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
+from urlab_client.integrations._feed.follower import flavoured, in_flavour
 from urlab_client.integrations._feed.geometry import Shape, scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
     ContactsMessage,
@@ -26,7 +27,7 @@ from urlab_client.integrations._feed.messages import (
 )
 from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
@@ -210,30 +211,7 @@ def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quate
     return fox.Quaternion(x=0.0, y=-z / scale, z=y / scale, w=scale / 2)
 
 
-@overload
-def foxglove_view(
-    client: AsyncClient,
-    *,
-    host: str = ...,
-    port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> AsyncView: ...
-@overload
-def foxglove_view(
-    client: URLabClient,
-    *,
-    host: str = ...,
-    port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> View: ...
+@flavoured(AsyncView, View)
 def foxglove_view(
     client: AsyncClient | URLabClient,
     *,
@@ -273,5 +251,14 @@ def foxglove_view(
     and `KeyError` for an unknown camera.
     """
     need("foxglove", "PIL", extra="foxglove")
-    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
-    return make_view(client, _Foxglove(host=host, port=port, sensors=sensors), options, "foxglove_view")
+    return in_flavour(
+        client,
+        AsyncView,
+        View,
+        _Foxglove(host=host, port=port, sensors=sensors),
+        "foxglove_view",
+        cameras=cameras,
+        camera_hz=camera_hz,
+        max_hz=max_hz,
+        contacts=contacts,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
+from urlab_client.integrations._feed.follower import flavoured, in_flavour
 from urlab_client.integrations._feed.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
@@ -200,36 +201,7 @@ def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
             return mesh, rr.Mesh3D
 
 
-@overload
-def rerun_view(
-    client: AsyncClient,
-    *,
-    save: str | os.PathLike[str] | None = ...,
-    connect: str | None = ...,
-    web: bool = ...,
-    web_port: int = ...,
-    grpc_port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> AsyncView: ...
-@overload
-def rerun_view(
-    client: URLabClient,
-    *,
-    save: str | os.PathLike[str] | None = ...,
-    connect: str | None = ...,
-    web: bool = ...,
-    web_port: int = ...,
-    grpc_port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> View: ...
+@flavoured(AsyncView, View)
 def rerun_view(
     client: AsyncClient | URLabClient,
     *,
@@ -277,7 +249,16 @@ def rerun_view(
     need("rerun", "PIL", extra="rerun")
     if (save is not None) + (connect is not None) + web > 1:
         raise ValueError("give one of save, connect and web")
-    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     path = None if save is None else Path(save)
     backend = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return make_view(client, backend, options, "rerun_view")
+    return in_flavour(
+        client,
+        AsyncView,
+        View,
+        backend,
+        "rerun_view",
+        cameras=cameras,
+        camera_hz=camera_hz,
+        max_hz=max_hz,
+        contacts=contacts,
+    )
