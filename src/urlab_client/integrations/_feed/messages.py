@@ -198,6 +198,17 @@ class CylinderPrimitive(Struct, frozen=True):
     color: Color
 
 
+class ArrowPrimitive(Struct, frozen=True):
+    """An arrow along x of its pose: lengths and diameters, metres."""
+
+    pose: Pose
+    shaft_length: float
+    shaft_diameter: float
+    head_length: float
+    head_diameter: float
+    color: Color
+
+
 class TriangleListPrimitive(Struct, frozen=True):
     """A mesh: each three indices of points are a triangle."""
 
@@ -219,6 +230,7 @@ class SceneEntity(Struct, frozen=True):
     spheres: list[SolidPrimitive]
     cylinders: list[CylinderPrimitive]
     triangles: list[TriangleListPrimitive]
+    arrows: list[ArrowPrimitive] = []
 
 
 class SceneEntityDeletion(Struct, frozen=True):
