@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import copy
 import logging
-from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeVar, cast, overload
+from typing import Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -25,21 +23,12 @@ from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.sync._facade import aio_of, portal_of
-from urlab_client.sync._portal import Portal
-from urlab_client.sync.client import URLabClient as BlockingClient
-from urlab_client.values.names import did_you_mean
 
 log = logging.getLogger("urlab_client.feed")
 
 _NS = 1_000_000_000
 
 S = TypeVar("S", bound=Struct)
-P = ParamSpec("P")
-A = TypeVar("A", bound="AsyncBlock")
-B = TypeVar("B", bound="BlockingBlock")
-A_co = TypeVar("A_co", bound="AsyncBlock", covariant=True)
-B_co = TypeVar("B_co", bound="BlockingBlock", covariant=True)
 
 
 class Follower(ClientObserver):
@@ -94,9 +83,6 @@ class Follower(ClientObserver):
                 f"{self._name}: poses are computed with the local model, which this client does not have.",
                 hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
             )
-        unknown = self._unknown_cameras()
-        if unknown:
-            raise KeyError(unknown)
         return self._current()
 
     @property
@@ -176,18 +162,11 @@ class Follower(ClientObserver):
         """Return the scene, described again after another handshake."""
         described = self._client.articulations  # a new map with each handshake
         if self._scene is None or described is not self._described:
-            if self._scene is not None and (unknown := self._unknown_cameras()):
-                log.warning("%s: the new scene has %s", self._name, unknown)
-            self._described = described
             self._scene = FollowedScene.of(self._client, self._views())
+            self._described = described
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
-
-    def _every_camera(self) -> dict[str, URLabCameraView]:
-        arts = self._client.articulations
-        own = {f"{key}/{name}": view for key, art in arts.items() for name, view in art.cameras.items()}
-        return own | dict(self._client.global_cameras)
 
     def _camera(self, name: str) -> URLabCameraView | None:
         try:
@@ -195,22 +174,21 @@ class Follower(ClientObserver):
         except KeyError:
             return None
 
-    def _unknown_cameras(self) -> str:
-        """Return which requested cameras are missing; empty if none."""
-        wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
-        missing = [name for name in wanted if self._camera(name) is None]
-        there = ", ".join(self._every_camera()) or "none"
-        if not missing:
-            return ""
-        suggested = did_you_mean(missing[0], self._every_camera()).strip()
-        return f"no camera {', '.join(map(repr, missing))}; {f'{suggested} ' if suggested else ''}there are: {there}"
-
     def _views(self) -> list[tuple[str, URLabCameraView]]:
-        every = self._every_camera()
+        """Return the requested cameras; raises `KeyError` for an unknown one, unless an earlier scene had it."""
+        client, wanted = self._client, set[int]()
+        own = {f"{key}/{name}": view for key, art in client.articulations.items() for name, view in art.cameras.items()}
+        every = [*own.items(), *client.global_cameras.items()]
         if self._wanted_cameras == "all":
-            return list(every.items())
-        wanted = {id(self._camera(name)) for name in self._wanted_cameras}
-        return [(name, view) for name, view in every.items() if id(view) in wanted]
+            return every
+        for name in self._wanted_cameras:
+            try:
+                wanted.add(id(client.camera(name)))
+            except KeyError as error:
+                if self._scene is None:
+                    raise
+                log.warning("%s: the new scene lacks a camera: %s", self._name, error)
+        return [(name, view) for name, view in every if id(view) in wanted]
 
     def _pass_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
@@ -299,85 +277,6 @@ class Follower(ClientObserver):
                 nanoseconds = round((self._client.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
-
-
-class Block(ABC):
-    """Follows a client for the duration of a block, in one of two flavours."""
-
-    @abstractmethod
-    async def _begin(self) -> None:
-        """Begin, on the client's loop."""
-
-    @abstractmethod
-    async def _end(self, error: BaseException | None) -> None:
-        """End, on the client's loop; `error` is the exception that ends the block."""
-
-    @abstractmethod
-    def _finish(self) -> None:
-        """End if the client's loop has already ended. Blocks."""
-
-
-class AsyncBlock(Block):
-    """The flavour for `async with`."""
-
-    async def __aenter__(self) -> Self:
-        await self._begin()
-        return self
-
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        await self._end(exc)
-
-
-class BlockingBlock(Block):
-    """The flavour for `with`, which runs on the loop of the followed client."""
-
-    _portal: Portal
-
-    def __enter__(self) -> Self:
-        self._portal.call(self._begin)
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            self._portal.call(self._end, exc)
-        except ClientClosed:
-            self._finish()
-
-
-class Flavoured(Protocol[P, A_co, B_co]):
-    """A function that returns a block of the client's flavour."""
-
-    @overload
-    def __call__(self, client: URLabClient, /, *args: P.args, **kwargs: P.kwargs) -> A_co: ...
-    @overload
-    def __call__(self, client: BlockingClient, /, *args: P.args, **kwargs: P.kwargs) -> B_co: ...
-
-
-def flavoured(
-    aio: type[A_co], blocking: type[B_co]
-) -> Callable[[Callable[Concatenate[Any, P], A_co | B_co]], Flavoured[P, A_co, B_co]]:
-    """Declare which flavour a function returns for which client."""
-    del aio, blocking
-    return lambda function: cast("Flavoured[P, A_co, B_co]", function)
-
-
-def in_flavour(
-    client: URLabClient | BlockingClient,
-    aio: Callable[Concatenate[URLabClient, P], A],
-    blocking: Callable[Concatenate[URLabClient, P], B],
-    *args: P.args,
-    **kwargs: P.kwargs,
-) -> A | B:
-    """Return a block of the client's flavour."""
-    if not isinstance(client, BlockingClient):
-        return aio(client, *args, **kwargs)
-    made = blocking(aio_of(client), *args, **kwargs)
-    made._portal = portal_of(client)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-    return made
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:

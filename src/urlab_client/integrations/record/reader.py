@@ -80,6 +80,9 @@ _DECODERS: Final = {
 class Run:
     """A recording on disk. Opening it reads only its index. Several threads may read.
 
+    Every method raises `OSError` if the file cannot be read, and `RecordingError` if it is no recording any more. Those
+    for a single state or picture also raise `RecordingError` if the file is damaged there.
+
     Attributes:
         path: The file.
         damage: Why the last read ended early; empty if it did not.
@@ -97,9 +100,6 @@ class Run:
         Args:
             progress: Called occasionally with the number of bytes read so far.
             verify: Read everything and compare checksums, to detect damage in the middle of a finished file.
-
-        Raises:
-            RecordingError: The file is not a recording.
         """
         index = self._index(progress)
         if verify:
@@ -138,7 +138,7 @@ class Run:
             fields: Fields to return, such as `qpos`; None returns all.
 
         Raises:
-            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
+            RecordingError: The file contains two scenes, which do not fit into one table.
         """
         return self._read_states(self._builder(None, fields), progress)
 
@@ -155,26 +155,18 @@ class Run:
 
         Raises:
             OSError: The temporary file cannot be written.
-            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
+            RecordingError: The file contains two scenes, which do not fit into one table.
         """
         with contextlib.closing(self._builder(folder, fields)) as builder:
             yield self._read_states(builder, progress)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
-        """Return the marked outcomes of episodes; if an episode has several marks, the last one.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
+        """Return the marked outcomes of episodes; if an episode has several marks, the last one."""
         outcomes = self._contents(self._index(), OutcomeMessage)
         return tuple({outcome.episode: outcome for outcome in outcomes}.values())
 
     def time_range(self) -> tuple[float, float]:
-        """Return the times of the first and the last state, seconds on the recording's clock; 0, 0 without states.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
+        """Return the times of the first and the last state, seconds on the recording's clock; 0, 0 without states."""
         index = self._index()
         channels = index.channels_of(_STATES, _ENTITIES)
         ends = [end for channel in channels for end in (index.first(channel.id), index.newest(channel.id))]
@@ -188,7 +180,6 @@ class Run:
             time: Time on the recording's clock, seconds.
 
         Raises:
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         index = self._index()
@@ -221,11 +212,7 @@ class Run:
         return found
 
     def positions(self) -> dict[str, list[str]]:
-        """Return the names of the values of `qpos` by articulation, from its first state.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
+        """Return the names of the values of `qpos` by articulation, from its first state."""
         index = self._index()
         found: dict[str, list[str]] = {}
         for channel in index.channels_of(_STATES):
@@ -278,7 +265,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
         times = array("q", (one.log_time for one in self._messages(self._index(progress), channels, progress)))
@@ -289,7 +275,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
@@ -299,7 +284,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
         index = self._index(progress)
@@ -315,7 +299,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         channels, index = self._camera(camera), self._index()
@@ -330,7 +313,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         channels, index = self._camera(camera), self._index()

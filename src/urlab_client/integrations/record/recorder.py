@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 from urlab_client.aio.arguments import finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import AsyncBlock, Block, BlockingBlock, Follower, flavoured, in_flavour
+from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.randomise.variation import declared_in

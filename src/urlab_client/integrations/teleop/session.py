@@ -14,10 +14,9 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import EpisodeOutcome
+from urlab_client.integrations._flavours import blocking
 from urlab_client.integrations.teleop.hand import HandControl
 from urlab_client.protocol.base import Floats
-from urlab_client.sync._facade import aio_of, portal_of
-from urlab_client.sync.client import URLabClient
 from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
@@ -141,33 +140,8 @@ async def teleoperate(
     return await session.run(episodes, seconds)
 
 
-def teleoperate_blocking(
-    client: URLabClient,
-    operator: Operator,
-    *,
-    hand: HandControl | None = None,
-    task: Task | None = None,
-    recorder: Recorder | None = None,
-    episodes: int | None = None,
-    seconds: float | None = None,
-    hz: float = 50.0,
-    seed: int = 0,
-    paced: bool = False,
-) -> TeleopTally:
-    """Teleoperate like `teleoperate`, with a blocking client and its recorder."""
-    return portal_of(client).call(
-        teleoperate,
-        aio_of(client),
-        operator,
-        hand=hand,
-        task=task,
-        recorder=recorder,
-        episodes=episodes,
-        seconds=seconds,
-        hz=hz,
-        seed=seed,
-        paced=paced,
-    )
+teleoperate_blocking = blocking(teleoperate)
+"""Teleoperate like `teleoperate`, with a blocking client and its recorder."""
 
 
 class _Session:

@@ -12,7 +12,6 @@ import numpy as np
 from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import flavoured, in_flavour
 from urlab_client.integrations._feed.geometry import Shape, scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
     ArrowPrimitive,
@@ -37,6 +36,7 @@ from urlab_client.integrations._feed.samples import (
     state_messages,
 )
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation
+from urlab_client.integrations._flavours import flavoured, in_flavour
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.client import URLabClient

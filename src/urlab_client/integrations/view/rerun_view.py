@@ -13,11 +13,11 @@ from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import flavoured, in_flavour
 from urlab_client.integrations._feed.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration
+from urlab_client.integrations._flavours import flavoured, in_flavour
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
 from urlab_client.sync.client import URLabClient
 

@@ -21,9 +21,10 @@ from msgspec import Struct
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import AsyncBlock, Block, BlockingBlock, Follower, flavoured, in_flavour
+from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
