@@ -75,7 +75,6 @@ class Follower(ClientObserver):
         self._live = False
 
     def check(self) -> FollowedScene:
-        """Describe the scene."""
         if not self._client.urlab_version:
             raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:
@@ -122,13 +121,11 @@ class Follower(ClientObserver):
         self._put = None
 
     async def ended(self) -> None:
-        """Wait until its tasks have ended."""
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # Called by the client
 
     def on_state(self, state: StateReply | StateSnapshot) -> None:
-        """See the base class."""
         live = self._client.step_mode is StepMode.LIVE
         if live is not self._live:
             if live:
@@ -152,7 +149,6 @@ class Follower(ClientObserver):
         return {camera.name: "sync" for camera in self._current().cameras.values()}
 
     async def ready(self) -> None:
-        """Wait until there is space; see the base class."""
         if self._put is not None and self._room is not None:
             await self._room()
 

@@ -28,7 +28,6 @@ class Time(Struct, frozen=True):
 
     @classmethod
     def of(cls, nanoseconds: int) -> Time:
-        """Split nanoseconds."""
         return cls(*divmod(nanoseconds, 1_000_000_000))
 
 
@@ -321,7 +320,6 @@ _URLAB: dict[type[Struct], str] = {
 
 
 def schema_name(kind: type[Struct]) -> str:
-    """Return the name of a message's schema."""
     return f"foxglove.{kind.__name__}" if kind in _FOXGLOVE else _URLAB[kind]
 
 

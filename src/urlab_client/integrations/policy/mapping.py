@@ -369,7 +369,6 @@ def _picture(term: PictureTerm) -> NDArray[Any]:
 
 
 def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
-    """Return the actuator that drives a joint."""
     found = [actuator for actuator in robot.actuators.values() if actuator.joint == joint.name]
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
         raise PolicyMismatch(

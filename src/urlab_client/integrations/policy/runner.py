@@ -222,7 +222,6 @@ class _PolicyLoop:
         self._travelled = (0.0, 0.0)
 
     async def until(self, seconds: float, seed: int | None, *, until_fall: bool) -> PolicyRun:
-        """Run for some simulated seconds, or until the first fall."""
         loop = asyncio.get_running_loop()
         client, result, period = self._client, self._result, self._policy.spec.period
         await self._restart(seed)
@@ -246,7 +245,6 @@ class _PolicyLoop:
         return result
 
     async def _restart(self, seed: int | None = None) -> None:
-        """Reset the simulation and the policy."""
         self._travelled = (self._result.distance, self._result.forward)
         await self._client.reset(self._policy.spec.keyframe, seed)
         if self._cameras:

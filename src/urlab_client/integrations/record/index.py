@@ -497,7 +497,6 @@ def _by_time(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Return the records of a chunk."""
     packed, size = chunk.data, chunk.uncompressed_size
     if size > min(max(_CHUNK_BYTES, _CHUNK_RATIO * len(packed)), _LARGEST_CHUNK):
         raise ValueError(f"a chunk of {len(packed)} bytes declares that it unpacks to {size}")

@@ -371,6 +371,5 @@ class LeRobot:
 
 
 def _last_line(text: str) -> str:
-    """Return the last line of the output of a program."""
     lines = text.strip().splitlines()
     return lines[-1] if lines else "it printed nothing"

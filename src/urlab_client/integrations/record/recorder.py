@@ -124,7 +124,7 @@ class Recording(Block):
             )
         if stats.dropped_states or stats.dropped_frames:
             lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
-            warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
+            warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=3)
 
     def _finish(self) -> None:
         self._follower.forget()

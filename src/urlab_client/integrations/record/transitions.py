@@ -107,5 +107,4 @@ def transitions(table: Table) -> Table:
 
 
 def _acting(table: Table) -> list[str]:
-    """Return the articulations with set-points."""
     return [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]

@@ -261,7 +261,6 @@ class _McapFile:
         self._raw = io.FileIO(path, mode)
 
     def write(self, data: bytes) -> int:
-        """Write all of it."""
         rest = memoryview(data)
         while rest:
             count = self._raw.write(rest) or 0
@@ -270,7 +269,6 @@ class _McapFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return the position, which is the end."""
         return self.written
 
     def flush(self) -> None:
@@ -309,7 +307,6 @@ class _Sink:
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **about})
 
     def write(self, item: State | CameraPicture | EpisodeMark) -> None:
-        """Write one item."""
         match item:
             case State():
                 self._write_state(item)
@@ -329,7 +326,6 @@ class _Sink:
             self._dirty_since = None
 
     def finish(self, dropped_states: int, dropped_frames: int) -> None:
-        """Write the rest, the index and the summary."""
         self._report(dropped_states, dropped_frames)
         totals = {
             "states": self.states,
