@@ -77,7 +77,8 @@ class _Rerun(ViewBackend):
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for shape in shapes_of(simulation.model, simulation.bodies):
             where = f"{_body(shape.body)}/{rr.escape_entity_path_part(shape.name)}"
-            drawn, self._static[where] = _drawn(shape)
+            drawn = _drawn(shape)
+            self._static[where] = type(drawn)
             w, x, y, z = shape.orientation
             pose = rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
             recording.log(where, pose, drawn, static=True)
@@ -177,7 +178,7 @@ def _transform(frame: FrameTransform) -> rerun.Transform3D:
     )
 
 
-def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
+def _drawn(shape: Shape) -> rerun.AsComponents:
     import rerun as rr
 
     solid = rr.components.FillMode.Solid
@@ -185,20 +186,18 @@ def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
     rgba = [shape.rgba]
     match shape.kind:
         case Kind.BOX:
-            return rr.Boxes3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid), rr.Boxes3D
+            return rr.Boxes3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid)
         case Kind.ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid), rr.Ellipsoids3D
+            return rr.Ellipsoids3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid)
         case Kind.CYLINDER:
-            return rr.Cylinders3D(lengths=[2 * y], radii=[x], colors=rgba, fill_mode=solid), rr.Cylinders3D
+            return rr.Cylinders3D(lengths=[2 * y], radii=[x], colors=rgba, fill_mode=solid)
         case Kind.CAPSULE:
             # Rerun's origin is the lower end, MuJoCo's the centre.
             middle = [(0.0, 0.0, -y)]
-            capsule = rr.Capsules3D(lengths=[2 * y], radii=[x], translations=middle, colors=rgba, fill_mode=solid)
-            return capsule, rr.Capsules3D
+            return rr.Capsules3D(lengths=[2 * y], radii=[x], translations=middle, colors=rgba, fill_mode=solid)
         case Kind.MESH:
             vertices = np.zeros((0, 3)) if shape.vertices is None else shape.vertices
-            mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=shape.triangles, albedo_factor=shape.rgba)
-            return mesh, rr.Mesh3D
+            return rr.Mesh3D(vertex_positions=vertices, triangle_indices=shape.triangles, albedo_factor=shape.rgba)
 
 
 @flavoured(AsyncView, View)
