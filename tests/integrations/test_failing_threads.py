@@ -19,7 +19,7 @@ from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.gym import vector
 from urlab_client.integrations.record import RecordingError, read_run, record
 from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.view.view import AsyncView, ViewOptions
+from urlab_client.integrations.view.view import AsyncView
 from urlab_client.server import SimulatedServer
 from urlab_client.simulation.opengl import RenderingUnavailable
 from urlab_client.simulation.painting import Painter, Visible
@@ -76,6 +76,9 @@ async def test_the_tasks_that_feed_a_recording(
     assert read_run(tmp_path / "run.mcap").damage == "", "what it holds is whole"
 
 
+OPTIONS: dict[str, Any] = {"cameras": (), "camera_hz": 10.0, "max_hz": 100.0, "contacts": False}
+
+
 class Display:
     """A display that fails with its first state."""
 
@@ -96,8 +99,7 @@ class Display:
 
 async def test_the_thread_that_shows(client: URLabClient, caplog: pytest.LogCaptureFixture) -> None:
     display = Display()
-    options = ViewOptions(cameras=(), camera_hz=10.0, max_hz=100.0, contacts=False)
-    async with AsyncView(client, display, options, "view") as view:
+    async with AsyncView(client, display, "view", **OPTIONS) as view:
         await until(lambda: view.closed)
         assert isinstance(view.error, URLabError)
         assert isinstance(view.error.__cause__, SystemExit)
@@ -112,9 +114,8 @@ async def test_the_tasks_that_feed_a_view(client: URLabClient, monkeypatch: pyte
         show = show_picture = use
 
     monkeypatch.setattr(Follower, "_follow_states", fail)
-    options = ViewOptions(cameras=(), camera_hz=10.0, max_hz=100.0, contacts=False)
     display = Fine()
-    async with AsyncView(client, display, options, "view") as view:
+    async with AsyncView(client, display, "view", **OPTIONS) as view:
         await until(lambda: view.closed)
         assert isinstance(view.error, URLabError)
         assert isinstance(view.error.__cause__, MemoryError)

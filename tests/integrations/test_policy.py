@@ -357,7 +357,7 @@ def test_a_goal_and_the_way_to_it_are_observed_and_what_is_left_is_told(arm: URL
     for bad in ([0.4, 0.2], [0.4, 0.2, 3.0], [0.4, 0.2, float("nan")]):
         with pytest.raises(ValueError, match=r"a goal must be from \[0.0, -1.0, 0.0\] to \[1.0, 1.0, 1.0\]"):
             policy.goal = bad
-    with pytest.raises(ValueError, match=r"it\.toml has no goal"):
+    with pytest.raises(ValueError, match=r"it\.toml takes no goal"):
         policy_of(REACH).goal = [0.0]
 
 

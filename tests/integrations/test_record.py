@@ -35,11 +35,12 @@ from urlab_client.integrations._feed.messages import (
     RawImage,
     Time,
     encode,
+    schema_name,
     schema_of,
 )
 from urlab_client.integrations.record import RecordingError, Run, read_run, record
 from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.record.reader import _state
+from urlab_client.integrations.record.reader import _DECODERS
 from urlab_client.server import Faults, Refuse, SimulatedServer
 
 # Fields of Foxglove's schemas of these names.
@@ -459,7 +460,7 @@ def test_messages_out_of_order_are_found_without_an_index(tmp_path: Path) -> Non
     source, shuffled = tmp_path / "run.mcap", tmp_path / "shuffled.mcap"
     write_recording(source, (({"arm": Robot([float(number)])}, {}) for number in range(6)))
     content = messages_of(source)
-    unindexed = {"use_chunking": False, "index_types": IndexType.NONE}
+    unindexed = {"index_types": IndexType.NONE}
     write_messages(shuffled, [content[number] for number in (3, 1, 0, 5, 2, 4)], **unindexed)
     for time in np.arange(-0.005, 0.06, 0.005).tolist():
         expected, found = read_run(source).state_at(time), read_run(shuffled).state_at(time)
@@ -688,8 +689,8 @@ def test_numbers_survive_to_the_bit(numbers: list[float], time: float) -> None:
         qvel=[],
         sensors={"null": numbers},
     )
-    read = _state(encode(message))
-    for back in ([float(v) for v in read.qpos], [float(v) for v in read.sensors["null"]]):
+    read = _DECODERS[schema_name(ArticulationMessage)](encode(message))
+    for back in (read.qpos, read.sensors["null"]):
         assert len(back) == len(numbers)
         for got, expected in zip(back, numbers, strict=True):
             assert bits(got) == bits(expected) or (math.isnan(got) and math.isnan(expected))

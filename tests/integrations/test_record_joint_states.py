@@ -43,7 +43,7 @@ def test_it_is_a_table_of_joints_over_time(saved: Path) -> None:
     assert len(table) == len(frames)
     assert summary.complete
     assert summary.episodes == 2
-    assert summary.topics["/joints"].messages == len(frames)
+    assert summary.topics["/state/joints"].messages == len(frames)
     assert table.time[0] == 0
     assert (np.diff(table.time) >= 0).all(), "the recording's clock goes on where a reset sets the other back"
     (base,) = (name for name, state in frames[0]["jointStates"].items() if len(state["qPos"]) == 7)
@@ -55,7 +55,7 @@ def test_it_is_a_table_of_joints_over_time(saved: Path) -> None:
 
 def test_the_commands_read_it(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(saved)]) == 0
-    assert "/joints" in capsys.readouterr().out
+    assert "/state/joints" in capsys.readouterr().out
     assert main(["plot", str(saved), "--joints", "*hip*", "-o", str(tmp_path / "hips.png")]) == 0
     assert (tmp_path / "hips.png").read_bytes().startswith(b"\x89PNG")
     assert main(["convert", str(saved), str(tmp_path / "falls.csv")]) == 0

@@ -494,7 +494,7 @@ def test_a_recording_of_wrong_contents_costs_its_reader_an_explanation(http: Tes
     poses = [({"arm": Robot([angle, *[0.0] * 7])}, {}) for angle in (0.0, 0.1, 0.2)]
     write_recording(tmp_path / "good.mcap", poses)
     good = messages_of(tmp_path / "good.mcap")
-    _, middle, last = (one._replace(data=one.data.replace(b'"sample":', b'"sample":"1","x":')) for one in good)
+    _, middle, last = (one._replace(data=one.data.replace(b'"sample":', b'"sample":"one","x":')) for one in good)
     bomb = good[2]._replace(data=b" " * (150 << 20) + good[2].data)
 
     def put(content: list[Message]) -> Any:

@@ -6,6 +6,7 @@ follow its semantic conventions for RPC.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
@@ -54,17 +55,12 @@ class OpenTelemetryObserver:
         self._trace = trace
         self._tracer = trace.get_tracer(_SCOPE, tracer_provider=tracer_provider)
         meter = metrics.get_meter(_SCOPE, meter_provider=meter_provider)
-        self._duration = meter.create_histogram(
-            "rpc.client.call.duration",
-            "s",
-            "Duration of requests, with the wait for other requests.",
-            explicit_bucket_boundaries_advisory=_DURATIONS_S,
+        waits = partial(meter.create_histogram, unit="s", explicit_bucket_boundaries_advisory=_DURATIONS_S)
+        self._duration = waits(
+            "rpc.client.call.duration", description="Duration of requests, with the wait for other requests."
         )
-        self._queued = meter.create_histogram(
-            "urlab.client.queue.duration",
-            "s",
-            "Wait of requests for other requests of the same client.",
-            explicit_bucket_boundaries_advisory=_DURATIONS_S,
+        self._queued = waits(
+            "urlab.client.queue.duration", description="Wait of requests for other requests of the same client."
         )
         self._sent = meter.create_histogram("urlab.client.request.size", "By", "Size of requests.")
         self._received = meter.create_histogram("urlab.client.response.size", "By", "Size of replies.")

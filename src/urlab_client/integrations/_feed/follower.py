@@ -7,8 +7,7 @@ import copy
 import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Any, Generic, Literal, Protocol, Self, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -24,8 +23,6 @@ from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.sync._portal import Portal
-from urlab_client.values.names import did_you_mean
 
 log = logging.getLogger("urlab_client.feed")
 
@@ -78,7 +75,6 @@ class Follower(ClientObserver):
         self._live = False
 
     def check(self) -> FollowedScene:
-        """Describe the scene."""
         if not self._client.urlab_version:
             raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
         if self._needs_model is not None and self._client.model is None:
@@ -86,9 +82,6 @@ class Follower(ClientObserver):
                 f"{self._name}: poses are computed with the local model, which this client does not have.",
                 hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
             )
-        unknown = self._unknown_cameras()
-        if unknown:
-            raise KeyError(unknown)
         return self._current()
 
     @property
@@ -128,13 +121,11 @@ class Follower(ClientObserver):
         self._put = None
 
     async def ended(self) -> None:
-        """Wait until its tasks have ended."""
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # Called by the client
 
     def on_state(self, state: StateReply | StateSnapshot) -> None:
-        """See the base class."""
         live = self._client.step_mode is StepMode.LIVE
         if live is not self._live:
             if live:
@@ -158,7 +149,6 @@ class Follower(ClientObserver):
         return {camera.name: "sync" for camera in self._current().cameras.values()}
 
     async def ready(self) -> None:
-        """Wait until there is space; see the base class."""
         if self._put is not None and self._room is not None:
             await self._room()
 
@@ -168,18 +158,11 @@ class Follower(ClientObserver):
         """Return the scene, described again after another handshake."""
         described = self._client.articulations  # a new map with each handshake
         if self._scene is None or described is not self._described:
-            if self._scene is not None and (unknown := self._unknown_cameras()):
-                log.warning("%s: the new scene has %s", self._name, unknown)
-            self._described = described
             self._scene = FollowedScene.of(self._client, self._views())
+            self._described = described
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
-
-    def _every_camera(self) -> dict[str, URLabCameraView]:
-        arts = self._client.articulations
-        own = {f"{key}/{name}": view for key, art in arts.items() for name, view in art.cameras.items()}
-        return own | dict(self._client.global_cameras)
 
     def _camera(self, name: str) -> URLabCameraView | None:
         try:
@@ -187,22 +170,21 @@ class Follower(ClientObserver):
         except KeyError:
             return None
 
-    def _unknown_cameras(self) -> str:
-        """Return which requested cameras are missing; empty if none."""
-        wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
-        missing = [name for name in wanted if self._camera(name) is None]
-        there = ", ".join(self._every_camera()) or "none"
-        if not missing:
-            return ""
-        suggested = did_you_mean(missing[0], self._every_camera()).strip()
-        return f"no camera {', '.join(map(repr, missing))}; {f'{suggested} ' if suggested else ''}there are: {there}"
-
     def _views(self) -> list[tuple[str, URLabCameraView]]:
-        every = self._every_camera()
+        """Return the requested cameras; raises `KeyError` for an unknown one, unless an earlier scene had it."""
+        client, wanted = self._client, set[int]()
+        own = {f"{key}/{name}": view for key, art in client.articulations.items() for name, view in art.cameras.items()}
+        every = [*own.items(), *client.global_cameras.items()]
         if self._wanted_cameras == "all":
-            return list(every.items())
-        wanted = {id(self._camera(name)) for name in self._wanted_cameras}
-        return [(name, view) for name, view in every.items() if id(view) in wanted]
+            return every
+        for name in self._wanted_cameras:
+            try:
+                wanted.add(id(client.camera(name)))
+            except KeyError as error:
+                if self._scene is None:
+                    raise
+                log.warning("%s: the new scene lacks a camera: %s", self._name, error)
+        return [(name, view) for name, view in every if id(view) in wanted]
 
     def _pass_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
@@ -291,48 +273,6 @@ class Follower(ClientObserver):
                 nanoseconds = round((self._client.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
-
-
-class Following(Protocol):
-    """Follows a client for the duration of an `async with` block."""
-
-    async def __aenter__(self) -> Any: ...
-
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None: ...
-
-    def finish(self) -> None:
-        """End if the client's loop has already ended. Blocks."""
-        ...
-
-
-F = TypeVar("F", bound=Following)
-
-
-class BlockingFlavour(Generic[F]):
-    """Runs its async counterpart for the duration of a `with` block, on the loop of the followed client."""
-
-    def __init__(self, aio: F, portal: Portal) -> None:
-        self._aio = aio
-        self._portal = portal
-
-    @property
-    def aio(self) -> F:
-        """The async counterpart."""
-        return self._aio
-
-    def __enter__(self) -> Self:
-        self._portal.call(self._aio.__aenter__)
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            self._portal.call(self._aio.__aexit__, exc_type, exc, traceback)
-        except ClientClosed:
-            self._aio.finish()
 
 
 def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:

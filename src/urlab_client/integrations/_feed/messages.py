@@ -28,7 +28,6 @@ class Time(Struct, frozen=True):
 
     @classmethod
     def of(cls, nanoseconds: int) -> Time:
-        """Split nanoseconds."""
         return cls(*divmod(nanoseconds, 1_000_000_000))
 
 
@@ -93,9 +92,9 @@ class EntityMessage(Struct, kw_only=True, omit_defaults=True):
     sample: Count
     step: Count
     episode: Count
-    position: list[float]
-    orientation: list[float]
-    qvel: list[float] = []
+    position: Annotated[list[float], Meta(min_length=3, max_length=3)]
+    orientation: Annotated[list[float], Meta(min_length=4, max_length=4)]
+    qvel: Annotated[list[float], Meta(max_length=6)] = []
 
 
 class JointState(Struct, frozen=True):
@@ -198,6 +197,17 @@ class CylinderPrimitive(Struct, frozen=True):
     color: Color
 
 
+class ArrowPrimitive(Struct, frozen=True):
+    """An arrow along x of its pose: lengths and diameters, metres."""
+
+    pose: Pose
+    shaft_length: float
+    shaft_diameter: float
+    head_length: float
+    head_diameter: float
+    color: Color
+
+
 class TriangleListPrimitive(Struct, frozen=True):
     """A mesh: each three indices of points are a triangle."""
 
@@ -219,6 +229,7 @@ class SceneEntity(Struct, frozen=True):
     spheres: list[SolidPrimitive]
     cylinders: list[CylinderPrimitive]
     triangles: list[TriangleListPrimitive]
+    arrows: list[ArrowPrimitive] = []
 
 
 class SceneEntityDeletion(Struct, frozen=True):
@@ -309,7 +320,6 @@ _URLAB: dict[type[Struct], str] = {
 
 
 def schema_name(kind: type[Struct]) -> str:
-    """Return the name of a message's schema."""
     return f"foxglove.{kind.__name__}" if kind in _FOXGLOVE else _URLAB[kind]
 
 

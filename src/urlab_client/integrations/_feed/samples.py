@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from urlab_client.enums import CameraMode
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
+    ContactsMessage,
     EpisodeOutcome,
+    FrameTransforms,
+    JointStates,
     RawImage,
     Time,
     values,
 )
-from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
+from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene, Simulation, calibration, to_metadata
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.pictures import PictureMemory, Pixels, decode_camera, encoded, jpeg, pillow_image
@@ -129,35 +135,63 @@ class SampleClock:
         return self.last
 
 
-def articulation_message(
-    item: State, key: str, stamp: Time, *, sample: int, episode: int, sensors: bool = True
-) -> ArticulationMessage:
-    """Return the state of one articulation as a message.
+class TopicMessage(NamedTuple):
+    """A message of a topic, made only if somebody takes it, and the metadata of its channel."""
+
+    topic: str
+    make: Callable[[], Struct]
+    metadata: Mapping[str, str] = {}
+
+
+def state_messages(item: State, ns: int, *, sample: int, episode: int, sensors: bool = True) -> Iterator[TopicMessage]:
+    """Yield the states of all articulations.
 
     Args:
         item: The state.
-        key: Key of the articulation.
-        stamp: Time on the run's clock.
+        ns: Time on the run's clock, nanoseconds.
         sample: Number of the sample.
         episode: Number of preceding resets.
         sensors: Whether to include readings.
     """
     reply = item.reply
-    state = reply.per_articulation[key]
-    return ArticulationMessage(
-        timestamp=stamp,
-        sim_time=reply.time,
-        sample=sample,
-        step=reply.step,
-        episode=episode,
-        wall_time=Time.of(item.wall_ns),
-        qpos=state.qpos.tolist(),
-        qvel=state.qvel.tolist(),
-        set_points=item.set_points.get(key, []),
-        ctrl=values(state.ctrl),
-        act=values(state.act),
-        sensors=(state.sensors or {}) if sensors else {},
-    )
+    for key, state in reply.per_articulation.items():
+        names = item.scene.names.get(key)
+        make = partial(
+            ArticulationMessage,
+            timestamp=Time.of(ns),
+            sim_time=reply.time,
+            sample=sample,
+            step=reply.step,
+            episode=episode,
+            wall_time=Time.of(item.wall_ns),
+            qpos=state.qpos.tolist(),
+            qvel=state.qvel.tolist(),
+            set_points=item.set_points.get(key, []),
+            ctrl=values(state.ctrl),
+            act=values(state.act),
+            sensors=(state.sensors or {}) if sensors else {},
+        )
+        yield TopicMessage(f"/state/{key}", make, to_metadata(names) if names else {})
+
+
+def computed_messages(simulation: Simulation, ns: int, *, contacts: bool) -> Iterator[TopicMessage]:
+    """Yield what a simulation computes of a state: poses, joint states, and on request contacts."""
+    stamp = Time.of(ns)
+    yield TopicMessage("/tf", lambda: FrameTransforms(simulation.transforms(stamp)))
+    if joints := simulation.joints():
+        yield TopicMessage("/joint_states", lambda: JointStates(stamp, joints))
+    if contacts:
+        yield TopicMessage("/contacts", lambda: ContactsMessage(stamp, simulation.contacts()))
+
+
+def picture_messages(
+    picture: CameraPicture, ns: int, jpeg_quality: int | None, memory: PictureMemory | None = None
+) -> Iterator[TopicMessage]:
+    """Yield a picture and the parameters of its camera; see `picture_message`."""
+    stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
+    mode = {"mode": str(picture.camera.view.mode)}
+    yield TopicMessage(topic, lambda: picture_message(picture, stamp, jpeg_quality, memory), mode)
+    yield TopicMessage(f"{topic}/calibration", lambda: calibration(picture.camera, stamp))
 
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:

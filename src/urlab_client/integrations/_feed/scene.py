@@ -97,7 +97,6 @@ class FollowedScene:
 
     @classmethod
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
-        """Build the description of a client's scene."""
         model, arts = client.model, client.articulations
         prefixes = compiled_prefixes(client)
         layouts = {key: ArticulationLayout() for key in arts}
@@ -131,17 +130,19 @@ def joint_columns(names: list[str], dof: bool = False) -> list[str]:
 class Simulation:
     """Computes poses and contacts of recorded states. Not thread-safe; the model is only read.
 
-    Args:
-        scene: The scene, with a model.
+    Attributes:
+        model: The model.
+        data: The data computed last.
+        bodies: Name of each body, which is also that of its frame.
     """
 
     def __init__(self, scene: FollowedScene, model: mujoco.MjModel) -> None:
         import mujoco
 
         self._scene = scene
-        self._model = model
-        self._data = mujoco.MjData(model)
-        self._bodies = [name or f"body_{i}" for i, name in enumerate(model_names(model, "body"))]
+        self.model: mujoco.MjModel = model
+        self.data: mujoco.MjData = mujoco.MjData(model)
+        self.bodies: list[str] = [name or f"body_{i}" for i, name in enumerate(model_names(model, "body"))]
         joints = model_names(model, "joint")
         scalar = np.flatnonzero(model.jnt_type > _BALL).tolist()
         self._joints = [(joints[i], int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in scalar if joints[i]]
@@ -150,7 +151,7 @@ class Simulation:
         self, articulations: Mapping[str, ArticulationState], entities: Mapping[str, EntityState], *, forces: bool
     ) -> None:
         """Set a state and compute its poses and contacts."""
-        data = self._data
+        data = self.data
         for key, state in articulations.items():
             layout = self._scene.layouts.get(key)
             if layout is None:
@@ -173,43 +174,27 @@ class Simulation:
 
     def start_from(self, qpos: Floats, qvel: Floats, *, forces: bool) -> None:
         """Set complete arrays of joint positions and velocities and compute poses and contacts."""
-        self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         self._compute(forces)
 
     def _compute(self, forces: bool) -> None:
         import mujoco
 
         if forces:
-            mujoco.mj_forward(self._model, self._data)
+            mujoco.mj_forward(self.model, self.data)
         else:
-            mujoco.mj_kinematics(self._model, self._data)
-            mujoco.mj_comPos(self._model, self._data)
-            mujoco.mj_camlight(self._model, self._data)
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The model."""
-        return self._model
-
-    @property
-    def data(self) -> mujoco.MjData:
-        """The data computed last."""
-        return self._data
-
-    @property
-    def bodies(self) -> list[str]:
-        """Name of each body, which is also that of its frame."""
-        return self._bodies
+            mujoco.mj_kinematics(self.model, self.data)
+            mujoco.mj_comPos(self.model, self.data)
+            mujoco.mj_camlight(self.model, self.data)
 
     def joints(self) -> list[JointState]:
-        """Return all named hinge and slide joints."""
-        qpos, qvel = self._data.qpos.tolist(), self._data.qvel.tolist()
+        qpos, qvel = self.data.qpos.tolist(), self.data.qvel.tolist()
         return [JointState(name, qpos[q], qvel[v]) for name, q, v in self._joints]
 
     def transforms(self, time: Time) -> list[FrameTransform]:
         """Return the poses of all bodies and of the recorded cameras in the world."""
-        positions, rotations = self._data.xpos.tolist(), self._data.xquat.tolist()
-        found = [_transform(time, self._bodies[i], positions[i], rotations[i]) for i in range(1, len(self._bodies))]
+        positions, rotations = self.data.xpos.tolist(), self.data.xquat.tolist()
+        found = [_transform(time, self.bodies[i], positions[i], rotations[i]) for i in range(1, len(self.bodies))]
         for camera in self._scene.cameras.values():
             if camera.model_id >= 0:
                 position, rotation = self._camera_pose(camera.model_id)
@@ -220,7 +205,7 @@ class Simulation:
         """Return the contacts of a state that was set with forces."""
         import mujoco
 
-        model, data = self._model, self._data
+        model, data = self.model, self.data
         found: list[ContactMessage] = []
         force = np.zeros(6)
         for i in range(data.ncon):
@@ -244,15 +229,15 @@ class Simulation:
 
     def _owner(self, geom: int) -> str:
         """Return the body of a geom; empty for a flex."""
-        return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
+        return self.bodies[int(self.model.geom_bodyid[geom])] if geom >= 0 else ""
 
     def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
         import mujoco
 
         looking, turned = np.zeros(4), np.zeros(4)
-        mujoco.mju_mat2Quat(looking, self._data.cam_xmat[camera])
+        mujoco.mju_mat2Quat(looking, self.data.cam_xmat[camera])
         mujoco.mju_mulQuat(turned, looking, _OPTICAL)
-        return self._data.cam_xpos[camera], turned
+        return self.data.cam_xpos[camera], turned
 
 
 def calibration(camera: CameraLayout, time: Time) -> CameraCalibration:
@@ -321,10 +306,8 @@ def _sensor_kinds() -> dict[int, str]:
 
 
 def to_metadata(layout: SceneLayout) -> dict[str, str]:
-    """Return a layout as the metadata of a channel."""
     return {"layout": msgspec.json.encode(layout).decode()}
 
 
 def from_metadata(metadata: dict[str, str]) -> SceneLayout:
-    """Return the layout in the metadata of a channel."""
     return msgspec.json.decode(metadata.get("layout", "{}"), type=SceneLayout)

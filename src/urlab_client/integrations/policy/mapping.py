@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
-from urlab_client.aio.model.elements import Actuator, Joint, Sensor
+from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations.policy.spec import (
@@ -37,6 +37,8 @@ from urlab_client.integrations.policy.spec import (
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.values.pictures import observed_pixels
+
+T = TypeVar("T")
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 
@@ -154,7 +156,7 @@ class PolicyMapping:
         self.action_size: int = len(self.joints)
         self._qpos, self._qvel = _offsets(self.joints)
         self._scale, self._offset = _array(spec.action.scale), _array(spec.action.offset)
-        self._sensor_names: dict[str, str] = {}
+        self._goal_sensor = ""
         self._terms: list[tuple[_Read, NumberTerm]] = []
         self._columns: dict[str, list[int]] = {}
         self.observation_size: int = 0
@@ -265,9 +267,8 @@ class PolicyMapping:
 
     def goal_error(self, state: RobotState, goal: Floats) -> Floats | None:
         """Return the distance from the goal in the first goal term with `relative_to`; None without such a term."""
-        measured = [term.relative_to for term in self.spec.observation if isinstance(term, GoalTerm)]
-        name = next(filter(None, measured), None)
-        return None if name is None else np.linalg.norm(goal - state.sensors[self._sensor_names[name]], axis=-1)
+        measured = self._goal_sensor
+        return np.linalg.norm(goal - state.sensors[measured], axis=-1) if measured else None
 
     def fallen(self, state: RobotState) -> NDArray[np.bool_]:
         """Whether the robot has fallen, shape (…)."""
@@ -297,9 +298,7 @@ class PolicyMapping:
         return np.where(self.fallen(state), 0.0, gain - cost)
 
     def _check_picture(self, robot: PolicyRobot, term: PictureTerm, where: str) -> None:
-        camera = robot.cameras.get(term.camera)
-        if camera is None:
-            raise self._misfit(f"{where}.camera", _unknown("camera", term.camera, robot.prefix, robot.cameras))
+        camera = self._element("camera", term.camera, robot.cameras, f"{where}.camera")
         if camera.mode != term.mode:
             raise self._misfit(f"{where}.mode", f"{term.camera!r} shows {str(camera.mode)!r}, not {str(term.mode)!r}")
         if tuple(camera.resolution) != term.size:
@@ -312,49 +311,50 @@ class PolicyMapping:
             case JointPosition() | JointVelocity():
                 joints = self._joints(robot, term.joints, f"{where}.joints") or self.joints
                 qpos, qvel = _offsets(joints)
-                if isinstance(term, JointPosition):
-                    return len(joints), lambda moment: moment.state.qpos[..., qpos]
-                return len(joints), lambda moment: moment.state.qvel[..., qvel]
-            case SensorTerm() | GoalTerm():
-                return self._sensor_term(robot, term, where)
-            case LastAction():
-                return self.action_size, lambda moment: moment.last_action
+                return len(joints), (
+                    (lambda moment: moment.state.qpos[..., qpos])
+                    if isinstance(term, JointPosition)
+                    else (lambda moment: moment.state.qvel[..., qvel])
+                )
+            case SensorTerm():
+                sensor = self._element("sensor", term.sensor, robot.sensors, f"{where}.sensor")
+                return sensor.dim, lambda moment: moment.state.sensors[sensor.name]
+            case GoalTerm():
+                return len(self.default_goal), self._goal_term(robot, term, where)
             case PhaseClock():
                 rate = 2 * math.pi * term.hz
                 return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
+            case LastAction():
+                return self.action_size, lambda moment: moment.last_action
             case _:
                 if not self._has_base and not isinstance(term, CommandTerm):
                     raise self._misfit(where, f"needs a free base; {robot.prefix!r} has none")
                 return _PLAIN[type(term)]
 
-    def _sensor_term(self, robot: PolicyRobot, term: SensorTerm | GoalTerm, where: str) -> tuple[int, _Read]:
-        if isinstance(term, SensorTerm):
-            sensor = self._sensor(robot, term.sensor, f"{where}.sensor")
-            return sensor.dim, lambda moment: moment.state.sensors[sensor.name]
-        size = len(self.default_goal)
+    def _goal_term(self, robot: PolicyRobot, term: GoalTerm, where: str) -> _Read:
         if not term.relative_to:
-            return size, lambda moment: moment.goal
-        sensor = self._sensor(robot, term.relative_to, f"{where}.relative_to")
+            return lambda moment: moment.goal
+        where, size = f"{where}.relative_to", len(self.default_goal)
+        sensor = self._element("sensor", term.relative_to, robot.sensors, where)
         if sensor.dim != size:
-            raise self._misfit(f"{where}.relative_to", f"{sensor.name!r} has {sensor.dim} numbers, the goal {size}")
-        self._sensor_names[term.relative_to] = sensor.name
-        return size, lambda moment: moment.goal - moment.state.sensors[sensor.name]
-
-    def _sensor(self, robot: PolicyRobot, name: str, where: str) -> Sensor:
-        sensor = robot.sensors.get(name)
-        if sensor is None:
-            raise self._misfit(where, _unknown("sensor", name, robot.prefix, robot.sensors))
-        return sensor
+            raise self._misfit(where, f"{sensor.name!r} has {sensor.dim} numbers, the goal {size}")
+        self._goal_sensor = self._goal_sensor or sensor.name
+        return lambda moment: moment.goal - moment.state.sensors[sensor.name]
 
     def _joints(self, robot: PolicyRobot, names: Sequence[str], where: str) -> list[Joint]:
         found: list[Joint] = []
         for index, name in enumerate(names):
-            joint = robot.joints.get(name)
-            if joint is None:
-                raise self._misfit(f"{where}[{index}]", _unknown("joint", name, robot.prefix, robot.joints))
+            joint = self._element("joint", name, robot.joints, f"{where}[{index}]")
             if joint.jnt_type not in _SCALAR_JOINTS:
                 raise self._misfit(f"{where}[{index}]", f"{name!r} is neither a hinge nor a slide joint")
             found.append(joint)
+        return found
+
+    def _element(self, kind: str, name: str, known: Mapping[str, T], where: str) -> T:
+        found = known.get(name)
+        if found is None:
+            there = ", ".join(known) or "none"
+            raise self._misfit(where, f"{self._robot!r} has no {kind} {name!r}; it has {there}")
         return found
 
     def _misfit(self, where: str, problem: str) -> PolicyMismatch:
@@ -369,7 +369,6 @@ def _picture(term: PictureTerm) -> NDArray[Any]:
 
 
 def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
-    """Return the actuator that drives a joint."""
     found = [actuator for actuator in robot.actuators.values() if actuator.joint == joint.name]
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
         raise PolicyMismatch(
@@ -385,10 +384,6 @@ def _offsets(joints: Sequence[Joint]) -> tuple[NDArray[np.intp], NDArray[np.intp
         np.array([joint.qpos_local_offset for joint in joints], dtype=np.intp),
         np.array([joint.qvel_local_offset for joint in joints], dtype=np.intp),
     )
-
-
-def _unknown(kind: str, name: str, robot: str, known: Mapping[str, object]) -> str:
-    return f"{robot!r} has no {kind} {name!r}; it has {', '.join(known) or 'none'}"
 
 
 def _array(value: Numbers) -> Floats:

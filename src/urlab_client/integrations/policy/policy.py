@@ -12,7 +12,7 @@ import numpy as np
 
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, PolicyRobot, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxInputs, OnnxNetwork, PicturesNetwork
-from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
+from urlab_client.integrations.policy.spec import Command, Goal, PolicyFileError, PolicySpec, read_spec
 from urlab_client.protocol.base import Floats
 
 
@@ -64,16 +64,7 @@ class Policy:
 
     @command.setter
     def command(self, values: Sequence[float] | Floats) -> None:
-        known = self.spec.command
-        given = np.array(values, dtype=np.float64)
-        if known is None:
-            raise ValueError(f"{self.source} takes no command")
-        if not known.contains(given):
-            raise ValueError(
-                f"a command must be vx, vy, yaw rate from {list(known.low)} to {list(known.high)} (m/s, m/s, rad/s), "
-                f"not {given.tolist()}"
-            )
-        self._command = given
+        self._command = _within("command", self.spec.command, values, self.source)
 
     @property
     def goal(self) -> Floats:
@@ -87,13 +78,7 @@ class Policy:
 
     @goal.setter
     def goal(self, values: Sequence[float] | Floats) -> None:
-        known = self.spec.goal
-        given = np.array(values, dtype=np.float64)
-        if known is None:
-            raise ValueError(f"{self.source} has no goal")
-        if not known.contains(given):
-            raise ValueError(f"a goal must be from {list(known.low)} to {list(known.high)}, not {given.tolist()}")
-        self._goal = given
+        self._goal = _within("goal", self.spec.goal, values, self.source)
 
     @property
     def action(self) -> Floats:
@@ -189,6 +174,16 @@ class Policy:
 
     def __repr__(self) -> str:
         return f"<Policy {self.source} for {self.spec.robot!r}>"
+
+
+def _within(what: str, known: Goal | None, values: Sequence[float] | Floats, source: str) -> Floats:
+    given = np.array(values, dtype=np.float64)
+    if known is None:
+        raise ValueError(f"{source} takes no {what}")
+    if not known.contains(given):
+        of = "vx, vy, yaw rate " if isinstance(known, Command) else ""
+        raise ValueError(f"a {what} must be {of}from {list(known.low)} to {list(known.high)}, not {given.tolist()}")
+    return given
 
 
 def load(onnx: str | PathLike[str], toml: str | PathLike[str] | None = None) -> Policy:

@@ -15,11 +15,10 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.defaults import DEFAULT
 from urlab_client.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.errors import URLabError
+from urlab_client.integrations._flavours import blocking
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
-from urlab_client.sync._facade import aio_of, portal_of
-from urlab_client.sync.client import URLabClient
 from urlab_client.values.plain import Serializable
 
 _STANDSTILL_S: Final = 5.0
@@ -196,17 +195,8 @@ async def run(
                 await controller.configure(timeout=DEFAULT, **before)
 
 
-def run_blocking(
-    client: URLabClient,
-    policy: Policy,
-    *,
-    articulation: str | None = None,
-    seconds: float = 10.0,
-    on_action: OnAction | None = None,
-) -> PolicyRun:
-    """Run a policy like `run`, with a blocking client."""
-    portal = portal_of(client)
-    return portal.call(run, aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
+run_blocking = blocking(run)
+"""Run a policy like `run`, with a blocking client."""
 
 
 class _PolicyLoop:
@@ -232,7 +222,6 @@ class _PolicyLoop:
         self._travelled = (0.0, 0.0)
 
     async def until(self, seconds: float, seed: int | None, *, until_fall: bool) -> PolicyRun:
-        """Run for some simulated seconds, or until the first fall."""
         loop = asyncio.get_running_loop()
         client, result, period = self._client, self._result, self._policy.spec.period
         await self._restart(seed)
@@ -256,7 +245,6 @@ class _PolicyLoop:
         return result
 
     async def _restart(self, seed: int | None = None) -> None:
-        """Reset the simulation and the policy."""
         self._travelled = (self._result.distance, self._result.forward)
         await self._client.reset(self._policy.spec.keyframe, seed)
         if self._cameras:

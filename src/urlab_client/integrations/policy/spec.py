@@ -53,23 +53,23 @@ class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, 
         _check_clip(self.clip)
 
 
-class BaseHeight(_Term, tag="base_height", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class BaseHeight(_Term, tag="base_height", kw_only=True, frozen=True):
     """Height of the free base, metres, world frame; 1 number."""
 
 
-class Gravity(_Term, tag="gravity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class Gravity(_Term, tag="gravity", kw_only=True, frozen=True):
     """Direction of gravity, a unit vector in the base frame; 3 numbers."""
 
 
-class LinearVelocity(_Term, tag="linear_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class LinearVelocity(_Term, tag="linear_velocity", kw_only=True, frozen=True):
     """Velocity of the free base, m/s, base frame; 3 numbers."""
 
 
-class AngularVelocity(_Term, tag="angular_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class AngularVelocity(_Term, tag="angular_velocity", kw_only=True, frozen=True):
     """Angular velocity of the free base, rad/s, base frame; 3 numbers."""
 
 
-class JointPosition(_Term, tag="joint_position", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class JointPosition(_Term, tag="joint_position", kw_only=True, frozen=True):
     """Positions of hinge and slide joints, rad or m; one number each.
 
     Attributes:
@@ -79,7 +79,7 @@ class JointPosition(_Term, tag="joint_position", kw_only=True, forbid_unknown_fi
     joints: list[str] = []
 
 
-class JointVelocity(_Term, tag="joint_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class JointVelocity(_Term, tag="joint_velocity", kw_only=True, frozen=True):
     """Velocities of hinge and slide joints, rad/s or m/s; one number each.
 
     Attributes:
@@ -89,7 +89,7 @@ class JointVelocity(_Term, tag="joint_velocity", kw_only=True, forbid_unknown_fi
     joints: list[str] = []
 
 
-class SensorTerm(_Term, tag="sensor", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class SensorTerm(_Term, tag="sensor", kw_only=True, frozen=True):
     """The reading of a sensor, in its own units and frame.
 
     Attributes:
@@ -99,11 +99,11 @@ class SensorTerm(_Term, tag="sensor", kw_only=True, forbid_unknown_fields=True, 
     sensor: str
 
 
-class CommandTerm(_Term, tag="command", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class CommandTerm(_Term, tag="command", kw_only=True, frozen=True):
     """The command (vx, vy, yaw rate), m/s and rad/s, base frame; 3 numbers. Needs the table `command`."""
 
 
-class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class GoalTerm(_Term, tag="goal", kw_only=True, frozen=True):
     """The goal of the policy, such as a position in the world; as many numbers as in the table `goal`.
 
     Attributes:
@@ -114,11 +114,11 @@ class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, froz
     relative_to: str = ""
 
 
-class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class LastAction(_Term, tag="last_action", kw_only=True, frozen=True):
     """The network's last output after clipping, zeros at the start; one number per joint of the action."""
 
 
-class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class PhaseClock(_Term, tag="clock", kw_only=True, frozen=True):
     """Sine and cosine of a phase that advances with time; 2 numbers.
 
     Attributes:

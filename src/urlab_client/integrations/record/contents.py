@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +140,6 @@ class Table:
             else:
                 flat.update({f"{key}/{name}": values[:, i] for i, name in enumerate(column.names)})
         return flat
-
-    def with_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> Table:
-        """Return a table with the same columns and other rows, given in the form of `arrays`."""
-        columns = {key: replace(column, values=arrays[key]) for key, column in self.columns.items()}
-        return Table(
-            arrays["time"], arrays["sim_time"], arrays["wall_ns"], arrays["step"], arrays["episode"], columns=columns
-        )
 
 
 @dataclass(frozen=True, slots=True)

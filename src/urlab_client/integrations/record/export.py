@@ -11,11 +11,11 @@ import contextlib
 import csv
 import importlib
 import zipfile
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, report),
+        contextlib.closing(_transitions(run, path.parent, episodes, progress)) as pieces,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
@@ -59,7 +59,6 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
             for start in range(0, len(piece), _ROWS):
                 rows = slice(start, start + _ROWS)
                 writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
-                report(count + start)
             count += len(piece)
     return count
 
@@ -110,7 +109,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
     count = 0
     with (
         replaced(path) as temporary,
-        _transitions(run, path.parent, episodes, progress) as (pieces, report),
+        contextlib.closing(_transitions(run, path.parent, episodes, progress)) as pieces,
         contextlib.ExitStack() as stack,
     ):
         writer: Any = None
@@ -123,7 +122,6 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
             if len(piece):
                 writer.write_table(group)
             count += len(piece)
-            report(count)
     return count
 
 
@@ -167,15 +165,8 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
     return count
 
 
-class _Transitions(NamedTuple):
-    """The pairs of a recording in pieces, and a callback for the number of written rows."""
-
-    pieces: Iterator[Table]
-    report: Progress
-
-
-@contextlib.contextmanager
-def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress | None) -> Generator[_Transitions]:
+def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress | None) -> Generator[Table]:
+    """Yield the pairs of a recording in pieces, each of which counts as written when the next one is taken."""
     check_episodes(episodes)
     size = run.path.stat().st_size
     reading, writing = phases(size, progress, 2)
@@ -183,13 +174,11 @@ def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress 
         outcomes = run.outcomes()
         rows = pair_rows(table, outcomes, episodes)
         width = sum(column.values.shape[1] for column in table.columns.values()) + 1
-        parts = np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES)
-        pieces = (with_goals(pairs_at(table, part), outcomes) for part in parts)
-
-        def report(count: int) -> None:
+        count = 0
+        for part in np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES):
+            yield with_goals(pairs_at(table, part), outcomes)
+            count += len(part)
             writing(size * count // max(1, len(rows)))
-
-        yield _Transitions(pieces, report)
 
 
 def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, report: Callable[[float], None]) -> None:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from urlab_client.integrations._feed.scene import SceneLayout, from_metadata
+from urlab_client.integrations.record.joint_states import as_mcap, is_joint_states
 from urlab_client.integrations.record.writer import RecordingError
 
 Progress: TypeAlias = Callable[[int], None]
@@ -95,11 +96,10 @@ class RecordedMessage(NamedTuple):
 
 @dataclass(slots=True)
 class _Block:
-    """Messages that are read together: a chunk, or consecutive messages outside of chunks. In bytes of the file."""
+    """A chunk, whose messages are read together. In bytes of the file."""
 
     start: int
     size: int
-    chunked: bool
     first_ns: int
     index_size: int = 0
     channels: frozenset[int] = _NO_CHANNELS
@@ -133,8 +133,11 @@ class RecordingIndex:
         self._kept: OrderedDict[int, _Contents] = OrderedDict()
         self._lock = threading.Lock()
         self._forget()
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+        # A server's own recording has no index and is read whole.
+        self._converted = as_mcap(path) if is_joint_states(path) else None
+        with self._opened() as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: {UNKNOWN}")
             try:
@@ -146,6 +149,9 @@ class RecordingIndex:
                 self._scan(file, size, progress)
         first = np.array([block.first_ns for block in self._blocks], dtype=np.uint64)
         self._earliest = np.minimum.accumulate(first[::-1])[::-1]  # of a block and all after it
+
+    def _opened(self) -> BinaryIO:
+        return self.path.open("rb") if self._converted is None else io.BytesIO(self._converted)
 
     def _forget(self) -> None:
         self.damage: str = ""
@@ -163,7 +169,7 @@ class RecordingIndex:
         """Return the times of all messages by channel, nanoseconds, without reading the messages."""
         found: dict[int, list[NDArray[np.int64]]] = {}
         walked = 0
-        with self.path.open("rb") as file:
+        with self._opened() as file:
             for block in self._blocks:
                 if channels is None or not block.channels.isdisjoint(channels):
                     positions = self._positions(file, block)
@@ -183,7 +189,7 @@ class RecordingIndex:
     def unreadable(self, message: RecordedMessage, reason: object) -> RecordingError:
         """Return the error for a message with wrong contents; it says which of its channel's messages that is."""
         topic, number = message.channel.topic, 1
-        with self.path.open("rb") as file:
+        with self._opened() as file:
             for at, block in enumerate(self._blocks[: message.block + 1]):
                 rows = self._positions(file, block).get(message.channel.id)
                 if rows is not None:
@@ -193,7 +199,7 @@ class RecordingIndex:
     def messages(self, channels: Collection[int], progress: Progress | None = None) -> Iterator[RecordedMessage]:
         """Iterate over the messages of some channels in the file's order, up to damage, which `damage` names."""
         wanted = frozenset(channels)
-        with self.path.open("rb") as file:
+        with self._opened() as file:
             for number, block in enumerate(self._blocks):
                 if wanted.isdisjoint(block.channels):
                     continue
@@ -243,7 +249,7 @@ class RecordingIndex:
                 self._kept.move_to_end(number)
                 return kept
         block = self._blocks[number]
-        with self._locating_damage(block), self.path.open("rb") as file:
+        with self._locating_damage(block), self._opened() as file:
             data = self._data(file, block)
             contents = _Contents(data, {channel: _by_time(rows) for channel, rows in _walked(data).items()})
         with self._lock:
@@ -280,7 +286,7 @@ class RecordingIndex:
         raw = file.read(block.size)
         if len(raw) < block.size:
             raise ValueError(CUT_OFF)
-        return _unpacked(Chunk.read(_stream(raw[_RECORD.size :]))) if block.chunked else raw
+        return _unpacked(Chunk.read(_stream(raw[_RECORD.size :])))
 
     def _positions(self, file: BinaryIO, block: _Block) -> Positions:
         """Return the positions in a block: from the index that follows it, or else from its messages."""
@@ -368,25 +374,16 @@ class RecordingIndex:
         """Add a record with messages, or with their positions, to the blocks."""
         if len(self._blocks) > _MOST_BLOCKS:
             raise ValueError(f"it has more than {_MOST_BLOCKS} chunks")
-        last = self._blocks[-1] if self._blocks else None
         match kind:
             case Opcode.CHUNK:
-                first_ns = int.from_bytes(head[_RECORD.size : _RECORD.size + 8], "little")
-                self._blocks.append(_Block(at, size, chunked=True, first_ns=first_ns))
-            case Opcode.MESSAGE_INDEX if last is not None:
+                self._blocks.append(_Block(at, size, int.from_bytes(head[_RECORD.size : _RECORD.size + 8], "little")))
+            case Opcode.MESSAGE_INDEX if self._blocks:
                 channel, entries = _INDEX.unpack_from(head, _RECORD.size)
+                last = self._blocks[-1]
                 last.index_size += size
                 last.channels |= {channel} if entries else _NO_CHANNELS
             case Opcode.MESSAGE:
-                first_ns = _MESSAGE.unpack_from(head)[4]
-                if size > _CHUNK_BYTES:
-                    raise ValueError(f"a message outside of chunks has {size} bytes, more than {_CHUNK_BYTES}")
-                full = last is None or last.size + size > _CHUNK_BYTES
-                if last is None or full or last.chunked or last.start + last.size != at:
-                    last = _Block(at, 0, chunked=False, first_ns=first_ns)
-                    self._blocks.append(last)
-                last.size += size
-                last.first_ns = min(last.first_ns, first_ns)
+                raise ValueError("a message is outside of chunks, where none is looked up; write the file with chunks")
             case _:
                 pass
 
@@ -454,7 +451,7 @@ def _block_of(body: bytes) -> _Block:
     end = _CHUNK_INDEX.size + listed
     channels = frozenset(channel for channel, _ in _LISTED.iter_unpack(body[_CHUNK_INDEX.size : end]))
     index_size = int.from_bytes(body[end : end + 8], "little")
-    return _Block(start, size, chunked=True, first_ns=first_ns, index_size=index_size, channels=channels)
+    return _Block(start, size, first_ns, index_size, channels)
 
 
 def _heads(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes]]:
@@ -500,7 +497,6 @@ def _by_time(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Return the records of a chunk."""
     packed, size = chunk.data, chunk.uncompressed_size
     if size > min(max(_CHUNK_BYTES, _CHUNK_RATIO * len(packed)), _LARGEST_CHUNK):
         raise ValueError(f"a chunk of {len(packed)} bytes declares that it unpacks to {size}")

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -102,54 +102,68 @@ def write_lerobot(
         episode, when = table.episode[rows], table.time[rows]
         limit = 1 / rate if max_picture_age is None else max_picture_age
         chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
-        if not np.isfinite(_goals_of(np.unique(episode), outcomes)).all():
+        vectors = _vectors(table, rows[np.unique(episode, return_index=True)[1]], outcomes)
+        if not np.isfinite(vectors["goal"].values).all():
             raise RecordingError(f"{run.path}: the goals of some of its episodes are unknown.")
-        first = with_goals(pairs_at(table, rows[:1]), outcomes)
-        robots = [key.removesuffix("/action") for key in first.columns if key.endswith("/action")]
         plan = {
             "folder": str((work / "dataset").absolute()),
             "name": folder.name,
             "fps": rate,
             "task": task,
-            "robot_type": "+".join(robots) if robot_type is None else robot_type,
-            "state": _joined(first, "qpos")[0],
-            "action": _joined(first, "action")[0],
-            "goal": _goal(first)[0],
+            "robot_type": "+".join(vectors["action"].owners) if robot_type is None else robot_type,
+            **{what: vector.names for what, vector in vectors.items()},
             "cameras": [name.replace("/", ".") for name in names],
             "video": video,
         }
         (work / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
         pictures = [_Pictures(run, name, video, next(steps)) for name in names]
         with LeRobot(python, work) as writer:
-            for frames in _frames(table, rows, outcomes):
-                wanted = [
-                    one.take(which[frames.start : frames.stop]) for one, which in zip(pictures, chosen, strict=True)
-                ]
-                writer.add(frames.arrays | _numbered(wanted), ends_episode=frames.ends_episode)
+            for part, ends_episode in _batches(episode):
+                arrays: dict[str, NDArray[Any]] = {
+                    what: vector.values.astype(np.float32)
+                    for what, vector in _vectors(table, rows[part], outcomes).items()
+                }
+                for i, (one, which) in enumerate(zip(pictures, chosen, strict=True)):
+                    arrays[f"pictures{i}"], arrays[f"picture{i}"] = one.take(which[part])
+                writer.add(arrays, ends_episode=ends_episode)
             writer.finish()
         (work / "dataset").rename(folder)
     return len(rows)
 
 
-class _Frames(NamedTuple):
-    """Consecutive frames of one episode, and their numbers in the dataset."""
+class _Vector(NamedTuple):
+    """Columns side by side: the articulations or goals they belong to, their names, and their values."""
 
-    start: int
-    stop: int
-    arrays: dict[str, NDArray[Any]]
-    ends_episode: bool
+    owners: list[str]
+    names: list[str]
+    values: Floats
 
 
-def _frames(table: Table, rows: NDArray[np.intp], outcomes: Sequence[OutcomeMessage]) -> Iterator[_Frames]:
-    """Yield the frames at some rows of a table, in batches that fit into memory with their pictures."""
+def _vectors(table: Table, rows: NDArray[np.intp], outcomes: Sequence[OutcomeMessage]) -> dict[str, _Vector]:
+    """Return state, action and goal at some rows of a table."""
+    columns = with_goals(pairs_at(table, rows), outcomes).columns
+    chosen: dict[str, dict[str, Column]] = {
+        "state": {key.removesuffix("/qpos"): one for key, one in columns.items() if key.endswith("/qpos")},
+        "action": {key.removesuffix("/action"): one for key, one in columns.items() if key.endswith("/action")},
+        "goal": {key.partition("/")[2]: one for key, one in columns.items() if key.startswith(f"{GOAL}/")},
+    }
+    return {
+        what: _Vector(
+            owners=[*found],
+            names=[f"{key}.{name}" for key, one in found.items() for name in one.names],
+            values=np.concatenate([np.zeros((len(rows), 0)), *(one.values for one in found.values())], axis=1),
+        )
+        for what, found in chosen.items()
+    }
+
+
+def _batches(episodes: NDArray[np.int64]) -> Iterator[tuple[slice, bool]]:
+    """Yield consecutive frames of one episode that fit into memory with their pictures, and whether they end it."""
     start = 0
-    for end in (*(np.flatnonzero(np.diff(table.episode[rows])) + 1).tolist(), len(rows)):
+    for end in (*(np.flatnonzero(np.diff(episodes)) + 1).tolist(), len(episodes)):
         while start < end:
             stop = min(start + _TOGETHER, end)
-            part = with_goals(pairs_at(table, rows[start:stop]), outcomes)
-            values = {"state": _joined(part, "qpos")[1], "action": _joined(part, "action")[1], "goal": _goal(part)[1]}
-            arrays = {name: given.astype(np.float32) for name, given in values.items()}
-            yield _Frames(start, stop, arrays, ends_episode=stop == end)
+            yield slice(start, stop), stop == end
             start = stop
 
 
@@ -186,18 +200,6 @@ class _Pictures:
         return self._pixels
 
 
-def _numbered(pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.intp]]]) -> dict[str, NDArray[Any]]:
-    numbered: dict[str, NDArray[Any]] = {}
-    for i, (found, places) in enumerate(pictures):
-        numbered |= {f"pictures{i}": found, f"picture{i}": places}
-    return numbered
-
-
-def _goals_of(episodes: NDArray[np.int64], outcomes: Sequence[OutcomeMessage]) -> Floats:
-    nothing = np.zeros(len(episodes))
-    return _goal(with_goals(Table(nothing, nothing, episodes, episodes, episodes, {}), outcomes))[1]
-
-
 def _check(python: str) -> None:
     try:
         done = subprocess.run(  # noqa: S603  # the user's own interpreter
@@ -226,23 +228,18 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
     return round(rate)
 
 
-def _starts(table: Table) -> dict[int, float]:
-    """Return the time of the first state of each episode."""
-    episodes, first = np.unique(table.episode, return_index=True)
-    return dict(zip(episodes.tolist(), table.time[first].tolist(), strict=True))
-
-
 def _resampled(
     run: Run, table: Table, pairs: NDArray[np.intp], fps: int, pictures: list[NDArray[np.float64]]
 ) -> NDArray[np.intp]:
     """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
     rows: list[NDArray[np.intp]] = []
-    time, episodes, starts = table.time[pairs], table.episode[pairs], _starts(table)
+    time, episodes = table.time[pairs], table.episode[pairs]
     for episode in np.unique(episodes).tolist():
         own = np.flatnonzero(episodes == episode)
         first, last = float(time[own[0]]), float(time[own[-1]])
+        began = float(table.time[np.argmax(table.episode == episode)])
         for times in pictures:
-            later = times[times >= starts[episode] - _SLACK_S]
+            later = times[times >= began - _SLACK_S]
             first = max(first, float(later[0]) if len(later) else np.inf)
         if first <= last + _SLACK_S:
             if (last - first) * fps > _MOST_FRAMES:
@@ -270,24 +267,6 @@ def _newest(
             "--max-picture-age SECONDS.",
         )
     return chosen
-
-
-def _goal(table: Table) -> tuple[list[str], Floats]:
-    return _together(
-        {key.partition("/")[2]: one for key, one in table.columns.items() if key.startswith(f"{GOAL}/")}, len(table)
-    )
-
-
-def _joined(table: Table, field: str) -> tuple[list[str], Floats]:
-    chosen = {key: column for key, column in table.columns.items() if key.endswith(f"/{field}")}
-    return _together({key.rpartition("/")[0]: column for key, column in chosen.items()}, len(table))
-
-
-def _together(columns: Mapping[str, Column], rows: int) -> tuple[list[str], Floats]:
-    """Return names and values of all columns side by side."""
-    names = [f"{key}.{name}" for key, column in columns.items() for name in column.names]
-    values = [column.values for column in columns.values()]
-    return names, np.concatenate(values, axis=1) if values else np.zeros((rows, 0))
 
 
 class LeRobot:
@@ -392,6 +371,5 @@ class LeRobot:
 
 
 def _last_line(text: str) -> str:
-    """Return the last line of the output of a program."""
     lines = text.strip().splitlines()
     return lines[-1] if lines else "it printed nothing"

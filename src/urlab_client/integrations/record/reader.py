@@ -12,9 +12,9 @@ import struct
 import threading
 import zlib
 from array import array
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -26,7 +26,6 @@ from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
-    Count,
     EntityMessage,
     EpisodeMessage,
     GapMessage,
@@ -45,7 +44,7 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
-from urlab_client.integrations.record.tables import Number, SampleTimes, TableBuilder
+from urlab_client.integrations.record.tables import SampleTimes, Source, TableBuilder
 from urlab_client.integrations.record.writer import MODEL_NAME, RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.values.html import curve, fields, table
@@ -66,44 +65,23 @@ _VALUES_PER_BYTE = 200  # states of a robot at rest are packed this well
 _NAMES_CHARS = 32 << 20
 _CURVE_POINTS = 100
 _MODEL_BYTES = 1 << 30
-_T = TypeVar("_T")
+S = TypeVar("S", bound=msgspec.Struct)
 
 
-class _Sample(msgspec.Struct):
-    """A part of a sample as decoded; numbers that JSON cannot represent are text."""
-
-    sim_time: Number
-    sample: Count
-    step: Count
-    episode: Count
-
-
-class _State(_Sample):
-    qpos: list[Number]
-    qvel: list[Number]
-    set_points: list[Number] = []
-    ctrl: list[Number] = []
-    act: list[Number] = []
-    sensors: dict[str, list[Number]] = {}
-
-
-class _Entity(_Sample):
-    position: Annotated[list[Number], msgspec.Meta(min_length=3, max_length=3)]
-    orientation: Annotated[list[Number], msgspec.Meta(min_length=4, max_length=4)]
-    qvel: Annotated[list[Number], msgspec.Meta(max_length=6)] = []
-
-
-_state = msgspec.json.Decoder(_State).decode
-_entity = msgspec.json.Decoder(_Entity).decode
-_episode = msgspec.json.Decoder(EpisodeMessage).decode
-_outcome = msgspec.json.Decoder(OutcomeMessage).decode
-_gap = msgspec.json.Decoder(GapMessage).decode
-_compressed = msgspec.json.Decoder(CompressedImage).decode
-_raw = msgspec.json.Decoder(RawImage).decode
+# Lax, because numbers that JSON cannot represent are text.
+_DECODERS: Final = {
+    schema_name(kind): msgspec.json.Decoder(kind, strict=False).decode
+    for kind in (
+        ArticulationMessage, CompressedImage, EntityMessage, EpisodeMessage, GapMessage, OutcomeMessage, RawImage,
+    )
+}  # fmt: skip
 
 
 class Run:
     """A recording on disk. Opening it reads only its index. Several threads may read.
+
+    Every method raises `OSError` if the file cannot be read, and `RecordingError` if it is no recording any more. Those
+    for a single state or picture also raise `RecordingError` if the file is damaged there.
 
     Attributes:
         path: The file.
@@ -122,9 +100,6 @@ class Run:
         Args:
             progress: Called occasionally with the number of bytes read so far.
             verify: Read everything and compare checksums, to detect damage in the middle of a finished file.
-
-        Raises:
-            RecordingError: The file is not a recording.
         """
         index = self._index(progress)
         if verify:
@@ -136,7 +111,7 @@ class Run:
         stamps_of = {topic: np.concatenate(parts) for topic, parts in sorted(times.items())}
         schemas = {channel.topic: channel.schema for channel in index.channels.values()}
         states = [found for one in index.channels_of(_STATES) if (found := index.newest(one.id)) is not None]
-        gaps = self._contents(index, GapMessage, _gap)
+        gaps = self._contents(index, GapMessage)
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
         ends_of = [(index.first(one), index.newest(one)) for one in index.channels]
         walls = [end.publish_time for pair in ends_of for end in pair if end is not None]
@@ -147,11 +122,11 @@ class Run:
             about=dict(index.metadata.get("urlab", {})),
             duration_s=int(max(ends) - min(ends)) / _NS if ends else 0.0,
             wall_s=(max(walls) - min(walls)) / _NS if walls else 0.0,
-            episodes=max((_decoded(index, message, _state).episode for message in states), default=-1) + 1,
+            episodes=max((_decoded(index, message, ArticulationMessage).episode for message in states), default=-1) + 1,
             dropped_states=sum(gap.states for gap in gaps),
             dropped_frames=sum(gap.frames for gap in gaps),
             topics={topic: describe_topic(topic, schemas[topic], stamps) for topic, stamps in stamps_of.items()},
-            varied=tuple(self._contents(index, EpisodeMessage, _episode)),
+            varied=tuple(self._contents(index, EpisodeMessage)),
             outcomes=self.outcomes(),
         )
 
@@ -163,7 +138,7 @@ class Run:
             fields: Fields to return, such as `qpos`; None returns all.
 
         Raises:
-            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
+            RecordingError: The file contains two scenes, which do not fit into one table.
         """
         return self._read_states(self._builder(None, fields), progress)
 
@@ -180,26 +155,18 @@ class Run:
 
         Raises:
             OSError: The temporary file cannot be written.
-            RecordingError: The file is not a recording, or contains two scenes, which do not fit into one table.
+            RecordingError: The file contains two scenes, which do not fit into one table.
         """
         with contextlib.closing(self._builder(folder, fields)) as builder:
             yield self._read_states(builder, progress)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
-        """Return the marked outcomes of episodes; if an episode has several marks, the last one.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
-        outcomes = self._contents(self._index(), OutcomeMessage, _outcome)
+        """Return the marked outcomes of episodes; if an episode has several marks, the last one."""
+        outcomes = self._contents(self._index(), OutcomeMessage)
         return tuple({outcome.episode: outcome for outcome in outcomes}.values())
 
     def time_range(self) -> tuple[float, float]:
-        """Return the times of the first and the last state, seconds on the recording's clock; 0, 0 without states.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
+        """Return the times of the first and the last state, seconds on the recording's clock; 0, 0 without states."""
         index = self._index()
         channels = index.channels_of(_STATES, _ENTITIES)
         ends = [end for channel in channels for end in (index.first(channel.id), index.newest(channel.id))]
@@ -213,53 +180,45 @@ class Run:
             time: Time on the recording's clock, seconds.
 
         Raises:
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         index = self._index()
-        found = [_newest(index, [channel], time) for channel in index.channels_of(_STATES, _ENTITIES)]
-        every = [
-            (one, _decoded(index, one, _state if one.channel.schema == _STATES else _entity))
-            for one in found
-            if one is not None
-        ]
+        messages = [_newest(index, [channel], time) for channel in index.channels_of(_STATES, _ENTITIES)]
+        every = [(one, _decoded(index, one, ArticulationMessage, EntityMessage)) for one in messages if one is not None]
         if not every:
             return None
         message, newest = max(every, key=lambda one: one[1].sample)
-        # Elements from an earlier sample had left the scene by then.
-        present = [(one.channel.topic, state) for one, state in every if state.sample == newest.sample]
-        return RecordedState(
+        found = RecordedState(
             time=message.log_time / _NS,
-            sim_time=float(newest.sim_time),
+            sim_time=newest.sim_time,
             wall_ns=message.publish_time,
             step=newest.step,
             episode=newest.episode,
-            articulations={
-                topic.removeprefix(_ARTICULATION): _articulation(state)
-                for topic, state in present
-                if isinstance(state, _State)
-            },
-            entities={
-                topic.removeprefix(_ENTITY): RecordedEntity(
-                    _floats(state.position), _floats(state.orientation), _floats(state.qvel)
-                )
-                for topic, state in present
-                if isinstance(state, _Entity)
-            },
+            articulations={},
+            entities={},
         )
+        for one, state in every:
+            if state.sample != newest.sample:
+                continue  # it had left the scene by then
+            if isinstance(state, ArticulationMessage):
+                found.articulations[one.channel.topic.removeprefix(_ARTICULATION)] = RecordedArticulation(
+                    *map(np.array, (state.qpos, state.qvel, state.set_points, state.ctrl, state.act)),
+                    sensors={name: np.array(reading) for name, reading in state.sensors.items()},
+                )
+            else:
+                found.entities[one.channel.topic.removeprefix(_ENTITY)] = RecordedEntity(
+                    *map(np.array, (state.position, state.orientation, state.qvel))
+                )
+        return found
 
     def positions(self) -> dict[str, list[str]]:
-        """Return the names of the values of `qpos` by articulation, from its first state.
-
-        Raises:
-            RecordingError: The file is not a recording.
-        """
+        """Return the names of the values of `qpos` by articulation, from its first state."""
         index = self._index()
         found: dict[str, list[str]] = {}
         for channel in index.channels_of(_STATES):
             first = index.first(channel.id)
             if first is not None:
-                count, names = len(_decoded(index, first, _state).qpos), channel.layout.qpos
+                count, names = len(_decoded(index, first, ArticulationMessage).qpos), channel.layout.qpos
                 names = names if len(names) == count else [str(i) for i in range(count)]
                 found.setdefault(channel.topic.removeprefix(_ARTICULATION), names)
         return found
@@ -306,7 +265,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
         times = array("q", (one.log_time for one in self._messages(self._index(progress), channels, progress)))
@@ -317,7 +275,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
@@ -327,7 +284,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording.
         """
         channels = [channel.id for channel in self._camera(camera)]
         index = self._index(progress)
@@ -343,7 +299,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         channels, index = self._camera(camera), self._index()
@@ -358,7 +313,6 @@ class Run:
 
         Raises:
             KeyError: The file has no pictures of this camera.
-            RecordingError: The file is not a recording, or is damaged there.
             ValueError: The time is NaN.
         """
         channels, index = self._camera(camera), self._index()
@@ -401,15 +355,15 @@ class Run:
         yield from index.messages(channels, progress)
         self.damage = index.damage
 
-    def _contents(self, index: RecordingIndex, kind: type[msgspec.Struct], decode: Callable[[bytes], _T]) -> list[_T]:
+    def _contents(self, index: RecordingIndex, kind: type[S]) -> list[S]:
         """Return all messages of a kind that is rare in recordings."""
-        found: list[_T] = []
+        found: list[S] = []
         left = max(_KEPT_BYTES, 4 * self.path.stat().st_size)
         for message in self._messages(index, [channel.id for channel in index.channels_of(schema_name(kind))]):
             left -= len(message.data)
             if left < 0:
                 raise index.unreadable(message, "with those before it, it is larger than the file can be")
-            found.append(_decoded(index, message, decode))
+            found.append(_decoded(index, message, kind))
         return found
 
     def _builder(self, folder: Path | None, fields: Collection[str] | None) -> TableBuilder:
@@ -420,40 +374,40 @@ class Run:
         index = self._index(progress)
         channels = [channel.id for channel in index.channels_of(_STATES, _ENTITIES)]
         for message in self._messages(index, channels, progress):
-            take = self._take_state if message.channel.schema == _STATES else _take_entity
+            state = _decoded(index, message, ArticulationMessage, EntityMessage)
+            prefix = _ARTICULATION if isinstance(state, ArticulationMessage) else _ENTITY
+            key = message.channel.topic.removeprefix(prefix)
+            source = builder.source(key, message.channel.layout)
+            if source.layout != message.channel.layout:
+                raise RecordingError(
+                    f"{self.path}: {key} changes its joints or actuators in the middle, which fits no one table.",
+                    hint="Record each scene into a file of its own.",
+                )
+            times = SampleTimes(message.log_time, state.sim_time, message.publish_time, state.step, state.episode)
             try:
-                take(builder, index, message)
+                builder.add(source, state.sample, times, **_fields(source, state))
             except ValueError as error:  # it does not fit those before it
                 raise index.unreadable(message, error) from None
         return builder.finish(broken_off=bool(self.damage))
 
-    def _take_state(self, builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
-        state, key = _decoded(index, message, _state), message.channel.topic.removeprefix(_ARTICULATION)
-        source = builder.source(key, message.channel.layout)
-        if source.layout != message.channel.layout:
-            raise RecordingError(
-                f"{self.path}: {key} changes its joints or actuators in the middle, which fits no one table.",
-                hint="Record each scene into a file of its own.",
-            )
-        builder.add(
-            source,
-            state.sample,
-            _times(message, state),
-            qpos=state.qpos,
-            qvel=state.qvel,
-            set_points=state.set_points,
-            ctrl=state.ctrl,
-            act=state.act,
-            sensors=[value for reading in state.sensors.values() for value in reading],
-        )
-        if state.sensors and "sensors" not in source.names:
-            if sum(len(name) * len(reading) for name, reading in state.sensors.items()) > _NAMES_CHARS:
-                raise ValueError("the names of its sensors are too long")
-            source.names["sensors"] = [
-                name if len(reading) == 1 else f"{name}.{i}"
-                for name, reading in state.sensors.items()
-                for i in range(len(reading))
-            ]
+
+def _fields(source: Source, state: ArticulationMessage | EntityMessage) -> dict[str, list[float]]:
+    """Return the values of a state by field, and name those that the layout does not."""
+    if isinstance(state, EntityMessage):
+        source.names["pose"] = list(_POSE)
+        source.names["qvel"] = ["vx", "vy", "vz", "wx", "wy", "wz"]
+        return {"pose": [*state.position, *state.orientation], "qvel": state.qvel}
+    if state.sensors and "sensors" not in source.names:
+        if sum(len(name) * len(reading) for name, reading in state.sensors.items()) > _NAMES_CHARS:
+            raise ValueError("the names of its sensors are too long")
+        source.names["sensors"] = [
+            name if len(reading) == 1 else f"{name}.{i}"
+            for name, reading in state.sensors.items()
+            for i in range(len(reading))
+        ]
+    sensors = [value for reading in state.sensors.values() for value in reading]
+    own = {name: getattr(state, name) for name in ("qpos", "qvel", "set_points", "ctrl", "act")}
+    return own | {"sensors": sensors}
 
 
 def _shown(run: Run) -> str:
@@ -512,12 +466,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
         OSError: The file cannot be read.
         RecordingError: The file is neither.
     """
-    from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states
-
-    file = Path(path)
-    if is_joint_states(file):
-        return JointStatesRun(file)
-    run = Run(file)
+    run = Run(Path(path))
     run._index()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
     return run
 
@@ -532,51 +481,21 @@ def _newest(index: RecordingIndex, channels: Sequence[IndexedChannel], time: flo
     return max((one for one in found if one is not None), key=lambda one: one.log_time, default=None)
 
 
-def _decoded(index: RecordingIndex, message: RecordedMessage, decode: Callable[[bytes], _T]) -> _T:
-    """Return the contents of a message."""
+def _decoded(index: RecordingIndex, message: RecordedMessage, *kinds: type[S]) -> S:
+    """Return the contents of a message, which has the schema of one of these kinds."""
     if len(message.data) > _MESSAGE_BYTES and message.channel.schema not in _PICTURES:
         raise index.unreadable(message, f"it has {len(message.data)} bytes, more than {_MESSAGE_BYTES}")
     try:
-        return decode(message.data)
+        return cast("S", _DECODERS[message.channel.schema](message.data))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise index.unreadable(message, error) from None
 
 
 def _picture(index: RecordingIndex, message: RecordedMessage) -> RecordedPicture:
-    decode = _raw if message.channel.schema == schema_name(RawImage) else _compressed
-    found: CompressedImage | RawImage = _decoded(index, message, decode)
     place = message._replace(data=b"")
     return RecordedPicture(
         message.log_time / _NS,
         message.channel.metadata.get("mode", ""),
-        found,
+        _decoded(index, message, CompressedImage, RawImage),
         lambda reason: index.unreadable(place, reason),
     )
-
-
-def _times(message: RecordedMessage, state: _Sample) -> SampleTimes:
-    return SampleTimes(message.log_time, float(state.sim_time), message.publish_time, state.step, state.episode)
-
-
-def _take_entity(builder: TableBuilder, index: RecordingIndex, message: RecordedMessage) -> None:
-    entity, key = _decoded(index, message, _entity), message.channel.topic.removeprefix(_ENTITY)
-    source = builder.source(key, message.channel.layout)
-    source.names["pose"] = list(_POSE)
-    source.names["qvel"] = ["vx", "vy", "vz", "wx", "wy", "wz"]
-    pose: list[Number] = [*entity.position, *entity.orientation]
-    builder.add(source, entity.sample, _times(message, entity), pose=pose, qvel=entity.qvel)
-
-
-def _articulation(state: _State) -> RecordedArticulation:
-    return RecordedArticulation(
-        qpos=_floats(state.qpos),
-        qvel=_floats(state.qvel),
-        set_points=_floats(state.set_points),
-        ctrl=_floats(state.ctrl),
-        act=_floats(state.act),
-        sensors={name: _floats(reading) for name, reading in state.sensors.items()},
-    )
-
-
-def _floats(values: Sequence[Number]) -> Floats:
-    return np.array([float(value) for value in values])

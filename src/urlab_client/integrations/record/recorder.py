@@ -8,8 +8,8 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import Literal, Self, get_args, overload
+from types import MappingProxyType
+from typing import Literal, get_args
 
 import anyio.to_thread
 import numpy as np
@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike
 from urlab_client.aio.arguments import finite_array
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
+from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.randomise.variation import declared_in
-from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 log: logging.Logger = logging.getLogger("urlab_client.record")
@@ -35,20 +35,19 @@ _FLUSH_S = 1.0
 _NS = 1_000_000_000
 
 
-class AsyncRecorder:
-    """A recording in progress, for the duration of an `async with` block. Created by `record`."""
+class Recording(Block):
+    """A recording in progress, of either flavour."""
 
     def __init__(
         self,
         client: AsyncClient,
         path: Path,
+        options: WriterOptions,
         *,
         cameras: Sequence[str] | Literal["all"],
         camera_hz: float,
-        pose_hz: float,
-        options: WriterOptions,
     ) -> None:
-        needs = ", or pass pose_hz=0" if pose_hz > 0 else None
+        needs = ", or pass pose_hz=0" if options.pose_ns > 0 else None
         self._follower = Follower(
             client, name=f"record {path}", cameras=cameras, camera_hz=camera_hz, needs_model=needs, buffer=_LIVE_ITEMS
         )
@@ -81,6 +80,61 @@ class AsyncRecorder:
         there = frozenset[str]() if self._writer is None else self._writer.cameras
         return [name for name in self._follower.cameras if name not in there]
 
+    def _mark(self, outcome: EpisodeOutcome, goal: Mapping[str, ArrayLike]) -> None:
+        if outcome not in get_args(EpisodeOutcome):
+            raise ValueError(f"outcome must be one of {', '.join(get_args(EpisodeOutcome))}, not {outcome!r}")
+        given = {name: finite_array(f"goal {name!r}", np.ravel(values)).tolist() for name, values in goal.items()}
+        if self._writer is None or self._ended:
+            raise URLabError(
+                "No recording is under way, so no episode can be marked.", hint="Call mark() inside the block."
+            )
+        self._writer.mark(EpisodeMark(outcome, given, time.time_ns()))
+
+    async def _begin(self) -> None:
+        if self._used:
+            raise URLabError("A recorder records once.", hint="Call record() again.")
+        self._follower.check()
+        self._used = True
+        about = _about(self._client)
+        writer = await anyio.to_thread.run_sync(WriterThread, self._path, self._options, about)
+        self._writer = writer
+        self._follower.start(writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up)
+
+    async def _end(self, error: BaseException | None) -> None:
+        self._follower.detach()
+        self._ended = True
+        writer = self._writer
+        if writer is not None:
+            writer.end()  # from here on it finishes the file, even if the caller is cancelled
+        await self._follower.ended()
+        if writer is None:
+            return
+        try:
+            await anyio.to_thread.run_sync(writer.close, abandon_on_cancel=True)
+        except URLabError:
+            if error is None:
+                raise  # otherwise it was logged, and the exception that ends the block takes precedence
+            return
+        stats = writer.stats
+        if missing := self.without_pictures:
+            log.warning(
+                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
+                self._path,
+                ", ".join(missing),
+            )
+        if stats.dropped_states or stats.dropped_frames:
+            lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
+            warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=3)
+
+    def _finish(self) -> None:
+        self._follower.forget()
+        if self._writer is not None:
+            self._writer.close()
+
+
+class AsyncRecorder(Recording, AsyncBlock):
+    """A recording in progress, for the duration of an `async with` block. Created by `record`."""
+
     async def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
         """Mark the outcome of the current episode, from the last reset to the next one.
 
@@ -95,119 +149,18 @@ class AsyncRecorder:
             ValueError: The outcome is unknown, or the goal contains NaN or infinity.
             URLabError: The recording has not started, or has ended.
         """
-        if outcome not in get_args(EpisodeOutcome):
-            raise ValueError(f"outcome must be one of {', '.join(get_args(EpisodeOutcome))}, not {outcome!r}")
-        given = {name: finite_array(f"goal {name!r}", np.ravel(values)).tolist() for name, values in goal.items()}
-        if self._writer is None or self._ended:
-            raise URLabError(
-                "No recording is under way, so no episode can be marked.", hint="Call mark() inside the block."
-            )
-        self._writer.mark(EpisodeMark(outcome, given, time.time_ns()))
-
-    async def __aenter__(self) -> Self:
-        if self._used:
-            raise URLabError("A recorder records once.", hint="Call record() again.")
-        self._follower.check()
-        self._used = True
-        about = _about(self._client)
-        writer = await anyio.to_thread.run_sync(WriterThread, self._path, self._options, about)
-        self._writer = writer
-        self._follower.start(writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up)
-        return self
-
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._follower.detach()
-        self._ended = True
-        writer = self._writer
-        if writer is not None:
-            writer.end()  # from here on it finishes the file, even if the caller is cancelled
-        await self._follower.ended()
-        if writer is None:
-            return
-        try:
-            await anyio.to_thread.run_sync(writer.close, abandon_on_cancel=True)
-        except URLabError:
-            if exc is None:
-                raise  # otherwise it was logged, and the exception that ends the block takes precedence
-            return
-        stats = writer.stats
-        if missing := self.without_pictures:
-            log.warning(
-                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
-                self._path,
-                ", ".join(missing),
-            )
-        if stats.dropped_states or stats.dropped_frames:
-            lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
-            warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
-
-    def finish(self) -> None:
-        """Finish the file if the client's loop has already ended. Blocks."""
-        self._follower.forget()
-        if self._writer is not None:
-            self._writer.close()
+        self._mark(outcome, goal)
 
 
-class Recorder(BlockingFlavour[AsyncRecorder]):
+class Recorder(Recording, BlockingBlock):
     """A recording in progress, for the duration of a `with` block. Created by `record`."""
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self._aio.path
-
-    @property
-    def stats(self) -> RecorderStats:
-        """Current counters."""
-        return self._aio.stats
-
-    @property
-    def failed(self) -> bool:
-        """Whether writing has failed; leaving the block raises the reason."""
-        return self._aio.failed
-
-    @property
-    def without_pictures(self) -> list[str]:
-        """Cameras to record without a picture in the file so far."""
-        return self._aio.without_pictures
 
     def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
         """Mark the outcome of the current episode; see `AsyncRecorder.mark`."""
-        self._portal.call(self._aio.mark, outcome, goal=goal)
+        self._mark(outcome, goal)
 
 
-@overload
-def record(
-    client: AsyncClient,
-    path: str | os.PathLike[str],
-    *,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    image_format: Literal["jpeg", "png"] = ...,
-    jpeg_quality: int = ...,
-    pose_hz: float = ...,
-    contacts: bool = ...,
-    lossless: bool = ...,
-    buffer_mib: float = ...,
-    overwrite: bool = ...,
-) -> AsyncRecorder: ...
-@overload
-def record(
-    client: URLabClient,
-    path: str | os.PathLike[str],
-    *,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    image_format: Literal["jpeg", "png"] = ...,
-    jpeg_quality: int = ...,
-    pose_hz: float = ...,
-    contacts: bool = ...,
-    lossless: bool = ...,
-    buffer_mib: float = ...,
-    overwrite: bool = ...,
-) -> Recorder: ...
+@flavoured(AsyncRecorder, Recorder)
 def record(
     client: AsyncClient | URLabClient,
     path: str | os.PathLike[str],
@@ -257,8 +210,6 @@ def record(
         raise ValueError(f"image_format must be 'jpeg' or 'png', not {image_format!r}")
     if contacts and pose_hz == 0:
         raise ValueError("contacts come with the poses: pose_hz must be above 0")
-    core = aio_of(client) if isinstance(client, URLabClient) else client
-
     options = WriterOptions(
         image_format=image_format,
         jpeg_quality=jpeg_quality,
@@ -269,10 +220,7 @@ def record(
         overwrite=overwrite,
         lossless=lossless,
     )
-    recorder = AsyncRecorder(core, Path(path), cameras=cameras, camera_hz=camera_hz, pose_hz=pose_hz, options=options)
-    if isinstance(client, URLabClient):
-        return Recorder(recorder, portal_of(client))
-    return recorder
+    return in_flavour(client, AsyncRecorder, Recorder, Path(path), options, cameras=cameras, camera_hz=camera_hz)
 
 
 def _about(client: AsyncClient) -> dict[str, str]:

@@ -6,12 +6,13 @@ Its columns have the quantity and unit of each value, for axis labels.
 from __future__ import annotations
 
 import io
+import math
 import tempfile
 from array import array
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Literal, NamedTuple, TypeAlias
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -73,9 +74,6 @@ _SENSORS: dict[str, str] = {
 }
 _QUATERNIONS = frozenset({"ballquat", "framequat"})
 
-Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
-"""A number as decoded; numbers that JSON cannot represent are text."""
-
 
 class SampleTimes(NamedTuple):
     """Time of a sample: see `Table`, in nanoseconds and seconds."""
@@ -87,33 +85,144 @@ class SampleTimes(NamedTuple):
     episode: int
 
 
-class _Rows:
-    """Rows of numbers, in memory or in a temporary file.
+_TIMES = len(SampleTimes._fields)
 
-    If the system supports it, the file has no name, so a crash leaves nothing behind.
+
+@dataclass(slots=True)
+class _Field:
+    """Places of the values of one field of an articulation or entity in a row, in two parts if it has become wider."""
+
+    source: Source
+    name: str
+    parts: list[range] = field(default_factory=list[range])
+
+    @property
+    def width(self) -> int:
+        return sum(map(len, self.parts))
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One articulation or entity: its key, its layout, and names of the values of fields that the layout lacks."""
+
+    key: str
+    layout: SceneLayout
+    names: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+
+
+class TableBuilder:
+    """Builds one table. Samples arrive in order, with one part for each articulation and entity.
+
+    Each sample is written as one row. Columns keep their places while the table grows to the right; if it has grown,
+    or a field has become wider, the rows are written once more at the end, with the columns of each field together.
+
+    Args:
+        folder: Folder of a temporary file for the values, which the table then maps; None keeps them in memory. If the
+            system supports it, the file has no name, so a crash leaves nothing behind.
+        only: Fields to keep, such as `qpos`; None keeps all.
+        most: Largest number of values of the whole table, missing ones included.
     """
 
-    def __init__(self, folder: Path | None, width: int) -> None:
+    def __init__(self, folder: Path | None, only: Collection[str] | None = None, *, most: int) -> None:
         self._folder = folder
+        self._only = only
+        self._most = most
         self._file = self._opened()
-        self._count, self._width = 0, width
+        self._row = array("d")
+        self._width = _TIMES
+        self._rows: list[tuple[int, int]] = []  # widths, each with the number of successive rows
+        self._fields: dict[str, _Field] = {}
+        self._sources: dict[str, Source] = {}
+        self._sample = -1
+        self._count = 0
+        self._present = set[str]()
+        self._present_before = set[str]()
 
-    def append(self, rows: Floats) -> None:
-        """Add rows, which are as wide as `spread` says."""
-        self._file.write(rows.data)
-        self._count += len(rows)
+    def source(self, key: str, layout: SceneLayout) -> Source:
+        """Return the articulation or entity of a key, which is new if it has had no samples so far."""
+        return self._sources.setdefault(key, Source(key, layout))
 
-    def spread(self, places: list[int], width: int) -> None:
-        """Move each column to its place among more columns; new ones are NaN."""
-        before = self.values()
-        self.close()
-        self._file, self._width = self._opened(), width
-        for rows in np.array_split(before, 1 + before.size // PIECE_VALUES):
-            wider = np.full((len(rows), width), np.nan)
-            wider[:, places] = rows
-            self._file.write(wider.data)
+    def add(self, source: Source, sample: int, times: SampleTimes, **fields: Sequence[float]) -> None:
+        """Add a part of a sample."""
+        if sample < self._sample or (sample == self._sample and source.key in self._present):
+            raise ValueError(f"sample {sample} comes after sample {self._sample}")
+        kept = {
+            name: values for name, values in fields.items() if values and (self._only is None or name in self._only)
+        }
+        known = {name: self._fields.get(f"{source.key}/{name}") or _Field(source, name) for name in kept}
+        width = self._width + sum(max(0, len(values) - known[name].width) for name, values in kept.items())
+        count = self._count + (sample > self._sample)
+        if width > _MOST_COLUMNS or count * width > self._most:
+            raise ValueError(f"{count} samples of {width} values are too many for the size of the file")
+        if sample > self._sample:
+            self._write_row()
+            self._sample, self._present_before, self._present = sample, self._present, set[str]()
+            self._row = array("d", (times.log_ns / _NS, times.sim_time))
+            self._row.frombytes(array("q", times[2:]).tobytes())  # the bits of integers
+            self._row.extend([math.nan] * (self._width - _TIMES))
+            self._count = count
+        self._present.add(source.key)
+        for name, values in kept.items():
+            self._put(known[name], values)
 
-    def values(self) -> Floats:
+    def _put(self, into: _Field, values: Sequence[float]) -> None:
+        more = len(values) - into.width
+        if more > 0:
+            self._fields[f"{into.source.key}/{into.name}"] = into
+            into.parts.append(range(self._width, self._width + more))
+            self._width += more
+            self._row.extend([math.nan] * more)
+        taken = 0
+        for part in into.parts:
+            some = values[taken : taken + len(part)]
+            self._row[part.start : part.start + len(some)] = array("d", some)
+            taken += len(part)
+
+    def finish(self, *, broken_off: bool) -> Table:
+        """Return the table. If the recording broke off, and an articulation or entity of the sample before the last one
+        is missing in that, the last sample is left out."""
+        self._write_row()
+        order = [place for one in self._fields.values() for part in one.parts for place in part]
+        if len(self._rows) > 1 or order != sorted(order):
+            self._write_again([*range(_TIMES), *order])
+        partial = broken_off and not self._present_before <= self._present
+        rows = self._values()[: self._count - partial]
+        whole = rows.view(np.int64)
+        columns: dict[str, Column] = {}
+        at = _TIMES
+        for key, one in self._fields.items():
+            columns[key] = _column(one.source, one.name, rows[:, at : at + one.width])
+            at += one.width
+        return Table(rows[:, 0], rows[:, 1], whole[:, 2], whole[:, 3], whole[:, 4], columns)
+
+    def close(self) -> None:
+        """Close the temporary file; the table stays valid."""
+        if self._folder is not None:
+            self._file.close()
+
+    def _opened(self) -> IO[bytes]:
+        return io.BytesIO() if self._folder is None else tempfile.TemporaryFile(dir=self._folder, prefix=".urlab-")
+
+    def _write_row(self) -> None:
+        if self._row:
+            width, count = (
+                self._rows.pop() if self._rows and self._rows[-1][0] == len(self._row) else (len(self._row), 0)
+            )
+            self._rows.append((width, count + 1))
+            self._file.write(self._row)
+
+    def _write_again(self, order: list[int]) -> None:
+        """Write the rows with the same columns for all, in an order."""
+        before, self._file = self._file, self._opened()
+        before.seek(0)
+        for width, count in self._rows:
+            for part in np.array_split(np.empty((count, 0)), 1 + count * width // PIECE_VALUES):
+                rows = np.full((len(part), self._width), np.nan)
+                rows[:, :width] = np.frombuffer(before.read(8 * len(part) * width)).reshape(len(part), width)
+                self._file.write(np.ascontiguousarray(rows[:, order]).data)
+        before.close()
+
+    def _values(self) -> Floats:
         """Return all rows, shape (n, width), without a copy in memory."""
         if not self._count:
             return np.zeros((0, self._width))
@@ -124,138 +233,8 @@ class _Rows:
             flat = np.asarray(np.memmap(self._file, np.float64, "r"))
         return flat.reshape(self._count, self._width)
 
-    def close(self) -> None:
-        """Close the file; arrays that are in use stay valid."""
-        if self._folder is not None:
-            self._file.close()
 
-    def _opened(self) -> IO[bytes]:
-        if self._folder is None:
-            return io.BytesIO()
-        return tempfile.TemporaryFile(dir=self._folder, prefix=".urlab-")
-
-
-@dataclass(slots=True)
-class _Field:
-    """Rows of one field of an articulation or entity that are not stored yet, and their places among those samples."""
-
-    width: int = 0
-    places: list[int] = field(default_factory=list[int])
-    rows: list[array[float]] = field(default_factory=list["array[float]"])
-
-    def move_into(self, values: Floats) -> None:
-        """Write the rows into an array, except those beyond its end, and forget them."""
-        for place, row in zip(self.places, self.rows, strict=True):
-            if place < len(values):
-                values[place, : len(row)] = row
-        self.places, self.rows = [], []
-
-
-@dataclass(slots=True)
-class _Source:
-    """Samples of one articulation or entity."""
-
-    key: str
-    layout: SceneLayout
-    fields: dict[str, _Field] = field(default_factory=dict[str, _Field])
-    names: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-
-
-class TableBuilder:
-    """Builds one table. Samples arrive in order, with one part for each articulation and entity.
-
-    Args:
-        folder: Folder of a temporary file for the values, which the table then maps; None keeps them in memory.
-        only: Fields to keep, such as `qpos`; None keeps all.
-        most: Largest number of values of the whole table, missing ones included.
-    """
-
-    def __init__(self, folder: Path | None, only: Collection[str] | None = None, *, most: int) -> None:
-        self._rows = _Rows(folder, len(SampleTimes._fields))
-        self._only = only
-        self._most = most
-        self._count = 0
-        self._width = len(SampleTimes._fields)
-        self._sources: dict[str, _Source] = {}
-        self._sample = -1
-        self._present = set[str]()
-        self._present_before = set[str]()
-        self._times: list[SampleTimes] = []
-        self._layout: dict[str, range] = {}
-
-    def source(self, key: str, layout: SceneLayout) -> _Source:
-        """Return the samples of an articulation or entity so far."""
-        return self._sources.setdefault(key, _Source(key, layout))
-
-    def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
-        """Add a part of a sample."""
-        new = sample > self._sample
-        if sample < self._sample or (not new and source.key in self._present):
-            raise ValueError(f"sample {sample} comes after sample {self._sample}")
-        kept = {name: row for name, row in fields.items() if row and (self._only is None or name in self._only)}
-        widths = {name: source.fields[name].width if name in source.fields else 0 for name in kept}
-        self._width += sum(max(0, len(row) - widths[name]) for name, row in kept.items())
-        self._count += new
-        if self._width > _MOST_COLUMNS or self._count * self._width > self._most:
-            raise ValueError(f"{self._count} samples of {self._width} values are too many for the size of the file")
-        if new:
-            if len(self._times) * self._width >= PIECE_VALUES:
-                self._store(len(self._times))
-            self._sample, self._present_before, self._present = sample, self._present, set[str]()
-            self._times.append(times)
-        self._present.add(source.key)
-        for name, values in kept.items():
-            into = source.fields.setdefault(name, _Field())
-            into.width = max(into.width, len(values))
-            into.places.append(len(self._times) - 1)
-            into.rows.append(array("d", map(float, values)))
-
-    def finish(self, *, broken_off: bool) -> Table:
-        """Return the table. If the recording broke off, and an articulation or entity of the sample before the last one
-        is missing in that, the last sample is left out."""
-        partial = broken_off and not self._present_before <= self._present
-        self._store(len(self._times) - partial)
-        rows = self._rows.values()
-        whole = rows.view(np.int64)  # their columns hold the bits of integers
-        return Table(
-            time=rows[:, 0],
-            sim_time=rows[:, 1],
-            wall_ns=whole[:, 2],
-            step=whole[:, 3],
-            episode=whole[:, 4],
-            columns={
-                key: _column(self._sources[key.rpartition("/")[0]], key.rpartition("/")[2], rows[:, at.start : at.stop])
-                for key, at in self._layout.items()
-            },
-        )
-
-    def close(self) -> None:
-        """Close the temporary file; the table stays valid."""
-        self._rows.close()
-
-    def _store(self, count: int) -> None:
-        """Store the first of the samples that have come since the last time, and forget them."""
-        width, layout = len(SampleTimes._fields), dict[str, range]()
-        sources = self._sources.values()
-        fields = [(f"{source.key}/{name}", one) for source in sources for name, one in source.fields.items()]
-        for key, one in fields:
-            layout[key] = range(width, width + one.width)
-            width += one.width
-        if layout != self._layout:
-            kept = [place for key, before in self._layout.items() for place in layout[key][: len(before)]]
-            self._rows.spread([*range(len(SampleTimes._fields)), *kept], width)
-            self._layout = layout
-        rows = np.full((count, width), np.nan)
-        for row, times in zip(rows, self._times, strict=False):
-            row[:2] = times.log_ns / _NS, times.sim_time
-            row.view(np.int64)[2:5] = times.wall_ns, times.step, times.episode
-        for key, one in fields:
-            one.move_into(rows[:, layout[key].start : layout[key].stop])
-        self._rows.append(rows)
-        self._times = []
-
-
-def _column(source: _Source, name: str, values: Floats) -> Column:
+def _column(source: Source, name: str, values: Floats) -> Column:
     layout = source.layout
     known = {
         "qpos": layout.qpos,

@@ -60,11 +60,13 @@ def pair_rows(table: Table, outcomes: Sequence[OutcomeMessage] = (), only: Episo
 
 def pairs_at(table: Table, rows: NDArray[np.intp]) -> Table:
     """Return these rows of a table, of those in `pair_rows`, with the actions."""
-    found = table.with_arrays({key: values[rows] for key, values in table.arrays().items()})
+    columns = {key: replace(column, values=column.values[rows]) for key, column in table.columns.items()}
     for key in _acting(table):
         led = table.columns[key + _SET_POINTS]
-        found.columns[f"{key}/action"] = replace(led, values=led.values[rows + 1])
-    return found
+        columns[f"{key}/action"] = replace(led, values=led.values[rows + 1])
+    return Table(
+        table.time[rows], table.sim_time[rows], table.wall_ns[rows], table.step[rows], table.episode[rows], columns
+    )
 
 
 def check_episodes(only: Episodes) -> None:
@@ -107,5 +109,4 @@ def transitions(table: Table) -> Table:
 
 
 def _acting(table: Table) -> list[str]:
-    """Return the articulations with set-points."""
     return [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]

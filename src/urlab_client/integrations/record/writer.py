@@ -10,11 +10,12 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
@@ -25,12 +26,9 @@ from urlab_client.aio.background import background_thread
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.geometry import scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
-    ContactsMessage,
     EntityMessage,
     EpisodeMessage,
-    FrameTransforms,
     GapMessage,
-    JointStates,
     OutcomeMessage,
     Time,
     VariedQuantity,
@@ -45,10 +43,12 @@ from urlab_client.integrations._feed.samples import (
     SampleClock,
     Schedule,
     State,
-    articulation_message,
-    picture_message,
+    TopicMessage,
+    computed_messages,
+    picture_messages,
+    state_messages,
 )
-from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.pictures import PictureMemory
@@ -254,14 +254,13 @@ class WriterThread:
 
 
 class _McapFile:
-    """An unbuffered file: a forked child would write a buffer a second time."""
+    """An unbuffered file: a forked child would write a buffer a second time. The library buffers a raw file."""
 
     def __init__(self, path: Path, mode: str) -> None:
         self.written = 0
         self._raw = io.FileIO(path, mode)
 
     def write(self, data: bytes) -> int:
-        """Write all of it."""
         rest = memoryview(data)
         while rest:
             count = self._raw.write(rest) or 0
@@ -270,7 +269,6 @@ class _McapFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return the position, which is the end."""
         return self.written
 
     def flush(self) -> None:
@@ -309,7 +307,6 @@ class _Sink:
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **about})
 
     def write(self, item: State | CameraPicture | EpisodeMark) -> None:
-        """Write one item."""
         match item:
             case State():
                 self._write_state(item)
@@ -318,7 +315,7 @@ class _Sink:
             case EpisodeMark():
                 now = self._clock.last or 0
                 outcome = OutcomeMessage(Time.of(now), self._clock.episode, item.outcome, item.goal)
-                self._add("/recording/outcomes", outcome, now, item.wall_ns, {})
+                self._add("/recording/outcomes", outcome, now, item.wall_ns)
 
     def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
         """Write the chunk if its oldest message is old enough, which limits the loss in a crash."""
@@ -329,7 +326,6 @@ class _Sink:
             self._dirty_since = None
 
     def finish(self, dropped_states: int, dropped_frames: int) -> None:
-        """Write the rest, the index and the summary."""
         self._report(dropped_states, dropped_frames)
         totals = {
             "states": self.states,
@@ -346,31 +342,29 @@ class _Sink:
         now = self._clock.advance(item.nanoseconds, item.restarts)
         if item.scene is not self._scene:
             self._use(item.scene, now, item.wall_ns)
-        stamp, clock = Time.of(now), self._clock
+        episode = self._clock.episode
         self._write_episode(item, now)
-        for key in reply.per_articulation:
-            names = item.scene.names.get(key)
-            message = articulation_message(item, key, stamp, sample=self.states, episode=clock.episode)
-            self._add(f"/state/{key}", message, now, item.wall_ns, to_metadata(names) if names else {})
+        self._add_all(state_messages(item, now, sample=self.states, episode=episode), now, item.wall_ns)
         entities: Mapping[str, EntityState] = {}
         if isinstance(reply, StepOk | StateSnapshot):
             entities = reply.entities or {}
         for name, entity in entities.items():
             pose = EntityMessage(
-                timestamp=stamp,
+                timestamp=Time.of(now),
                 sim_time=reply.time,
                 sample=self.states,
                 step=reply.step,
-                episode=clock.episode,
+                episode=episode,
                 position=list(entity.xpos),
                 orientation=list(entity.xquat),
                 qvel=values(entity.qvel),
             )
-            self._add(f"/entity/{name}", pose, now, item.wall_ns, {})
+            self._add(f"/entity/{name}", pose, now, item.wall_ns)
         self.states += 1
         if self._simulation is not None and (self._poses.due(now) or item.restarts):
             self._simulation.take(reply.per_articulation, entities, forces=self.options.contacts)
-            self._write_derived(self._simulation, now, item.wall_ns)
+            computed = computed_messages(self._simulation, now, contacts=self.options.contacts)
+            self._add_all(computed, now, item.wall_ns)
 
     def _write_episode(self, item: State, now: int) -> None:
         """Write an episode's randomisation once, because an environment may reset several times at its start."""
@@ -385,27 +379,14 @@ class _Sink:
             VariedQuantity(vary.what, vary.by, dict(zip(elements.names, drawn.tolist(), strict=True)))
             for vary, elements, drawn in draws.varied
         ]
-        self._add("/recording/episodes", EpisodeMessage(Time.of(now), episode, seed, varied), now, item.wall_ns, {})
-
-    def _write_derived(self, simulation: Simulation, now: int, wall_ns: int) -> None:
-        stamp = Time.of(now)
-        self._add("/tf", FrameTransforms(simulation.transforms(stamp)), now, wall_ns, {})
-        joints = simulation.joints()
-        if joints:
-            self._add("/joint_states", JointStates(stamp, joints), now, wall_ns, {})
-        if self.options.contacts:
-            self._add("/contacts", ContactsMessage(stamp, simulation.contacts()), now, wall_ns, {})
+        self._add("/recording/episodes", EpisodeMessage(Time.of(now), episode, seed, varied), now, item.wall_ns)
 
     def _write_picture(self, item: CameraPicture) -> None:
-        clock, camera = self._clock, item.camera
-        sim = clock.sim if item.nanoseconds is None else item.nanoseconds
-        now = max(0, clock.offset + sim)
-        stamp, topic = Time.of(now), f"/camera/{camera.name}"
+        sim = self._clock.sim if item.nanoseconds is None else item.nanoseconds
+        now = max(0, self._clock.offset + sim)
         quality = self.options.jpeg_quality if self.options.image_format == "jpeg" else None
-        metadata = {"mode": str(camera.view.mode)}
-        memory = self.cameras.setdefault(camera.name, PictureMemory())
-        self._add(topic, picture_message(item, stamp, quality, memory), now, item.wall_ns, metadata)
-        self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
+        memory = self.cameras.setdefault(item.camera.name, PictureMemory())
+        self._add_all(picture_messages(item, now, quality, memory), now, item.wall_ns)
         self.frames += 1
 
     def _use(self, scene: FollowedScene, now: int, wall_ns: int) -> None:
@@ -418,32 +399,33 @@ class _Sink:
         if self.options.pose_ns > 0:
             self._simulation = Simulation(scene, scene.model)
             shapes = shapes_of(scene.model, self._simulation.bodies)
-            self._add("/scene", scene_update(shapes, Time.of(now)), now, wall_ns, {})
+            self._add("/scene", scene_update(shapes, Time.of(now)), now, wall_ns)
 
     def _report(self, dropped_states: int, dropped_frames: int) -> None:
         if (dropped_states, dropped_frames) != self._reported:
             before, self._reported = self._reported, (dropped_states, dropped_frames)
             now = self._clock.last or 0
             gap = GapMessage(Time.of(now), dropped_states - before[0], dropped_frames - before[1])
-            self._add("/recording/gaps", gap, now, time.time_ns(), {})
+            self._add("/recording/gaps", gap, now, time.time_ns())
 
-    def _add(self, name: str, message: Struct, now: int, wall_ns: int, metadata: dict[str, str]) -> None:
-        topic = self._topics.get((name, metadata.get("layout", "")))
+    def _add_all(self, messages: Iterable[TopicMessage], now: int, wall_ns: int) -> None:
+        for topic, make, metadata in messages:
+            self._add(topic, make(), now, wall_ns, metadata)
+
+    def _add(
+        self, name: str, message: Struct, now: int, wall_ns: int, metadata: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
+        key, kind = (name, metadata.get("layout", "")), type(message)
+        topic = self._topics.get(key)
         if topic is None:
-            topic = self._register(name, type(message), metadata)
+            if kind not in self._schemas:
+                self._schemas[kind] = self._writer.register_schema(schema_name(kind), "jsonschema", schema_of(kind))
+            channel = self._writer.register_channel(name, "json", self._schemas[kind], dict(metadata))
+            topic = self._topics[key] = _Topic(channel)
         self._writer.add_message(topic.channel, now, encode(message), wall_ns, topic.sequence)
         topic.sequence += 1
         if self._dirty_since is None:
             self._dirty_since = time.monotonic()
-
-    def _register(self, name: str, kind: type[Struct], metadata: dict[str, str]) -> _Topic:
-        schema = self._schemas.get(kind)
-        if schema is None:
-            schema = self._writer.register_schema(schema_name(kind), "jsonschema", schema_of(kind))
-            self._schemas[kind] = schema
-        topic = _Topic(self._writer.register_channel(name, "json", schema, metadata))
-        self._topics[name, metadata.get("layout", "")] = topic
-        return topic
 
 
 def _size(item: State | CameraPicture) -> int:

@@ -21,19 +21,11 @@ class _Motion(NamedTuple):
     sign: float
 
 
+# Two keys for each axis: forwards and backwards.
 _MOTIONS: Final[dict[str, _Motion]] = {
-    "w": _Motion(0, 1.0),
-    "s": _Motion(0, -1.0),
-    "a": _Motion(1, 1.0),
-    "d": _Motion(1, -1.0),
-    "r": _Motion(2, 1.0),
-    "f": _Motion(2, -1.0),
-    "c": _Motion(3, 1.0),
-    "z": _Motion(3, -1.0),
-    "b": _Motion(4, 1.0),
-    "v": _Motion(4, -1.0),
-    "q": _Motion(5, 1.0),
-    "e": _Motion(5, -1.0),
+    key: _Motion(axis, sign)
+    for axis, keys in enumerate(("ws", "ad", "rf", "cz", "bv", "qe"))
+    for key, sign in zip(keys, (1.0, -1.0), strict=True)
 }
 _VERDICTS: Final[dict[str, Verdict]] = {
     "\r": "success",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 from collections.abc import Awaitable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
@@ -14,10 +15,9 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import EpisodeOutcome
+from urlab_client.integrations._flavours import blocking
 from urlab_client.integrations.teleop.hand import HandControl
 from urlab_client.protocol.base import Floats
-from urlab_client.sync._facade import aio_of, portal_of
-from urlab_client.sync.client import URLabClient
 from urlab_client.values.plain import Serializable
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ async def teleoperate(
     *,
     hand: HandControl | None = None,
     task: Task | None = None,
-    recorder: AsyncRecorder | None = None,
+    recorder: AsyncRecorder | Recorder | None = None,
     episodes: int | None = None,
     seconds: float | None = None,
     hz: float = 50.0,
@@ -141,50 +141,25 @@ async def teleoperate(
     return await session.run(episodes, seconds)
 
 
-def teleoperate_blocking(
-    client: URLabClient,
-    operator: Operator,
-    *,
-    hand: HandControl | None = None,
-    task: Task | None = None,
-    recorder: Recorder | None = None,
-    episodes: int | None = None,
-    seconds: float | None = None,
-    hz: float = 50.0,
-    seed: int = 0,
-    paced: bool = False,
-) -> TeleopTally:
-    """Teleoperate like `teleoperate`, with a blocking client and its recorder."""
-    return portal_of(client).call(
-        teleoperate,
-        aio_of(client),
-        operator,
-        hand=hand,
-        task=task,
-        recorder=None if recorder is None else recorder.aio,
-        episodes=episodes,
-        seconds=seconds,
-        hz=hz,
-        seed=seed,
-        paced=paced,
-    )
+teleoperate_blocking = blocking(teleoperate)
+"""Teleoperate like `teleoperate`, with a blocking client and its recorder."""
 
 
+@dataclass
 class _Session:
     """One call of `teleoperate`."""
 
-    def __init__(
-        self,
-        client: AsyncClient,
-        operator: Operator,
-        *,
-        hand: HandControl | None,
-        task: Task | None,
-        recorder: AsyncRecorder | None,
-        hz: float,
-        seed: int,
-        paced: bool,
-    ) -> None:
+    client: AsyncClient
+    operator: Operator
+    hand: HandControl | None
+    task: Task | None
+    recorder: AsyncRecorder | Recorder | None
+    hz: float
+    seed: int
+    paced: bool
+
+    def __post_init__(self) -> None:
+        client = self.client
         model = client.model
         if model is None:
             raise URLabError(
@@ -197,24 +172,19 @@ class _Session:
                 hint="Make the client with step_mode='direct'.",
             )
         timestep = float(model.opt.timestep)
-        if not 0 < hz <= 1.0 / timestep * (1.0 + 1e-9):
+        if not 0 < self.hz <= 1.0 / timestep * (1.0 + 1e-9):
             raise ValueError(f"hz must be above 0 and at most one period per physics step, {1.0 / timestep:g}")
-        self._client = client
-        self._operator = operator
-        self._recorder = recorder
-        self._paced = paced
-        self._rng = np.random.default_rng(seed)
-        self._task = task
-        self._n_steps = max(1, round(1.0 / (hz * timestep)))
+        self._rng = np.random.default_rng(self.seed)
+        self._n_steps = max(1, round(1.0 / (self.hz * timestep)))
         self._starts: EnvEpisode | None = None
-        if task is not None:
+        if self.task is not None:
             from urlab_client.integrations.gym.episode import EnvEpisode
             from urlab_client.integrations.gym.settings import EpisodeSettings
 
-            settings = EpisodeSettings.of(task=task, cameras=())
+            settings = EpisodeSettings.of(task=self.task, cameras=())
             self._n_steps = settings.n_substeps
             self._starts = EnvEpisode(client, settings=settings)
-        self._hand = HandControl(client) if hand is None else hand
+        self._hand = HandControl(client) if self.hand is None else self.hand
         self._period = self._n_steps * timestep
         self._tally = TeleopTally()
         self._episode = 0
@@ -227,18 +197,18 @@ class _Session:
             verdict, moved = await self._drive(seconds)
             if moved:
                 await self._judge("discarded" if verdict == "quit" else verdict)
-            if verdict == "quit" or (self._recorder is not None and self._recorder.failed):
+            if verdict == "quit" or (self.recorder is not None and self.recorder.failed):
                 break
         return self._tally
 
     async def _drive(self, seconds: float | None) -> tuple[Verdict, bool]:
         """Run one episode; return its verdict, and whether anything moved."""
-        client, began, moved = self._client, self._client.sim_time, False
+        client, began, moved = self.client, self.client.sim_time, False
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
             view = self._view(client.sim_time - began)
-            answer = self._operator(view)
+            answer = self.operator(view)
             command = await answer if inspect.isawaitable(answer) else answer
             if command.verdict is not None:
                 return command.verdict, moved
@@ -249,7 +219,7 @@ class _Session:
                 self._hand.drive(command.linear, command.angular, command.gripper, dt=self._period)
                 await client.step(self._n_steps)
             due = max(due + self._period, loop.time() - self._period)
-            await asyncio.sleep(max(0.0, due - loop.time()) if self._paced or not moved else 0.0)
+            await asyncio.sleep(max(0.0, due - loop.time()) if self.paced or not moved else 0.0)
 
     def _view(self, time: float) -> TeleopView:
         position, quaternion = self._hand.ik.pose()
@@ -268,22 +238,24 @@ class _Session:
     async def _judge(self, verdict: EpisodeOutcome) -> None:
         self._episode += 1
         self._tally = self._tally.replace(**{verdict: getattr(self._tally, verdict) + 1})
-        if self._recorder is not None:
-            await self._recorder.mark(verdict, goal=self._goal_and_success()[0])
+        if self.recorder is not None:
+            marking = self.recorder.mark(verdict, goal=self._goal_and_success()[0])
+            if inspect.isawaitable(marking):
+                await marking
 
     async def _reset(self) -> None:
         if self._starts is None:
-            for articulation in self._client.articulations.values():
+            for articulation in self.client.articulations.values():
                 articulation.ctrl_array[:] = 0.0
-            await self._client.reset()
+            await self.client.reset()
         else:
             seed = None if self._starts.randomise is None else int(self._rng.integers(2**31))
             await self._starts.reset(self._rng, seed=seed)
 
     def _goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         """Return the goal of the episode, and whether the current state is a success."""
-        if self._starts is None or self._task is None:
+        if self._starts is None or self.task is None:
             return {}, None
         states = self._starts.states()
-        found = self._task.success(states)
+        found = self.task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])

@@ -2,40 +2,51 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, overload
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from msgspec import Struct
 
 from urlab_client._installation import need
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.geometry import Shape, scene_update, shapes_of
 from urlab_client.integrations._feed.messages import (
-    ContactsMessage,
-    FrameTransforms,
-    JointStates,
+    ArrowPrimitive,
+    Color,
+    ContactMessage,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    SolidPrimitive,
     Time,
+    Vector3,
     encode,
     schema_name,
     schema_of,
 )
-from urlab_client.integrations._feed.samples import CameraPicture, State, articulation_message, picture_message
-from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration, to_metadata
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
+from urlab_client.integrations._feed.samples import (
+    CameraPicture,
+    TopicMessage,
+    computed_messages,
+    picture_messages,
+    state_messages,
+)
+from urlab_client.integrations._feed.scene import FollowedScene, Simulation
+from urlab_client.integrations._flavours import flavoured, in_flavour
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
+from urlab_client.protocol.base import Floats
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
     import foxglove
-    from foxglove import messages as fox
-    from foxglove.channels import SceneUpdateChannel
     from foxglove.websocket import ChannelView, Client, WebSocketServer
 
 _JPEG_QUALITY = 80
+_RED = Color(1.0, 0.2, 0.1, 1.0)
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 _BACKLOG = 64  # queue length per browser; older messages are dropped
 _JOINING_S = 1.0  # how long after a subscription the newest state is sent again
@@ -49,7 +60,6 @@ class _Foxglove(ViewBackend):
         self._sensors = sensors
         self._server: WebSocketServer | None = None
         self._context: foxglove.Context | None = None
-        self._contact_channel: SceneUpdateChannel | None = None
         self._channels: dict[tuple[str, str], foxglove.Channel] = {}
         self._shapes: list[Shape] = []
         self._last: Moment | None = None
@@ -64,7 +74,6 @@ class _Foxglove(ViewBackend):
 
     def open(self) -> None:
         import foxglove
-        from foxglove.channels import SceneUpdateChannel
         from foxglove.websocket import ServerListener
 
         backend = self
@@ -75,7 +84,6 @@ class _Foxglove(ViewBackend):
                 backend._joined = time.monotonic()
 
         self._context = foxglove.Context()
-        self._contact_channel = SceneUpdateChannel("/contact_markers", context=self._context)
         try:
             self._server = foxglove.start_server(
                 name="urlab",
@@ -101,20 +109,17 @@ class _Foxglove(ViewBackend):
 
     def show(self, moment: Moment) -> None:
         self._last = moment
-        stamp, simulation = Time.of(moment.ns), moment.simulation
-        self._send("/tf", lambda: FrameTransforms(simulation.transforms(stamp)), moment.ns)
-        joints = simulation.joints()
-        if joints:
-            self._send("/joint_states", lambda: JointStates(stamp, joints), moment.ns)
-        if moment.state is not None:
-            self._send_states(moment, moment.state)
+        simulation, ns = moment.simulation, moment.ns
+        self._send(computed_messages(simulation, ns, contacts=moment.contacts), ns)
         if moment.contacts:
-            self._send_contacts(moment)
+            self._send([TopicMessage("/contact_markers", lambda: _markers(simulation.contacts(), Time.of(ns)))], ns)
+        if moment.state is not None:
+            step, episode = moment.step, moment.episode
+            states = state_messages(moment.state, ns, sample=step, episode=episode, sensors=self._sensors)
+            self._send(states, ns)
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
-        self._send(topic, lambda: picture_message(picture, stamp, _JPEG_QUALITY), ns)
-        self._send(f"{topic}/calibration", lambda: calibration(picture.camera, stamp), ns)
+        self._send(picture_messages(picture, ns, _JPEG_QUALITY), ns)
 
     def idle(self) -> bool:
         # So that clients that join while time stands still see something. Repeated, because a subscription may be
@@ -123,7 +128,7 @@ class _Foxglove(ViewBackend):
         if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
             self._shown = now
             ns = self._last.ns
-            self._send("/scene", lambda: scene_update(self._shapes, Time.of(ns)), ns)
+            self._send([TopicMessage("/scene", lambda: scene_update(self._shapes, Time.of(ns)))], ns)
             self.show(self._last)
         return True
 
@@ -133,107 +138,49 @@ class _Foxglove(ViewBackend):
         if self._server is not None:
             self._server.stop()
 
-    def _send(self, topic: str, make: Callable[[], Struct], ns: int, metadata: dict[str, str] | None = None) -> None:
-        """Send the result of `make`, which is called only if there is a subscriber, and once for the topic's schema."""
+    def _send(self, messages: Iterable[TopicMessage], ns: int) -> None:
+        """Send messages, which are made only if there is a subscriber, and once for the topic's schema."""
         import foxglove
 
-        key = topic, (metadata or {}).get("layout", "")
-        channel = self._channels.get(key)
-        if channel is None:
-            kind = type(make())
-            schema = foxglove.Schema(name=schema_name(kind), encoding="jsonschema", data=schema_of(kind))
-            self._channels[key] = foxglove.Channel(
-                topic, schema=schema, message_encoding="json", context=self._context, metadata=metadata or {}
-            )
-        elif channel.has_sinks():
-            channel.log(encode(make()), log_time=ns)
-
-    def _send_states(self, moment: Moment, item: State) -> None:
-        for key in item.reply.per_articulation:
-            names = moment.scene.names.get(key)
-            make = functools.partial(
-                articulation_message,
-                item,
-                key,
-                Time.of(moment.ns),
-                sample=item.reply.step,
-                episode=moment.episode,
-                sensors=self._sensors,
-            )
-            self._send(f"/state/{key}", make, moment.ns, to_metadata(names) if names else {})
-
-    def _send_contacts(self, moment: Moment) -> None:
-        from foxglove import messages as fox
-
-        contacts = moment.simulation.contacts()
-        self._send("/contacts", lambda: ContactsMessage(Time.of(moment.ns), contacts), moment.ns)
-        channel = self._contact_channel
-        if channel is None or not channel.has_sinks():
-            return
-        red = fox.Color(r=1.0, g=0.2, b=0.1, a=1.0)
-        points: list[fox.SpherePrimitive] = []
-        arrows: list[fox.ArrowPrimitive] = []
-        for contact in contacts:
-            at = _vector(contact.position.x, contact.position.y, contact.position.z)
-            points.append(fox.SpherePrimitive(pose=fox.Pose(position=at), size=_vector(0.016, 0.016, 0.016), color=red))
-            force = np.array([contact.force.x, contact.force.y, contact.force.z])
-            newtons = float(np.linalg.norm(force))
-            if newtons > 0:
-                arrows.append(
-                    fox.ArrowPrimitive(
-                        pose=fox.Pose(position=at, orientation=_along(force / newtons)),
-                        shaft_length=0.8 * _NEWTON_M * newtons,
-                        shaft_diameter=0.008,
-                        head_length=0.2 * _NEWTON_M * newtons,
-                        head_diameter=0.016,
-                        color=red,
-                    )
+        for topic, make, metadata in messages:
+            key = topic, metadata.get("layout", "")
+            channel = self._channels.get(key)
+            if channel is None:
+                kind = type(make())
+                schema = foxglove.Schema(name=schema_name(kind), encoding="jsonschema", data=schema_of(kind))
+                self._channels[key] = foxglove.Channel(
+                    topic, schema=schema, message_encoding="json", context=self._context, metadata=dict(metadata)
                 )
-        entity = fox.SceneEntity(id="contacts", frame_id="world", spheres=points, arrows=arrows)
-        channel.log(fox.SceneUpdate(entities=[entity]), log_time=moment.ns)
+            elif channel.has_sinks():
+                channel.log(encode(make()), log_time=ns)
 
 
-def _vector(x: float, y: float, z: float) -> fox.Vector3:
-    from foxglove import messages as fox
+def _markers(contacts: list[ContactMessage], time: Time) -> SceneUpdate:
+    """Return contacts as spheres, and their forces as arrows."""
+    entity = SceneEntity(
+        time, "world", "contacts", frame_locked=False, cubes=[], spheres=[], cylinders=[], triangles=[], arrows=[]
+    )
+    for contact in contacts:
+        at = Pose(contact.position, Quaternion(0.0, 0.0, 0.0, 1.0))
+        entity.spheres.append(SolidPrimitive(at, Vector3(0.016, 0.016, 0.016), _RED))
+        force = np.array([contact.force.x, contact.force.y, contact.force.z])
+        newtons = float(np.linalg.norm(force))
+        if newtons > 0:
+            length, along = _NEWTON_M * newtons, Pose(contact.position, _along(force / newtons))
+            entity.arrows.append(ArrowPrimitive(along, 0.8 * length, 0.008, 0.2 * length, 0.016, _RED))
+    return SceneUpdate([], [entity])
 
-    return fox.Vector3(x=x, y=y, z=z)
 
-
-def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quaternion:
+def _along(direction: Floats) -> Quaternion:
     """Return the shortest rotation of the x axis, along which arrows point, to a unit vector."""
-    from foxglove import messages as fox
-
     x, y, z = direction.tolist()
     if x < -1 + 1e-9:
-        return fox.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+        return Quaternion(0.0, 0.0, 1.0, 0.0)
     scale = float(np.sqrt(2 * (1 + x)))
-    return fox.Quaternion(x=0.0, y=-z / scale, z=y / scale, w=scale / 2)
+    return Quaternion(0.0, -z / scale, y / scale, scale / 2)
 
 
-@overload
-def foxglove_view(
-    client: AsyncClient,
-    *,
-    host: str = ...,
-    port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> AsyncView: ...
-@overload
-def foxglove_view(
-    client: URLabClient,
-    *,
-    host: str = ...,
-    port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> View: ...
+@flavoured(AsyncView, View)
 def foxglove_view(
     client: AsyncClient | URLabClient,
     *,
@@ -273,5 +220,14 @@ def foxglove_view(
     and `KeyError` for an unknown camera.
     """
     need("foxglove", "PIL", extra="foxglove")
-    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
-    return make_view(client, _Foxglove(host=host, port=port, sensors=sensors), options, "foxglove_view")
+    return in_flavour(
+        client,
+        AsyncView,
+        View,
+        _Foxglove(host=host, port=port, sensors=sensors),
+        "foxglove_view",
+        cameras=cameras,
+        camera_hz=camera_hz,
+        max_hz=max_hz,
+        contacts=contacts,
+    )

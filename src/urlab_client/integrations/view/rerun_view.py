@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from urlab_client.integrations._feed.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation, calibration
-from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend, ViewOptions, make_view
+from urlab_client.integrations._flavours import flavoured, in_flavour
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewBackend
 from urlab_client.sync.client import URLabClient
 
 if TYPE_CHECKING:
@@ -76,7 +77,8 @@ class _Rerun(ViewBackend):
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for shape in shapes_of(simulation.model, simulation.bodies):
             where = f"{_body(shape.body)}/{rr.escape_entity_path_part(shape.name)}"
-            drawn, self._static[where] = _drawn(shape)
+            drawn = _drawn(shape)
+            self._static[where] = type(drawn)
             w, x, y, z = shape.orientation
             pose = rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
             recording.log(where, pose, drawn, static=True)
@@ -176,7 +178,7 @@ def _transform(frame: FrameTransform) -> rerun.Transform3D:
     )
 
 
-def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
+def _drawn(shape: Shape) -> rerun.AsComponents:
     import rerun as rr
 
     solid = rr.components.FillMode.Solid
@@ -184,52 +186,21 @@ def _drawn(shape: Shape) -> tuple[rerun.AsComponents, type[rerun.AsComponents]]:
     rgba = [shape.rgba]
     match shape.kind:
         case Kind.BOX:
-            return rr.Boxes3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid), rr.Boxes3D
+            return rr.Boxes3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid)
         case Kind.ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid), rr.Ellipsoids3D
+            return rr.Ellipsoids3D(half_sizes=[(x, y, z)], colors=rgba, fill_mode=solid)
         case Kind.CYLINDER:
-            return rr.Cylinders3D(lengths=[2 * y], radii=[x], colors=rgba, fill_mode=solid), rr.Cylinders3D
+            return rr.Cylinders3D(lengths=[2 * y], radii=[x], colors=rgba, fill_mode=solid)
         case Kind.CAPSULE:
             # Rerun's origin is the lower end, MuJoCo's the centre.
             middle = [(0.0, 0.0, -y)]
-            capsule = rr.Capsules3D(lengths=[2 * y], radii=[x], translations=middle, colors=rgba, fill_mode=solid)
-            return capsule, rr.Capsules3D
+            return rr.Capsules3D(lengths=[2 * y], radii=[x], translations=middle, colors=rgba, fill_mode=solid)
         case Kind.MESH:
             vertices = np.zeros((0, 3)) if shape.vertices is None else shape.vertices
-            mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=shape.triangles, albedo_factor=shape.rgba)
-            return mesh, rr.Mesh3D
+            return rr.Mesh3D(vertex_positions=vertices, triangle_indices=shape.triangles, albedo_factor=shape.rgba)
 
 
-@overload
-def rerun_view(
-    client: AsyncClient,
-    *,
-    save: str | os.PathLike[str] | None = ...,
-    connect: str | None = ...,
-    web: bool = ...,
-    web_port: int = ...,
-    grpc_port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> AsyncView: ...
-@overload
-def rerun_view(
-    client: URLabClient,
-    *,
-    save: str | os.PathLike[str] | None = ...,
-    connect: str | None = ...,
-    web: bool = ...,
-    web_port: int = ...,
-    grpc_port: int = ...,
-    cameras: Sequence[str] | Literal["all"] = ...,
-    camera_hz: float = ...,
-    contacts: bool = ...,
-    sensors: bool = ...,
-    max_hz: float = ...,
-) -> View: ...
+@flavoured(AsyncView, View)
 def rerun_view(
     client: AsyncClient | URLabClient,
     *,
@@ -277,7 +248,16 @@ def rerun_view(
     need("rerun", "PIL", extra="rerun")
     if (save is not None) + (connect is not None) + web > 1:
         raise ValueError("give one of save, connect and web")
-    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     path = None if save is None else Path(save)
     backend = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return make_view(client, backend, options, "rerun_view")
+    return in_flavour(
+        client,
+        AsyncView,
+        View,
+        backend,
+        "rerun_view",
+        cameras=cameras,
+        camera_hz=camera_hz,
+        max_hz=max_hz,
+        contacts=contacts,
+    )

@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 import anyio.to_thread
 import numpy as np
@@ -22,13 +21,13 @@ from msgspec import Struct
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
-from urlab_client.integrations._feed.follower import BlockingFlavour, Follower
+from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
 from urlab_client.integrations._feed.scene import FollowedScene, Simulation
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.plain import Serializable
 
@@ -54,16 +53,6 @@ class ViewStats(Serializable, Struct, kw_only=True, frozen=True):
     frames: int
     dropped_states: int
     dropped_frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class ViewOptions:
-    """What to show, and how often."""
-
-    cameras: Sequence[str] | Literal["all"]
-    camera_hz: float
-    max_hz: float
-    contacts: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,17 +123,33 @@ class _Start:
     step: int
 
 
-class AsyncView:
-    """A view that is open for the duration of an `async with` block. Created by `rerun_view` and similar functions."""
+class Viewing(Block):
+    """A view of either flavour.
 
-    def __init__(self, client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> None:
+    Raises:
+        ValueError: An option is out of range.
+    """
+
+    def __init__(
+        self,
+        client: AsyncClient,
+        backend: ViewBackend,
+        name: str,
+        *,
+        cameras: Sequence[str] | Literal["all"],
+        camera_hz: float,
+        max_hz: float,
+        contacts: bool,
+    ) -> None:
+        for key, value in (("max_hz", max_hz), ("camera_hz", camera_hz)):
+            if not 0 < value <= 1000:
+                raise ValueError(f"{key} must be above 0 and at most 1000, not {value}")
         self._client = client
         self._backend = backend
-        self._options = options
         self._name = name
-        self._follower = Follower(
-            client, name=name, cameras=options.cameras, camera_hz=options.camera_hz, needs_model="", buffer=0
-        )
+        self._period = 1 / max_hz
+        self._contacts = contacts
+        self._follower = Follower(client, name=name, cameras=cameras, camera_hz=camera_hz, needs_model="", buffer=0)
         self._states: deque[State | _Start] = deque(maxlen=1)
         self._pictures: dict[int, CameraPicture] = {}
         self._counts = {"states": 0, "frames": 0, "dropped_states": 0, "dropped_frames": 0}
@@ -178,7 +183,7 @@ class AsyncView:
         """The error with which displaying failed; the simulation continues without the view."""
         return self._error
 
-    async def __aenter__(self) -> Self:
+    async def _begin(self) -> None:
         if self._opened:
             raise URLabError("A view opens once.", hint="Call the function that made it again.")
         scene = self._follower.check()
@@ -188,11 +193,8 @@ class AsyncView:
             self._states.append(self._start(scene))
         self._thread.start()
         self._follower.start(self._put, failed=self._fail)
-        return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def _end(self, error: BaseException | None) -> None:
         self._follower.detach()
         self._stop.set()
         await self._follower.ended()
@@ -206,8 +208,7 @@ class AsyncView:
                 return _Start(scene, np.zeros(0), np.zeros(0), round(client.sim_time * _NS), client.step_count)
             return _Start(scene, data.qpos.copy(), data.qvel.copy(), round(data.time * _NS), client.step_count)
 
-    def finish(self) -> None:
-        """End if the client's loop has already ended. Blocks."""
+    def _finish(self) -> None:
         self._follower.forget()
         self._stop.set()
         self._thread.join()
@@ -229,7 +230,6 @@ class AsyncView:
     # In the thread
 
     def _run(self) -> None:
-        period = 1 / self._options.max_hz
         pause = 0.0
         try:
             # At intervals instead of at each state, which would take the interpreter lock from the stepping thread.
@@ -239,7 +239,7 @@ class AsyncView:
                 if not self._backend.idle():
                     return
                 took = time.monotonic() - started
-                pause = max(period - took, took)  # at most half of a processor's time
+                pause = max(self._period - took, took)  # at most half of a processor's time
             self._drain()
         except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on
             self._error = error
@@ -275,7 +275,7 @@ class AsyncView:
             self._simulation, self._scene = simulation, item.scene
             self._backend.use(simulation, item.scene)
         state = item if isinstance(item, State) else None
-        contacts = self._options.contacts
+        contacts = self._contacts
         if isinstance(item, State):
             reply = item.reply
             entities: dict[str, EntityState] = {}
@@ -293,46 +293,12 @@ class AsyncView:
         self._counts["states"] += 1
 
 
-class View(BlockingFlavour[AsyncView]):
+class AsyncView(Viewing, AsyncBlock):
+    """A view that is open for the duration of an `async with` block. Created by `rerun_view` and similar functions."""
+
+
+class View(Viewing, BlockingBlock):
     """A view that is open for the duration of a `with` block. Created by `rerun_view` and similar functions."""
-
-    @property
-    def stats(self) -> ViewStats:
-        """Current counters."""
-        return self._aio.stats
-
-    @property
-    def address(self) -> str:
-        """Address of the served view; empty before the block, and if nothing is served."""
-        return self._aio.address
-
-    @property
-    def closed(self) -> bool:
-        """Whether the view has ended: the window was closed, displaying failed, or the block has ended."""
-        return self._aio.closed
-
-    @property
-    def error(self) -> Exception | None:
-        """The error with which displaying failed; the simulation continues without the view."""
-        return self._aio.error
-
-
-def make_view(
-    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
-) -> AsyncView | View:
-    """Return a view of the client's flavour.
-
-    Raises:
-        ValueError: An option is out of range.
-    """
-    for key, value in (("max_hz", options.max_hz), ("camera_hz", options.camera_hz)):
-        if not 0 < value <= 1000:
-            raise ValueError(f"{key} must be above 0 and at most 1000, not {value}")
-    core = aio_of(client) if isinstance(client, URLabClient) else client
-    view = AsyncView(core, backend, options, name)
-    if isinstance(client, URLabClient):
-        return View(view, portal_of(client))
-    return view
 
 
 def missing_for_window() -> str:
@@ -385,10 +351,7 @@ class _Window(ViewBackend):
             viewer.close()
 
 
-@overload
-def window_view(client: AsyncClient, *, max_hz: float = ...) -> AsyncView: ...
-@overload
-def window_view(client: URLabClient, *, max_hz: float = ...) -> View: ...
+@flavoured(AsyncView, View)
 def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> AsyncView | View:
     """Show a client's simulation in MuJoCo's own window; a context manager of the client's flavour.
 
@@ -403,5 +366,6 @@ def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> A
 
     Entering the block raises `URLabError` if no window can be opened; the message says what is missing.
     """
-    options = ViewOptions(cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True)
-    return make_view(client, _Window(), options, "window_view")
+    return in_flavour(
+        client, AsyncView, View, _Window(), "window_view", cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True
+    )
