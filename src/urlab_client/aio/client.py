@@ -12,7 +12,9 @@ from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
 from urlab_client.aio.arguments import integer, require
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.background import running_loop
+from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
@@ -64,7 +66,9 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicyName,
 )
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
 from urlab_client.values.html import fields
+from urlab_client.values.names import NameMap, unknown_name
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -214,7 +218,9 @@ class URLabClient(ClientState):
         )
         state.objects.move = self._motion.move_to
         self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
-        super().__init__(config, session, state)
+        super().__init__(state)
+        self._config = config
+        self._session = session
         self._discovery = Discovery(
             state,
             local_model=local_model,
@@ -235,6 +241,67 @@ class URLabClient(ClientState):
         self._farm = FarmNamespace(session)
         self._recording = RecordingNamespace(session, state)
         self._replay = ReplayNamespace(session, state)
+
+    @property
+    def address(self) -> str:
+        """The address given to the constructor."""
+        return self._config.address
+
+    @property
+    def config(self) -> ClientConfig:
+        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
+        return self._config
+
+    @property
+    def articulations(self) -> NameMap[URLabArticulation]:
+        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
+        return self._state.objects.articulations
+
+    @property
+    def articulations_by_id(self) -> dict[str, URLabArticulation]:
+        """Articulations that have an actor id, by that id."""
+        return self._state.objects.articulations_by_id
+
+    @property
+    def entities(self) -> NameMap[URLabEntity]:
+        """Every dynamic body by name, articulations included."""
+        return self._state.objects.entities
+
+    @property
+    def global_cameras(self) -> NameMap[URLabCameraView]:
+        """Scene-level cameras by name."""
+        return self._state.objects.global_cameras
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
+
+        Raises:
+            UnknownName: No camera or more than one has this name. It is a `KeyError`.
+        """
+        objects = self._state.objects
+        view = objects.camera(name)
+        if view is None:
+            raise unknown_name("camera", name, objects.camera_names())
+        return view
+
+    def describe(self) -> SceneDescription:
+        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
+
+        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
+        """
+        with self._state.mirror.lock:
+            described = [entity.describe() for entity in self.entities.values()]
+            model = self.model
+            return SceneDescription(
+                address=self.address,
+                playing=self.manager_present,
+                step_mode=str(self.step_mode),
+                sim_time=self.sim_time,
+                timestep=None if model is None else float(model.opt.timestep),
+                articulations=[one for one in described if isinstance(one, ArticulationDescription)],
+                entities=[one for one in described if isinstance(one, EntityDescription)],
+                cameras=[camera.describe() for camera in self.global_cameras.values()],
+            )
 
     # Namespaces
 

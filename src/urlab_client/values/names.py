@@ -126,6 +126,17 @@ class PublicDir:
         return [name for name in super().__dir__() if not name.startswith("_") or name.startswith("__")]
 
 
+class Local(PublicDir):
+    """Base class of what the async and the blocking client share: it reads and writes `_state`, and never waits."""
+
+    __slots__ = ("__weakref__", "_state")
+
+    _state: Any
+
+    def __init__(self, state: object) -> None:
+        self._state = state
+
+
 class NameMap(PublicDir, dict[str, T]):
     """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from urlab_client.protocol.messages.session import (
     EntityState,
     TwistState,
 )
+
+if TYPE_CHECKING:
+    from urlab_client.aio.model.elements import ArticulationElements
 
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
@@ -156,6 +159,7 @@ class MirroredArticulation(MirroredEntity):
 
     Attributes:
         layout: Addresses of its values in the compiled model.
+        elements: Handles of its joints, actuators, sensors and bodies once they were asked for.
         info: Description from the handshake.
         controller: Controller block from the handshake, kept current.
         control_mode: Whether the controller is active.
@@ -189,6 +193,7 @@ class MirroredArticulation(MirroredEntity):
         """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
+        self.elements: ArticulationElements | None = None
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
         self._sensor_names = [*layout.sensor_dims]
         self._sensor_dims = [*layout.sensor_dims.values()]

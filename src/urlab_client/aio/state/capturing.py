@@ -158,7 +158,7 @@ class _Taking:
         for view in self._views:
             sample = self._found[id(view)]
             view.pictures.deliver(sample.pixels, sample.sim_time, sample.frame_id)
-            view.delivered = True
+            view.pictures.delivered = True
         return [self._found[id(view)] for view in self._views]
 
     async def _ask(self) -> None:

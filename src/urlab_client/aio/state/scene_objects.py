@@ -163,7 +163,7 @@ class SceneObjects:
         for view in views:
             if view.delivered and id(view) not in delivered:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
-            view.delivered = id(view) in delivered
+            view.pictures.delivered = id(view) in delivered
 
     def _bind_articulations(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
         wrappers: dict[str, URLabArticulation] = {}

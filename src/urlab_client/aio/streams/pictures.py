@@ -38,9 +38,16 @@ _IDLE_S: Final = 5.0
 
 
 class LatestPicture(MessageHandler):
-    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access."""
+    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access.
+
+    Attributes:
+        camera: The camera.
+        delivered: False if the last step that requested a picture got none.
+    """
 
     def __init__(self, source: CameraSource) -> None:
+        self.camera: Camera = source.camera
+        self.delivered: bool = True
         self._source = source
         self._lock = Lock()
         self._message: tuple[bytes, BytesLike] | None = None
