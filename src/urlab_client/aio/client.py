@@ -230,7 +230,7 @@ class URLabClient(ClientState):
         )
         self._monitor = ConnectionMonitor(session, state)
         self._keeper = SessionKeeper(session, state, self._discovery)
-        self._transport.on_event = self._monitor.on_connection
+        self._transport.on_event = self._monitor.on_transport
         self._closed = False
         self._sim = SimNamespace(session, state, self._discovery)
         self._scene = SceneNamespace(session, self._sim)

@@ -11,37 +11,11 @@ from urlab_client.aio.arguments import collection
 from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import client_closed
-from urlab_client.events import (
-    ClientEvent,
-    PlayEnded,
-    PlayStarted,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-    SessionLost,
-    SessionOpened,
-    TaskFailed,
-)
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.messages.streams import StreamPolicy
 from urlab_client.values.names import did_you_mean
 
-_KINDS: dict[str, type[ClientEvent]] = {
-    str(kind.__struct_config__.tag): kind
-    for kind in (
-        ServerConnected,
-        ServerLost,
-        ServerReconnected,
-        ServerSilent,
-        ServerAnswers,
-        SessionOpened,
-        SessionLost,
-        PlayStarted,
-        PlayEnded,
-        TaskFailed,
-    )
-}
+_KINDS = {str(kind.__struct_config__.tag): kind for kind in ClientEvent.__subclasses__()}
 
 
 class EventBus:
