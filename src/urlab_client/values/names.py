@@ -280,7 +280,7 @@ def names_meant(name: str, names: Collection[str], prefixes: Mapping[str, str]) 
         return [name]
     local = {f"{prefix}_{name}" for prefix in prefixes.values()}
     keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
-    return sorted((local | keyed).intersection(names))
+    return [found for found in names if found in local | keyed]
 
 
 def spellings(names: Iterable[str], prefixes: Mapping[str, str]) -> list[tuple[str, ...]]:
