@@ -829,7 +829,7 @@ class TestEvents:
         dropped = bus.stream((), 3)
         del dropped
         gc.collect()
-        assert not bus._listeners
+        assert not bus.heard
 
 
 class TestBackground:

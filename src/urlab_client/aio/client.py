@@ -35,7 +35,6 @@ from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
-from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
@@ -199,19 +198,11 @@ class URLabClient(ClientState):
             read_only=read_only,
         )
         self._publishers = Publishers(
-            lambda: self._transport.endpoint,
-            self._state_port,
-            default_timeout=rcv_timeout_ms / 1000,
-            live=lambda: self._state.mode.live,
-            features=lambda: session.features,
-            keys=keys,
-            memory=memory,
+            session, self._state_port, live=lambda: self._state.mode.live, keys=keys, memory=memory
         )
         session.tell = self._publishers.events.publish
         if memory is not None:
             memory.tell = session.tell
-        if not read_only:
-            self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
         state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
         self._motion = Motion(
             state, step=self.step, explain=self.explain, locate=self._locate, stall_timeout=rcv_timeout_ms / 1000

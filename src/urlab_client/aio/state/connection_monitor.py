@@ -70,7 +70,7 @@ class ConnectionMonitor(MessageHandler):
         publishers.events.publish(event)
         if isinstance(event, ServerReconnected):
             self._session.was_down = self._session.was_down or event.refused
-            publishers.resume_regions()
+            publishers.refresh()
             self._investigate()
 
     async def aclose(self) -> None:

@@ -60,11 +60,7 @@ class Discovery:
         return hello
 
     async def open_read_only(self, turn: Turn, handshake: bytes) -> None:
-        """Apply the result of another client's `handshake()` without opening a session.
-
-        Raises:
-            ValueError: `handshake` is not the result of `handshake()`.
-        """
+        """Apply the result of another client's `handshake()`, or raise `ValueError`, without opening a session."""
         session = self._state.session
         try:
             hello = decode_reply(op_of(Hello), HelloOk, handshake)
