@@ -92,10 +92,9 @@ class Job(Generic[T]):
     Attributes:
         error: The exception that it raised; otherwise `value` is its result.
         finished: Whether it has ended.
-        leave: Whether its caller should stop waiting for it.
     """
 
-    __slots__ = ("_news", "coro", "error", "finished", "leave", "task", "value")
+    __slots__ = ("_news", "coro", "error", "finished", "task", "value")
 
     value: T
 
@@ -104,7 +103,6 @@ class Job(Generic[T]):
         self.task: asyncio.Task[T] | None = None
         self.error: BaseException | None = None
         self.finished = False
-        self.leave = False
         self._news: SimpleQueue[None] = SimpleQueue()
 
     def wait(self, timeout: float | None = _WAIT_SLICE) -> None:
@@ -182,15 +180,12 @@ class CallerDrivenLoop:
             drives = self._begin(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
-                # First, because a signal that arrives between this line and the next ones sets it again. The other way
-                # round, its handler would not run before the job is done.
-                job.leave = False
                 if signals.arrived:
                     # Here and not in the loop: what a handler raises there would hit whatever task is running.
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
                 elif drives and not self._ended:
-                    self._drive(job)
+                    self._drive(job, signals)
                 else:
                     job.wait()
         except BaseException:
@@ -229,7 +224,6 @@ class CallerDrivenLoop:
 
     def _call_away(self, job: Job[Any]) -> None:
         """Make the caller of `job` check whether it should continue waiting."""
-        job.leave = True
         job.wake()
         if self._driven is job:
             self._poke(self._loop.stop)
@@ -246,28 +240,27 @@ class CallerDrivenLoop:
         self._ensure_driver()
         deadline = time.monotonic() + GRACE
         while not job.finished and (left := deadline - time.monotonic()) > 0:
-            job.leave = False
             job.wait(left)
         if not job.finished:
             _log.warning(
                 "%s is still running %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE
             )
 
-    def _drive(self, job: Job[Any]) -> None:
-        """Run the loop on this thread until `job` is finished or its caller must leave."""
+    def _drive(self, job: Job[Any], signals: DeferredSignals) -> None:
+        """Run the loop on this thread until `job` is finished or a signal has arrived."""
         while not self._turn.acquire(blocking=False):
-            if job.leave:
+            if signals.arrived:
                 return
             # Again in each slice: the thread may have taken the turn only after it was asked.
             self._poke(self._yield)
             if self._turn.acquire(timeout=_CLAIM_SLICE):
                 break
         try:
-            if job.task is None and not self._ended:  # otherwise this caller was called away, and comes back
+            if job.task is None and not self._ended:  # otherwise this caller comes back from a signal
                 self._start_job(job)
             self._driven = job
             # In a loop, because anything may stop the loop: another caller that wants the turn, or code of a task.
-            while not (job.finished or job.leave or self._ended):
+            while not (job.finished or signals.arrived or self._ended):
                 self._run_loop()
             self._driven = None
         finally:
