@@ -61,7 +61,7 @@ class LocalCamera(Local):
     @property
     def frame_id(self) -> int | None:
         """Id of the state snapshot that the newest frame shows, comparable to `StepOk.frame_id`; None if not sent."""
-        return self._state.frame_id()
+        return self._state.newest()[2]
 
     @property
     def mode(self) -> CameraMode | str:

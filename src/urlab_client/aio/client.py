@@ -67,7 +67,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
 from urlab_client.values.html import fields
-from urlab_client.values.names import NameMap, unknown_name
+from urlab_client.values.names import NameMap
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -269,11 +269,7 @@ class URLabClient(ClientState):
         Raises:
             UnknownName: No camera or more than one has this name. It is a `KeyError`.
         """
-        objects = self._state.objects
-        view = objects.camera(name)
-        if view is None:
-            raise unknown_name("camera", name, objects.camera_names())
-        return view
+        return self._state.objects.require_camera(name)
 
     def describe(self) -> SceneDescription:
         """Return all robots, other dynamic bodies and scene cameras as of the last reply.

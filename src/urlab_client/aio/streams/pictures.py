@@ -82,13 +82,11 @@ class LatestPicture(MessageHandler):
     def came(self) -> bool:
         return self._pixels is not None or self._message is not None
 
-    def frame_id(self) -> int | None:
-        """Return the number of the snapshot that the newest picture shows, or None if unknown. Call from any thread."""
-        self.newest()
-        return self._frame_id
+    def newest(self) -> tuple[Pixels | None, float | None, int | None]:
+        """Return the newest picture, its simulation time and the number of its snapshot, each None if missing.
 
-    def newest(self) -> tuple[Pixels | None, float | None]:
-        """Return the newest picture and its simulation time, each None if missing. Call from any thread."""
+        Call from any thread.
+        """
         with self._lock:
             if self._message is not None:
                 (topic, payload), self._message = self._message, None
@@ -101,7 +99,7 @@ class LatestPicture(MessageHandler):
                 else:
                     self._pixels, self._sim_time = sample.pixels, sample.sim_time
                     self._frame_id = sample.frame_id
-            return self._pixels, self._sim_time
+            return self._pixels, self._sim_time, self._frame_id
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         if self._lock.acquire(blocking=False):  # held during conversion: skip this picture, the next one follows
