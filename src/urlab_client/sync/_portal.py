@@ -117,22 +117,16 @@ class Portal:
             return
         if self._io is not None and self._io.is_current:
             raise _on_io_thread()
-        error: BaseException | None = None
-        with DeferredSignals() as signals:
+        with DeferredSignals():
             try:
                 if last is not None:
                     with contextlib.suppress(ClientClosed):  # Another thread was faster.
-                        io = self._ready()
-                        job = Job(last(*args, **kwargs))
-                        io.run(job, signals)
-                        error = job.error
+                        self.call(last, *args, **kwargs)
             finally:
                 with self._lock:
                     self._closed = True
                 if self._finalizer is not None:
                     self._finalizer()
-        if error is not None and not isinstance(error, ClientClosed):
-            raise error
 
     def twin(self, aio: object, make: Callable[[], A]) -> A:
         """Return the blocking twin of `aio`: the same object while it is referenced, otherwise a new one."""

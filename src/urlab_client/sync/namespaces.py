@@ -76,7 +76,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
@@ -101,7 +100,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
@@ -121,7 +119,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -136,7 +133,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -144,9 +140,6 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
 
     def list_keyframes(self, *, timeout: Timeout = DEFAULT) -> list[KeyframeInfo]:
         """List the compiled keyframes.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
@@ -162,9 +155,6 @@ class ReplayOps(Facade, twin=aio_ops.ReplayOps):
 
     def list_sessions(self, *, timeout: Timeout = DEFAULT) -> list[str]:
         """List the loaded sessions.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
@@ -189,7 +179,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         self._portal.call(self._aio.create_level, name, force_overwrite=force_overwrite, timeout=timeout)
@@ -202,16 +191,12 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         self._portal.call(self._aio.load_level, name_or_path, timeout=timeout)
 
     def save_level(self, *, timeout: Timeout = DEFAULT) -> None:
         """Save the open level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
@@ -220,9 +205,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
 
     def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
         """Return the package path of the open level; during play this is still the edited level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -234,9 +216,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
         """Ensure that the level has one manager actor, without which play never becomes ready.
 
         Returns whether the level already had one.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -253,7 +232,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             DestroyAssetFailed: The asset exists but cannot be deleted.
         """
         return self._portal.call(self._aio.destroy_asset, asset_path, timeout=timeout)
@@ -279,7 +257,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         self._portal.call(
@@ -301,7 +278,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             ActorHierarchyFailed: No actor matches.
         """
         return self._portal.call(self._aio.actor_hierarchy, target, by_name=by_name, timeout=timeout)
@@ -315,9 +291,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
 
     def list_blueprints(self, *, timeout: Timeout = DEFAULT) -> list[BlueprintInfo]:
         """List the articulation blueprints of the project.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ListBlueprintsFailed: The content could not be searched.
@@ -336,7 +309,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             GetActorBoundsFailed: No actor matches.
         """
         return self._portal.call(
@@ -352,7 +324,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SelectFailed: No actor matches.
         """
         self._portal.call(self._aio.select_actor, target, by_name=by_name, timeout=timeout)
@@ -382,7 +353,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             AddQuickConvertFailed: No actor matches, or it has no mesh to convert.
         """
         self._portal.call(
@@ -406,7 +376,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             RemoveQuickConvertFailed: No actor matches, or it is not converted.
         """
         self._portal.call(self._aio.remove_quick_convert, target, by_name=by_name, timeout=timeout)
@@ -443,7 +412,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(self._aio.draw_marker, location, color, ttl=ttl, label=label, tag=tag, timeout=timeout)
@@ -471,7 +439,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(self._aio.draw_line, from_, to, color, ttl=ttl, thickness=thickness, tag=tag, timeout=timeout)
@@ -499,7 +466,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -538,7 +504,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -576,7 +541,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
@@ -611,7 +575,6 @@ class DebugNamespace(Facade, twin=aio_ops.DebugNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoEngine: There is no engine object to draw with.
         """
         self._portal.call(self._aio.set_overlay_text, text, anchor=anchor, timeout=timeout)
@@ -642,7 +605,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoViewport: The editor has no perspective viewport.
         """
         return self._portal.call(
@@ -656,9 +618,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
 
     def get_camera(self, *, timeout: Timeout = DEFAULT) -> CameraPose:
         """Read the viewport camera's pose.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NoViewport: The editor has no perspective viewport.
@@ -674,7 +633,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
@@ -689,7 +647,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
             Unsupported: The request is not supported without Unreal; only the simulated server answers this.
@@ -715,7 +672,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
@@ -724,11 +680,7 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
         )
 
     def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Stop tracking, and return whether it was active.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """Stop tracking, and return whether it was active."""
         return self._portal.call(self._aio.untrack, timeout=timeout)
 
 

@@ -70,7 +70,6 @@ class RuntimeOps(Namespace):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
@@ -95,7 +94,6 @@ class RuntimeOps(Namespace):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
             NotControlOwner: Another client controls the robot, or no client does; nothing was written.
             NoTwistController: The articulation has no twist controller.
@@ -118,7 +116,6 @@ class RuntimeOps(Namespace):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -136,7 +133,6 @@ class RuntimeOps(Namespace):
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
             UnknownBody: The compiled model has no body with this name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
@@ -144,9 +140,6 @@ class RuntimeOps(Namespace):
 
     async def list_keyframes(self, *, timeout: Timeout = DEFAULT) -> list[KeyframeInfo]:
         """List the compiled keyframes.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
@@ -159,9 +152,6 @@ class ReplayOps(Namespace):
 
     async def list_sessions(self, *, timeout: Timeout = DEFAULT) -> list[str]:
         """List the loaded sessions.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
@@ -183,7 +173,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             CreateLevelFailed: The level already exists, a play session is running, or it could not be saved.
         """
         await self._call(CreateLevel(name=name, force_overwrite=force_overwrite), timeout)
@@ -196,16 +185,12 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             LoadLevelFailed: The level does not exist, cannot be read, or a play session is running.
         """
         await self._call(LoadLevel(name_or_path=name_or_path), timeout)
 
     async def save_level(self, *, timeout: Timeout = DEFAULT) -> None:
         """Save the open level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
@@ -214,9 +199,6 @@ class SceneOps(Namespace):
 
     async def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
         """Return the package path of the open level; during play this is still the edited level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -228,9 +210,6 @@ class SceneOps(Namespace):
         """Ensure that the level has one manager actor, without which play never becomes ready.
 
         Returns whether the level already had one.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -247,7 +226,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             DestroyAssetFailed: The asset exists but cannot be deleted.
         """
         return (await self._call(DestroyAsset(asset_path=asset_path), timeout)).was_found
@@ -273,7 +251,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SetActorTransformFailed: No actor matches, or the rotation is invalid.
         """
         await self._call(
@@ -298,7 +275,6 @@ class SceneOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             ActorHierarchyFailed: No actor matches.
         """
         return (await self._call(ActorHierarchy(target=target, target_by=target_by(by_name)), timeout)).root
@@ -309,9 +285,6 @@ class OutlinerOps(Namespace):
 
     async def list_blueprints(self, *, timeout: Timeout = DEFAULT) -> list[BlueprintInfo]:
         """List the articulation blueprints of the project.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ListBlueprintsFailed: The content could not be searched.
@@ -330,7 +303,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             GetActorBoundsFailed: No actor matches.
         """
         return fill(
@@ -349,7 +321,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             SelectFailed: No actor matches.
         """
         await self._call(SelectActor(target=target, target_by=target_by(by_name)), timeout)
@@ -379,7 +350,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             AddQuickConvertFailed: No actor matches, or it has no mesh to convert.
         """
         await self._call(
@@ -404,7 +374,6 @@ class OutlinerOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             RemoveQuickConvertFailed: No actor matches, or it is not converted.
         """
         await self._call(RemoveQuickConvert(target=target, target_by=target_by(by_name)), timeout)
@@ -438,7 +407,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -471,7 +439,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -509,7 +476,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -549,7 +515,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -588,7 +553,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
         await self._call(
@@ -624,7 +588,6 @@ class DebugNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoEngine: There is no engine object to draw with.
         """
         await self._call(SetOverlayText(text=text, anchor=anchor), timeout)
@@ -652,7 +615,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             NoViewport: The editor has no perspective viewport.
         """
         return fill(
@@ -671,9 +633,6 @@ class ViewportNamespace(Namespace):
     async def get_camera(self, *, timeout: Timeout = DEFAULT) -> CameraPose:
         """Read the viewport camera's pose.
 
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-
         Raises:
             NoViewport: The editor has no perspective viewport.
         """
@@ -688,7 +647,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
@@ -703,7 +661,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             InvalidMode: Unknown viewport mode.
             NoViewport: The editor has no perspective viewport.
             Unsupported: The request is not supported without Unreal; only the simulated server answers this.
@@ -729,7 +686,6 @@ class ViewportNamespace(Namespace):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            MissingField: A required field is absent, empty or malformed.
             UnknownActor: No actor matches; the message contains the key.
             NoViewport: The editor has no perspective viewport.
         """
@@ -743,11 +699,7 @@ class ViewportNamespace(Namespace):
         ).tracked_actor_path
 
     async def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Stop tracking, and return whether it was active.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """Stop tracking, and return whether it was active."""
         return (await self._call(Untrack(), timeout)).was_tracking
 
 
