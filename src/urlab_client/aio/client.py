@@ -707,8 +707,7 @@ class URLabClient(ClientState):
         self._publishers.close()
         try:
             playing = self.connected and self.manager_present
-            if self._publishers.camera_switch is not None:
-                await self._publishers.camera_switch.aclose(connected=playing)
+            await self._publishers.camera_switch.aclose(connected=playing)
             await self._session.control.aclose(connected=playing)
             await self._keeper.aclose()
             await self._monitor.aclose()

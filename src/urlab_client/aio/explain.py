@@ -95,7 +95,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState, stat
 def _cameras(session: Session, state: SimState) -> Iterator[Finding]:
     """Check which cameras stream, on a server where they are off by default."""
     switch = state.publishers.camera_switch
-    if switch is None or not session.features.camera_switch:
+    if not session.features.camera_switch:
         return
     silent = [
         f"{art.prefix}/{name}"

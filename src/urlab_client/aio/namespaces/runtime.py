@@ -266,7 +266,7 @@ class RuntimeNamespace(RuntimeOps):
         wanted = {name: _transports(name, how) for name, how in given.items()}
         topics = {name: self._camera_topic("set_camera_streaming", name) for name in wanted}
         switch = self._state.publishers.camera_switch
-        if switch is None or not self._session.features.camera_switch:
+        if not self._session.features.camera_switch:
             return {name: self._always_on(name, how) for name, how in wanted.items()}
         states = (
             await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}

@@ -357,8 +357,7 @@ class SimState:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
-        if self.publishers.camera_switch is not None:
-            self.publishers.camera_switch.forget()
+        self.publishers.camera_switch.forget()
         self.mode.end_play()
         self.recording = False
         self.session.unsettled.clear()

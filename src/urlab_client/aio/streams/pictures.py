@@ -226,9 +226,7 @@ class StepStreams:
     async def opened(self) -> None:
         try:
             async with asyncio.timeout(_OPENING_S):
-                switch = self._publishers.camera_switch
-                if switch is not None:
-                    await switch.settled()
+                await self._publishers.camera_switch.settled()
                 for listener in tuple(self._listeners.values()):
                     await _connected(listener, self._publishers)
         except TimeoutError:

@@ -52,7 +52,7 @@ class Publishers:
         subscriptions: Active subscriptions.
         events: Events of the client.
         regions: Active shared memory regions; None if the client does not use shared memory.
-        camera_switch: Switch that turns cameras on and off; None if they always stream.
+        camera_switch: Switch that turns cameras on and off.
         capture: Callback that takes pictures without a step; set by the client.
         own_steps: Delivers the client's own steps to receivers of snapshots.
     """
@@ -71,9 +71,7 @@ class Publishers:
         self.default_timeout: float | None = session.default_timeout
         self.subscriptions: Subscriptions = Subscriptions(keys)
         self.events: EventBus = EventBus()
-        self.camera_switch: CameraSwitch | None = None
-        if not session.read_only:
-            self.camera_switch = CameraSwitch(session, self.subscriptions.refresh)
+        self.camera_switch: CameraSwitch = CameraSwitch(session, self.subscriptions.refresh)
         self.own_steps: OwnSteps = OwnSteps()
         self.regions: Regions | None = None if memory is None else Regions(memory, self.subscriptions)
         self._session = session
