@@ -23,13 +23,16 @@ class EventBus:
 
     Attributes:
         on_listener: Callback invoked on any thread when a listener is added.
+        lock: Guards the listeners, and the end.
+        listeners: The listeners, with the kinds of events that each wants.
+        closed: Whether the client was closed.
     """
 
     def __init__(self) -> None:
         self.on_listener: Callable[[], None] | None = None
-        self.lock = threading.Lock()
+        self.lock: threading.Lock = threading.Lock()
         self.listeners: dict[StreamHandler[ClientEvent], frozenset[type[ClientEvent]]] = {}
-        self.closed = False
+        self.closed: bool = False
 
     def stream(self, kinds: Collection[str | type[ClientEvent]], buffer: int) -> Stream[ClientEvent]:
         """Return a stream of future events that buffers the last `buffer` of them. Call from any thread.
