@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from copy import copy
+from functools import partial
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
@@ -28,7 +29,7 @@ from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
-from urlab_client.aio.state.capturing import Capturing
+from urlab_client.aio.state.capturing import take_pictures
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
 from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
@@ -204,11 +205,9 @@ class URLabClient(ClientState):
         if memory is not None:
             memory.tell = session.tell
         state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
-        self._motion = Motion(
-            state, step=self.step, explain=self.explain, locate=self._locate, stall_timeout=rcv_timeout_ms / 1000
-        )
+        self._motion = Motion(state, step=self.step, explain=self.explain, locate=self._locate)
         state.objects.move = self._motion.move_to
-        self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
+        self._publishers.capture = partial(take_pictures, state)
         super().__init__(state)
         self._config = config
         self._session = session

@@ -152,11 +152,8 @@ class CallerDrivenLoop:
         """Start the thread."""
         try:
             self._thread.start()
-        except BaseException:
-            if self._thread.ident is None:
-                self._loop.close()
-            else:
-                self._request_stop()
+        except BaseException:  # the system refuses another thread
+            self._loop.close()
             raise
 
     @property
