@@ -29,7 +29,7 @@ class Plan:
         modules: Mirrored modules, as patterns below `aio`.
         root: The class that users construct: it owns a portal.
         dropped: Base classes without public members, which façade classes do without.
-        exposed: Private names that are public all the same.
+        local: Base class of the classes that the façade shares.
         renames: What methods are called in the façade; docstrings follow.
     """
 
@@ -38,7 +38,7 @@ class Plan:
     modules: tuple[str, ...]
     root: str
     dropped: frozenset[str] = frozenset()
-    exposed: frozenset[str] = frozenset()
+    local: str = ""
     renames: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
@@ -105,8 +105,23 @@ class Sources:
                 if is_plain(name) and self.homes.setdefault(name, module) is not module:
                     raise module.refuse(node, f"{name} is the name of another mirrored class, too")
         self.facades: set[str] = {plan.root}
+        self.shared: set[str] = set()
         while more := {name for name in self.homes if self._needs_facade(name)} - self.facades:
-            self.facades |= more | {base for name in more for base in self._bases(name) if base in self.homes}
+            bases = {base for name in more for base in self._bases(name) if base in self.homes}
+            self.facades |= more | {base for base in bases if not self._is_local(base)}
+        # Objects of these may be of a façade class.
+        self.shared = {base for name in self.facades for base in self.ancestors(name)} - self.facades
+
+    def ancestors(self, name: str) -> Iterator[str]:
+        """Yield the mirrored classes that a class is derived from."""
+        for base in self._bases(name):
+            if base in self.homes:
+                yield base
+                yield from self.ancestors(base)
+
+    def _is_local(self, name: str) -> bool:
+        bases = self._bases(name)
+        return self.plan.local in bases or any(base in self.homes and self._is_local(base) for base in bases)
 
     def _bases(self, name: str) -> list[str]:
         return [base for node in self.homes[name].classes[name].bases for base in names_in(node)[:1]]
@@ -136,10 +151,10 @@ class Sources:
     def is_public(self, name: str) -> bool:
         if name.startswith("__") and name.endswith("__"):
             return name not in UNMIRRORED
-        return is_plain(name) or name in self.plan.exposed
+        return is_plain(name)
 
     def mentions(self, module: Module, annotation: ast.expr | None) -> bool:
-        return not self.facades.isdisjoint(module.names(annotation))
+        return not self.facades.union(self.shared).isdisjoint(module.names(annotation))
 
 
 def is_plain(name: str) -> bool:

@@ -506,10 +506,12 @@ def render_module(module: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+SHARED = "shared"  # a class that both clients share has one page, which begins with this word
+
 # Of each class of the clients: its page, its home in `aio`, its home in `sync` if that differs, what has it.
 CLASSES = {
     "URLabClient": ("client", "client", "", "its constructor"),
-    "ClientState": ("state", "client_state", "", "every client: `client.step_mode`, `client.articulations`, …"),
+    "ClientState": ("state", "client_state", SHARED, "every client: `client.step_mode`, `client.model`, …"),
     "SceneNamespace": ("scene", "namespaces.scene", "namespaces", "`client.scene`"),
     "SimNamespace": ("sim", "namespaces.sim", "namespaces", "`client.sim`"),
     "RuntimeNamespace": ("runtime", "namespaces.runtime", "namespaces", "`client.runtime`"),
@@ -519,21 +521,21 @@ CLASSES = {
     "RecordingNamespace": ("recording", "namespaces.recording", "namespaces", "`client.recording`"),
     "ReplayNamespace": ("replay", "namespaces.recording", "namespaces", "`client.replay`"),
     "URLabArticulation": ("articulation", "articulation", "", "`client.articulations`"),
-    "URLabEntity": ("entity", "articulation", "", "`client.entities`; every articulation is one"),
+    "URLabEntity": ("entity", "articulation", SHARED, "`client.entities`; every articulation is one"),
     "URLabController": ("controller", "controllers", "", "`articulation.controller`"),
     "URLabPDController": ("pd-controller", "controllers", "", "`articulation.controller`, if it is a PD controller"),
     "URLabCameraView": ("camera", "cameras", "", "`articulation.cameras` and `client.global_cameras`"),
     "Stream": ("stream", "streams.stream", "streams", "`client.state_stream()`, `camera.frames()`, `client.events()`"),
 }
-OF_THEIR_OWN = {"URLabClient": "ClientState", "URLabArticulation": "URLabEntity"}
-"""Classes whose inherited members are on the page of another class, because there are so many."""
+OF_THEIR_OWN = {"URLabClient": "ClientState"}
+"""Classes whose inherited members are on the page of a shared class, because there are so many."""
 
 
 def render_class(name: str, flavour: str, title: str) -> str:
     slug, core, facade, owner = CLASSES[name]
     home = f"aio.{core}" if flavour == "aio" else f"sync.{facade or core}"
     base = OF_THEIR_OWN.get(name)
-    more = f" Inherited members are on the page [{base}]({flavour}-{CLASSES[base][0]}.md)." if base else ""
+    more = f" Inherited members are on the page [{base}]({SHARED}-{CLASSES[base][0]}.md)." if base else ""
     options = "\n    options:\n      inherited_members: false" if base else ""
     other, words = ("blocking", "blocking client") if flavour == "aio" else ("aio", "async client")
     return f"""\
@@ -548,13 +550,28 @@ has the same one.{more}
 """
 
 
+def render_shared_class(name: str) -> str:
+    _, core, _, owner = CLASSES[name]
+    return f"""\
+{START}. Do not edit. -->
+
+# {name}
+
+You get it from: {owner}. The [blocking client](blocking.md) and the [async client](aio.md) share this class.
+
+::: urlab_client.aio.{core}.{name}
+"""
+
+
 def class_pages() -> dict[str, Callable[[], str]]:
-    flavours = (("blocking", "blocking client"), ("aio", "async client"))
-    return {
-        f"{flavour}-{slug}.md": partial(render_class, name, flavour, title)
-        for flavour, title in flavours
-        for name, (slug, *_) in CLASSES.items()
-    }
+    pages: dict[str, Callable[[], str]] = {}
+    for name, (slug, _, facade, _) in CLASSES.items():
+        if facade == SHARED:
+            pages[f"{SHARED}-{slug}.md"] = partial(render_shared_class, name)
+        else:
+            pages[f"blocking-{slug}.md"] = partial(render_class, name, "blocking", "blocking client")
+            pages[f"aio-{slug}.md"] = partial(render_class, name, "aio", "async client")
+    return pages
 
 
 def namespace_pages() -> dict[str, Callable[[], str]]:

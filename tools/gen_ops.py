@@ -117,7 +117,8 @@ def method(op: Any, source: Source) -> str:
     positional = declarations[: op.positional]
     keywords = [*declarations[op.positional :], "timeout: Timeout = DEFAULT"]
     signature = ", ".join(["self", *positional, "*", *keywords])
-    docs.append(("timeout", "Seconds to wait; None waits without limit."))
+    if docs:
+        docs.append(("timeout", "Seconds to wait; None waits without limit."))
     returns, unpack = result(op)
     call = f"await self._call({cls}({', '.join(arguments)}), timeout)"
     lines = [
@@ -145,9 +146,10 @@ def docstring(op: Any, docs: list[tuple[str, str]]) -> str:
 
     text = inspect.cleandoc(op.request.__doc__)
     arguments = "\n".join(wrapped(f"{name}: {text}") for name, text in docs)
-    sections = [text, f"Args:\n{arguments}"]
-    if op.errors:
-        rows = [f"{errors.RPC_ERRORS[code].__name__}: {errors.RPC_ERRORS[code].__doc__}" for code in op.errors]
+    sections = [text, f"Args:\n{arguments}"] if docs else [text]
+    codes = [code for code in op.errors if code != "missing_field"]  # a method has parameters for all that it requires
+    if codes:
+        rows = [f"{errors.RPC_ERRORS[code].__name__}: {errors.RPC_ERRORS[code].__doc__}" for code in codes]
         sections.append("Raises:\n" + "\n".join(wrapped(row) for row in rows))
     return '"""' + "\n\n".join(sections) + '\n"""'
 

@@ -10,7 +10,8 @@ What becomes of a mirrored module:
 
 - A package below `aio` becomes one module.
 - A class with an async method, or one that hands out such a class, becomes a façade class of the same name that holds
-  its async twin. Its base and derived classes do, too. Other classes are shared: imported from the source.
+  its async twin. Its base and derived classes do, too, except for bases that are derived from `Local`: they are the
+  bases of the façade class, too. Other classes are shared: imported from the source.
 - `async def` waits in the portal, `def` and properties delegate, an annotated attribute with a docstring becomes a
   read-only property. Private names are left out.
 - Annotations and defaults are copied as source text. A result that mentions a façade class is mapped by its
@@ -56,7 +57,7 @@ PLAN = Plan(
     ),
     root="URLabClient",
     dropped=frozenset({"Namespace", "PublicDir"}),
-    exposed=frozenset({"_data_lock"}),
+    local="Local",
     renames={
         "__aiter__": "__iter__",
         "__anext__": "__next__",
@@ -216,7 +217,7 @@ class Mirror:
         bases: list[str] = []
         for base in node.bases:
             (name, *_) = names_in(base)
-            if name in self.sources.facades:
+            if name in self.sources.facades or name in self.sources.shared:
                 self.at_run_time.add(name)
             elif name in self.sources.plan.dropped:
                 continue
@@ -252,11 +253,12 @@ class Mirror:
             raise self.module.refuse(node, f"{cls.name}.{name} is public: describe it, or make it private")
         if "ClassVar" in names_in(node.annotation):
             raise self.module.refuse(node, f"{cls.name}.{name}: class variables cannot be mirrored")
+        value = self._result(cls, node, node.annotation, f"self._aio.{name}", name)
         lines = [
             "@property",
             f"def {name}(self) -> {self._text(node.annotation)}:",
             self._docstring(doc),
-            f"    return {self._read(cls, node, node.annotation, name)}",
+            f"    return {value}",
         ]
         return textwrap.indent("\n".join(lines), "    ")
 
@@ -268,7 +270,7 @@ class Mirror:
             case []:
                 statement = self._statement(cls, node, own, returns)
             case ["property"] if isinstance(node, ast.FunctionDef):
-                statement = f"return {self._read(cls, node, returns, name)}"
+                statement = f"return {self._result(cls, node, returns, own, name)}"
             case [setter] if setter == f"{node.name}.setter":
                 statement = f"{own} = {node.args.args[1].arg}"
             case decorators:
@@ -356,13 +358,9 @@ class Mirror:
 
     # Results
 
-    def _read(self, cls: ast.ClassDef, node: ast.AST, annotation: ast.expr, name: str) -> str:
-        private = "" if is_plain(name) else "  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]"
-        return self._result(cls, node, annotation, f"self._aio.{name}", name) + private
-
     def _result(self, cls: ast.ClassDef, node: ast.AST, annotation: ast.expr, value: str, name: str) -> str:
         """Return the expression that turns `value` into façade objects."""
-        known = self.sources.facades
+        known = self.sources.facades | self.sources.shared
         match annotation:
             case ast.Name(id="Self"):
                 mapped = f"self._wrap(type(self), {value})"
@@ -396,12 +394,9 @@ def generate(plan: Plan) -> dict[Path, str]:
     parts: dict[Path, list[Parts]] = {}
     for module in sources.modules.values():
         parts.setdefault(module.output, []).append(Mirror(sources, module, renames).render())
-    texts = {path: text_of(found) for path, found in parts.items()}
+    texts = {path: text_of(found) for path, found in parts.items() if any(part.body for part in found)}
     if renames.unused:
         raise Refused(f"rename rules that nothing needs: {', '.join(sorted(renames.unused))}")
-    members = {name for cls in sources.facades for name, _ in sources.members(cls)}
-    if absent := plan.exposed - members:
-        raise Refused(f"exposed names that no class has: {', '.join(sorted(absent))}")
     for path in texts.keys() - generated_files(plan):
         if path.exists():
             raise Refused(f"{path.relative_to(plan.shown).as_posix()}: written by hand; it would be overwritten")

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from urlab_client.aio.streams import handler
+from urlab_client.aio.streams.handler import Source
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.errors import URLabTimeoutError
@@ -16,7 +17,7 @@ from urlab_client.events import ServerLost
 from urlab_client.values.layouts import BytesLike
 
 
-class Numbers:
+class Numbers(Source[ServerLost]):
     """A source of numbered items."""
 
     name = "numbers"
@@ -32,14 +33,8 @@ class Numbers:
         self.handler.on_message(b"", str(number).encode())
         self.handler.on_drained()
 
-    def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        return True
-
     def decode(self, topic: bytes, payload: BytesLike) -> ServerLost:
         return ServerLost(endpoint=bytes(payload).decode())
-
-    def first_after(self, handler: MessageHandler) -> float:
-        return 0.0
 
     def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
         return "nothing.", ""

@@ -18,6 +18,8 @@ from waiting import DEADLINE_S
 from written_region import WrittenRegion
 
 from urlab_client._platform.processors import processor_fence
+from urlab_client.aio.launch import transport_to
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import Camera
 from urlab_client.aio.streams.stream import Stream
@@ -67,13 +69,8 @@ async def memory(tmp_path: Path) -> AsyncIterator[ServerRegions]:
 
 @pytest.fixture
 async def publishers(publisher: Publisher, memory: ServerRegions) -> AsyncIterator[Publishers]:
-    made = Publishers(
-        lambda: "tcp://127.0.0.1:1",
-        lambda: publisher.port,
-        default_timeout=DEADLINE_S,
-        live=lambda: True,
-        memory=memory,
-    )
+    session = Session(transport_to("tcp://127.0.0.1", 1, None, shm=True), default_timeout=DEADLINE_S)
+    made = Publishers(session, lambda: publisher.port, live=lambda: True, memory=memory)
     yield made
     made.close()
 

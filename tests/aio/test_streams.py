@@ -523,7 +523,7 @@ class TestWaiting:
         endpoint = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
         with nobody:
             async with latest(StateSource(subscriptions, lambda: endpoint)) as states:
-                await until(lambda: "refused" in subscriptions.line(states._handler).obstacle)  # type: ignore[union-attr]
+                await until(lambda: "refused" in subscriptions.line(states._state).obstacle)  # type: ignore[union-attr]
                 with pytest.raises(
                     URLabTimeoutError,
                     match=rf"state_stream: no connection to {endpoint} within 300 ms: connection refused",
@@ -541,7 +541,7 @@ class TestWaiting:
         async with latest(source, default_timeout=1.0) as frames:
             first = asyncio.ensure_future(frames.receive())
             await publisher.subscribed(b"arm0/camera/wrist ")
-            await until(lambda: source.first_after(frames._handler) == (30.0 if live else 0.0))
+            await until(lambda: source.first_after(frames._state) == (30.0 if live else 0.0))
             pass_time(2.0)
             await turns()
             if live:
@@ -560,7 +560,7 @@ class TestWaiting:
         async with latest(source, default_timeout=1.0) as frames:
             first = asyncio.ensure_future(anext(frames))
             await publisher.subscribed(b"arm0/camera/wrist ")
-            await until(lambda: source.first_after(frames._handler))
+            await until(lambda: source.first_after(frames._state))
             pass_time(2.0)
             await turns()
             pass_time(40.0)
@@ -589,7 +589,7 @@ class TestWaiting:
             publisher.send(STATE, snapshot(1.0))
             await states.receive()
             publisher.close()
-            await until(lambda: not subscriptions.line(states._handler).connected)  # type: ignore[union-attr]
+            await until(lambda: not subscriptions.line(states._state).connected)  # type: ignore[union-attr]
             with pytest.raises(URLabTimeoutError, match="the connection was lost and not restored"):
                 await states.receive(timeout=0.3)
 
@@ -829,7 +829,7 @@ class TestEvents:
         dropped = bus.stream((), 3)
         del dropped
         gc.collect()
-        assert not bus._listeners
+        assert not bus.heard
 
 
 class TestBackground:

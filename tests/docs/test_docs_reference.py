@@ -17,7 +17,7 @@ import gen_docs
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.cli import _parser
 from urlab_client.errors import RPC_ERRORS
-from urlab_client.protocol.messages.scene import EnsureManager
+from urlab_client.protocol.messages.scene import CreateLevel
 from urlab_client.protocol.registry import OPS
 
 REFERENCE = ROOT / "docs" / "reference"
@@ -147,5 +147,5 @@ def test_the_reference_of_the_commands_is_current(tmp_path: Path, monkeypatch: p
 
 
 def test_help_shows_a_methods_text_as_its_op_declares_it() -> None:
-    text = inspect.getdoc(SceneNamespace.ensure_manager) or ""
-    assert text.startswith(f"{inspect.getdoc(EnsureManager)}\n\nArgs:\n")
+    text = inspect.getdoc(SceneNamespace.create_level) or ""
+    assert text.startswith(f"{inspect.getdoc(CreateLevel)}\n\nArgs:\n")

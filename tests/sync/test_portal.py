@@ -130,22 +130,6 @@ class TestCall:
         portal.close()
         assert "urlab-io ended unexpectedly" in caplog.text
 
-    def test_the_thread_ends_with_its_portal_though_a_signal_strikes_the_finalizer(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def struck() -> None:
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(_loop, "_ORPHAN_S", 0.05)
-        monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
-        portal = Portal()
-        thread = io_thread(portal)
-        monkeypatch.setattr(_loop, "DeferredSignals", struck)
-        del portal
-        gc.collect()
-        thread.join(DEADLINE_S)
-        assert not thread.is_alive()
-
     def test_the_loop_goes_on_between_calls(self, portal: Portal) -> None:
         ticked = threading.Event()
 
@@ -287,21 +271,6 @@ class TestTracebacks:
             portal.call(fail, URLabRPCError("not_ready", "no model", op="step"))
         names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
         assert names == ["test_a_refusal_shows_no_inner_frames", "call"]
-
-    def test_raising_the_same_object_again_does_not_grow_its_traceback(self, portal: Portal) -> None:
-        error = RuntimeError("link down")
-
-        def facade_method() -> None:
-            portal.call(fail, error)
-
-        def user_code() -> list[str]:
-            try:
-                facade_method()
-            except RuntimeError as exc:
-                return [frame.name for frame in traceback.extract_tb(exc.__traceback__)]
-            pytest.fail("not raised")
-
-        assert [user_code() for _ in range(3)] == [["user_code", "facade_method", "call", "fail"]] * 3
 
     def test_keeps_the_frames_of_a_call_made_inside_a_coroutine(self, portal: Portal) -> None:
         other = Portal()

@@ -37,7 +37,7 @@ def plan_for(folder: Path) -> Any:
         modules=("client.py", "robots.py", "streams.py", "namespaces/*.py"),
         root="Client",
         dropped=frozenset({"Namespace"}),
-        exposed=frozenset({"_data_lock"}),
+        local="Local",
         renames={
             "__aiter__": "__iter__",
             "__anext__": "__next__",
@@ -252,7 +252,6 @@ class TestRefusals:
         ("change", "message"),
         [
             ({"renames": {"__aenter__": "__enter__", "aopen": "open"}}, "rename rules that nothing needs: aopen"),
-            ({"exposed": frozenset({"_data_lock", "_gone"})}, "exposed names that no class has: _gone"),
             ({"modules": ("client.py", "cameras.py")}, "toylab/aio/cameras.py: no such module"),
             ({"root": "Scene"}, "Scene is constructed by users: write its __init__ here"),
         ],
@@ -361,6 +360,20 @@ class TestResult:
         assert lab("sync.robots").Joint is lab("aio.robots").Joint
         assert client.robots["dog"].joints is client._aio.robots["dog"].joints
 
+    def test_local_bases_are_shared_and_read_the_same_state(
+        self, client: Any, lab: Callable[[str], ModuleType]
+    ) -> None:
+        dog = client.robots["dog"]
+        main, spare = dog.batteries["main"], dog.batteries["spare"]
+        assert (type(main), type(spare)) == (lab("sync.robots").Charger, lab("aio.robots").Battery)
+        assert isinstance(main, lab("aio.robots").LocalCharger)
+        assert not isinstance(main, lab("aio.robots").Charger)
+        main.charge_to(1.0)
+        assert (main.charge, main.wait(), dog._aio.batteries["main"].charge) == (1.0, 1.0, 1.0)
+        assert "charge" not in vars(type(main)), "nothing is written twice"
+        with pytest.raises(AttributeError):
+            main.chrage = 1.0
+
     def test_properties_can_be_set_where_the_source_lets_them(self, client: Any) -> None:
         ball = client.bodies_by_id[1]
         ball.pos = (1.0, 2.0, 3.0)
@@ -380,8 +393,7 @@ class TestResult:
             assert not states.closed
         assert states.closed
 
-    def test_exposed_and_special_members(self, client: Any) -> None:
-        assert client._data_lock is client._aio._data_lock
+    def test_special_members(self, client: Any) -> None:
         assert len(client) == 1
         assert repr(client) == "<Client>"
 

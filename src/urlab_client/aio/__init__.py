@@ -13,30 +13,18 @@ if TYPE_CHECKING:
     from urlab_client.aio.model.elements import Actuator, Body, Joint, ScalarJoint, Sensor
     from urlab_client.aio.streams.stream import Stream
 
-_HOMES = {
-    "URLabArticulation": "urlab_client.aio.articulation",
-    "URLabEntity": "urlab_client.aio.articulation",
-    "URLabCameraView": "urlab_client.aio.cameras",
-    "URLabClient": "urlab_client.aio.client",
-    "URLabController": "urlab_client.aio.controllers",
-    "URLabPDController": "urlab_client.aio.controllers",
-    "DEFAULT": "urlab_client.aio.defaults",
-    "check_address": "urlab_client.aio.launch",
-    "Actuator": "urlab_client.aio.model.elements",
-    "Body": "urlab_client.aio.model.elements",
-    "Joint": "urlab_client.aio.model.elements",
-    "ScalarJoint": "urlab_client.aio.model.elements",
-    "Sensor": "urlab_client.aio.model.elements",
-    "Stream": "urlab_client.aio.streams.stream",
-}
+# Where names are looked for, the light modules first.
+_HOMES = ("defaults", "launch", "model.elements", "controllers", "client")
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for: a process that only compiles models starts sooner without the rest."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
-    return value
+    for home in _HOMES if name in __all__ else ():
+        module = import_module(f"{__name__}.{home}")
+        if hasattr(module, name):
+            value = globals()[name] = getattr(module, name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

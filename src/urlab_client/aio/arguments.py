@@ -18,42 +18,19 @@ V = TypeVar("V")
 
 
 def require(what: str, value: object, kind: type, takes: str) -> None:
-    """Check that an argument is an instance of a type.
-
-    Args:
-        what: The method and, if it has several, the parameter.
-        value: The argument.
-        kind: The required type.
-        takes: The required type in words.
-
-    Raises:
-        TypeError: The argument has another type.
-    """
+    """Raise `TypeError` unless an argument is of a type; `takes` says in words which."""
     if not isinstance(value, kind):
         raise TypeError(f"{what} takes {takes}, got {value!r:.80}.")
 
 
 def mapping(what: str, value: Mapping[str, V], of: str) -> Mapping[str, V]:
-    """Return a mapping unchanged.
-
-    Args:
-        what: The method and, if it has several, the parameter.
-        value: The argument.
-        of: The required contents, such as `actuator names to numbers`.
-
-    Raises:
-        TypeError: The argument is not a mapping.
-    """
+    """Return a mapping unchanged; `of` says what it must contain, such as `actuator names to numbers`."""
     require(what, value, Mapping, f"a dictionary of {of}")
     return value
 
 
 def collection(what: str, values: Collection[V]) -> Collection[V]:
-    """Return a collection unchanged.
-
-    Raises:
-        TypeError: The argument is a single value, or a string, whose items would be its characters.
-    """
+    """Return a collection unchanged. Refuses single values, and strings, whose items would be characters."""
     if isinstance(values, str):
         raise TypeError(f"{what} takes a collection, such as ({values!r:.80},), not one of its items.")
     require(what, values, Collection, "a collection, such as a tuple")
@@ -61,11 +38,7 @@ def collection(what: str, values: Collection[V]) -> Collection[V]:
 
 
 def integer(what: str, value: int) -> int:
-    """Return an integer as a plain `int`.
-
-    Raises:
-        TypeError: The argument is not an integer.
-    """
+    """Return an integer as a plain `int`."""
     try:
         return operator.index(value)
     except TypeError:
@@ -73,12 +46,7 @@ def integer(what: str, value: int) -> int:
 
 
 def numbers(what: str, values: Iterable[float], count: int) -> list[float]:
-    """Return exactly `count` numbers as a list.
-
-    Raises:
-        TypeError: The argument is not iterable or contains items that are not numbers.
-        ValueError: There are more or fewer items, or one is a string that is not a number.
-    """
+    """Return exactly `count` numbers as a list."""
     try:
         found = [float(value) for value in values]
     except TypeError:
@@ -91,11 +59,7 @@ def numbers(what: str, values: Iterable[float], count: int) -> list[float]:
 
 
 def text(what: str, value: str) -> str:
-    """Return a string unchanged.
-
-    Raises:
-        TypeError: The argument is not a string.
-    """
+    """Return a string unchanged."""
     require(what, value, str, "a string")
     return value
 
@@ -106,12 +70,7 @@ def is_array(value: object) -> TypeGuard[Iterable[float]]:
 
 
 def finite(what: str, value: object) -> float:
-    """Return a number as a float.
-
-    Raises:
-        TypeError: The value is not a number.
-        ValueError: The number is NaN or infinite.
-    """
+    """Return a number as a float. Refuses NaN and infinity."""
     if not isinstance(value, (float, SupportsFloat)):
         raise TypeError(f"{what} takes a number, got {value!r}.")
     number = float(value)
@@ -121,12 +80,7 @@ def finite(what: str, value: object) -> float:
 
 
 def finite_array(what: str, values: Iterable[float]) -> Floats:
-    """Return numbers as a new array.
-
-    Raises:
-        TypeError: A value is not a number.
-        ValueError: A number is NaN or infinite.
-    """
+    """Return numbers as a new array. Refuses NaN and infinity."""
     given = np.asarray(values if hasattr(values, "__array__") else tuple(values))
     if given.dtype.kind not in "biuf" and given.size:
         raise TypeError(f"{what} takes numbers, got {cast('object', given.tolist())!r:.80}.")

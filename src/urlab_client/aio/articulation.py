@@ -12,8 +12,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
-from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
-from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor, elements_of
 from urlab_client.aio.session.control import CLAIM_S
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
@@ -28,7 +27,7 @@ from urlab_client.values.descriptions import (
     EntityDescription,
     Pose,
 )
-from urlab_client.values.names import NameMap, PublicDir
+from urlab_client.values.names import Local, NameMap
 from urlab_client.values.rotation import rotate
 
 Move: TypeAlias = Callable[["URLabArticulation", Mapping[str, float], float, float], Awaitable[float]]
@@ -38,45 +37,46 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class URLabEntity(PublicDir):
+class URLabEntity(Local):
     """A dynamic body, or the root of an articulation.
 
     The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread
     other than the one that steps, hold `client._data_lock`.
     """
 
-    def __init__(self, record: MirroredEntity) -> None:
-        self._record = record
+    __slots__ = ()
+
+    _state: MirroredEntity
 
     @property
     def name(self) -> str:
         """Key in `client.entities`."""
-        return self._record.name
+        return self._state.name
 
     @property
     def body_id(self) -> int:
         """Global MuJoCo id of the body (of the root body for an articulation, -1 without a local model)."""
-        return self._record.body_id
+        return self._state.body_id
 
     @property
     def has_free_base(self) -> bool:
         """True if the body or root body has a free joint; False for an articulation without a local model."""
-        return self._record.has_free_base
+        return self._state.has_free_base
 
     @property
     def free_joint(self) -> str | None:
         """Compiled name of the free joint, or None."""
-        return self._record.free_joint
+        return self._state.free_joint
 
     @property
     def qpos_offset(self) -> int | None:
         """Start of the 7 free-joint positions in `client.data.qpos`, or None without a free joint."""
-        return self._record.qpos_offset
+        return self._state.qpos_offset
 
     @property
     def qvel_offset(self) -> int | None:
         """Start of the 6 free-joint velocities in `client.data.qvel`, or None without a free joint."""
-        return self._record.qvel_offset
+        return self._state.qvel_offset
 
     @property
     def root_pos_w(self) -> Floats:
@@ -96,21 +96,21 @@ class URLabEntity(PublicDir):
     @property
     def root_lin_vel_w(self) -> Floats:
         """Velocity of the body frame's origin, shape (3,), m/s, world frame."""
-        with self._record.mirror.lock:
-            qvel = self._record.root_qvel()
+        with self._state.mirror.lock:
+            qvel = self._state.root_qvel()
             return qvel[:3] if qvel is not None else self._derived_velocity()[3:]
 
     @property
     def root_lin_vel_b(self) -> Floats:
         """Velocity of the body frame's origin, shape (3,), m/s, body frame."""
-        with self._record.mirror.lock:
+        with self._state.mirror.lock:
             return _to_body(self.root_quat_w, self.root_lin_vel_w)
 
     @property
     def projected_gravity_b(self) -> Floats:
         """Unit vector in the direction of gravity, shape (3,), body frame; (0, 0, -1) when upright."""
-        with self._record.mirror.lock:
-            model = self._record.mirror.model
+        with self._state.mirror.lock:
+            model = self._state.mirror.model
             gravity = _DOWN if model is None else model.opt.gravity
             strength = float(np.linalg.norm(gravity))
             return _to_body(self.root_quat_w, gravity / strength if strength > 0 else _DOWN)
@@ -128,7 +128,7 @@ class URLabEntity(PublicDir):
             TypeError: A component is not a number.
             ValueError: A vector does not have three finite components.
         """
-        self._record.apply_wrench(self._record.name, _wrench(force, torque))
+        self._state.apply_wrench(self._state.name, _wrench(force, torque))
 
     def _place(self) -> Pose | None:
         try:
@@ -143,20 +143,20 @@ class URLabEntity(PublicDir):
         return EntityDescription(name=self.name, free_base=self.has_free_base, pose=self._place())
 
     def _pose(self) -> tuple[Floats, Floats]:
-        record = self._record
-        with record.mirror.lock:
-            qpos = record.root_qpos()
+        state = self._state
+        with state.mirror.lock:
+            qpos = state.root_qpos()
             if qpos is not None:
                 return qpos[:3], qpos[3:7]
-            if record.pose is not None:
-                return np.array(record.pose.xpos), np.array(record.pose.xquat)
-            pair = record.mirror.derived()
+            if state.pose is not None:
+                return np.array(state.pose.xpos), np.array(state.pose.xquat)
+            pair = state.mirror.derived()
             if pair is None:
                 raise self._needs_model("pose", "positions")
-            return pair[1].xpos[record.body_id].copy(), pair[1].xquat[record.body_id].copy()
+            return pair[1].xpos[state.body_id].copy(), pair[1].xquat[state.body_id].copy()
 
     def _derived_velocity(self) -> Floats:
-        velocity = self._record.mirror.body_velocity(self._record.body_id)
+        velocity = self._state.mirror.body_velocity(self._state.body_id)
         if velocity is None:
             raise self._needs_model("velocity", "velocities")
         return velocity
@@ -174,87 +174,52 @@ class URLabEntity(PublicDir):
         return self.describe()._repr_html_()  # pyright: ignore[reportPrivateUsage]
 
 
-class URLabArticulation(URLabEntity):
-    """A robot imported from MJCF.
+class LocalArticulation(URLabEntity):
+    """What both clients share of `URLabArticulation`: everything that sends nothing."""
 
-    Dictionaries are keyed by short names, without the articulation's prefix. Lookups also accept compiled names and
-    original MJCF names. Without a local model only actuators and cameras are known.
-    """
+    __slots__ = ()
 
-    _record: MirroredArticulation
-
-    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, move: Move) -> None:
-        super().__init__(record)
-        self._session = session
-        self._publishers = publishers
-        self._move = move
-        self._controller: tuple[ControllerInfo, URLabController] | None = None
-        self._handles: tuple[ArticulationLayout, ArticulationElements] | None = None
-        self._cameras: NameMap[URLabCameraView] = NameMap()
+    _state: MirroredArticulation  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
 
     @property
     def prefix(self) -> str:
         """Articulation key."""
-        return self._record.name
+        return self._state.name
 
     @property
     def compiled_prefix(self) -> str:
         """Prefix of its compiled names, without the underscore: the key, or the engine's name of the actor."""
-        return self._record.info.compiled_prefix
+        return self._state.info.compiled_prefix
 
     @property
     def user(self) -> dict[str, Any]:
         """Values of the user channels that the level declares for it, by name; empty if the server has none."""
-        return dict(self._record.user)
+        return dict(self._state.user)
 
     @property
     def actor_id(self) -> str:
         """Stable id given when it was spawned; empty if none was given."""
-        return self._record.info.actor_id
+        return self._state.info.actor_id
 
     @property
     def actuators(self) -> NameMap[Actuator]:
         """Actuators in id order."""
-        return self._made().actuators
+        return elements_of(self._state).actuators
 
     @property
     def joints(self) -> NameMap[Joint]:
         """Joints in id order."""
-        return self._made().joints
+        return elements_of(self._state).joints
 
     @property
     def sensors(self) -> NameMap[Sensor]:
         """Sensors in id order."""
-        return self._made().sensors
+        return elements_of(self._state).sensors
 
     @property
     def bodies(self) -> NameMap[Body]:
         """Bodies in id order."""
-        return self._made().bodies
-
-    @property
-    def cameras(self) -> NameMap[URLabCameraView]:
-        """Cameras by name."""
-        topics = {name.removeprefix(f"{self.prefix}/"): info for name, info in self._record.info.camera_topics.items()}
-        if any(name not in self._cameras or self._cameras[name].info is not info for name, info in topics.items()):
-            views = {
-                name: self._cameras.get(name) or URLabCameraView(name, info, self._publishers)
-                for name, info in topics.items()
-            }
-            for name, info in topics.items():
-                views[name].camera.info = info
-            self._cameras = NameMap(views, kind="camera", owner=self.prefix)
-        return self._cameras
-
-    @property
-    def controller(self) -> URLabController | None:
-        """The controller, or None if the set-points go directly to the actuators."""
-        info = self._record.controller
-        if info is None:
-            return None
-        if self._controller is None or self._controller[0] is not info:
-            self._controller = info, make_controller(self._session, self.prefix, info)
-        return self._controller[1]
+        return elements_of(self._state).bodies
 
     @property
     def control_mode(self) -> ControlMode:
@@ -263,12 +228,12 @@ class URLabArticulation(URLabEntity):
         Raises:
             ValueError: On assigning anything but `ue_controller` or `raw`.
         """
-        return self._record.control_mode
+        return self._state.control_mode
 
     @control_mode.setter
     def control_mode(self, mode: ControlMode | str) -> None:
-        self._record.control_mode = ControlMode(mode)
-        self._record.drive()
+        self._state.control_mode = ControlMode(mode)
+        self._state.drive()
 
     @property
     def ctrl_array(self) -> Floats:
@@ -281,68 +246,68 @@ class URLabArticulation(URLabEntity):
             TypeError: On assigning values that are not numbers.
             ValueError: On assigning NaN, infinities or the wrong number of values.
         """
-        return self._record.set_points
+        return self._state.set_points
 
     @ctrl_array.setter
     def ctrl_array(self, values: Sequence[float] | Floats) -> None:
         checked = finite_array(f"ctrl_array of {self.prefix!r}", values)
-        self._record.drive()
-        self._record.ctrl[:] = checked
+        self._state.drive()
+        self._state.ctrl[:] = checked
 
     @property
     def last_applied_ctrl(self) -> Floats:
         """`mjData.ctrl` that the server applied last, after any controller, shape (n_actuators,)."""
-        return self._record.applied.copy()
+        return self._state.applied.copy()
 
     @property
     def act_array(self) -> Floats:
         """Activation per actuator, shape (n_actuators,); 0 for stateless ones."""
-        return self._record.act.copy()
+        return self._state.act.copy()
 
     @property
     def qpos_array(self) -> Floats:
         """Joint positions, shape (nq,), in joint order: radians, metres, quaternions (w, x, y, z)."""
-        return self._record.qpos.copy()
+        return self._state.qpos.copy()
 
     @property
     def qvel_array(self) -> Floats:
         """Joint velocities, shape (nv,), in joint order: rad/s, m/s; a free base's linear in world, angular in body."""
-        return self._record.qvel.copy()
+        return self._state.qvel.copy()
 
     @property
     def dof_qpos(self) -> Floats:
         """Joint positions without the free base, shape (nq,) or (nq - 7,)."""
-        return self._record.qpos[7 if self.has_free_base else 0 :].copy()
+        return self._state.qpos[7 if self.has_free_base else 0 :].copy()
 
     @property
     def dof_qvel(self) -> Floats:
         """Joint velocities without the free base, shape (nv,) or (nv - 6,)."""
-        return self._record.qvel[6 if self.has_free_base else 0 :].copy()
+        return self._state.qvel[6 if self.has_free_base else 0 :].copy()
 
     @property
     def twist_linear(self) -> Floats:
         """Commanded linear velocity, shape (3,), m/s, base frame (ROS Twist)."""
-        twist = self._record.twist
+        twist = self._state.twist
         return np.zeros(3) if twist is None else np.array(twist.linear)
 
     @property
     def twist_angular(self) -> Floats:
         """Commanded angular velocity, shape (3,), rad/s, base frame (ROS Twist)."""
-        twist = self._record.twist
+        twist = self._state.twist
         return np.zeros(3) if twist is None else np.array(twist.angular)
 
     @property
     def root_ang_vel_w(self) -> Floats:
         """Angular velocity of the root, shape (3,), rad/s, world frame."""
-        with self._record.mirror.lock:
-            qvel = self._record.root_qvel()
+        with self._state.mirror.lock:
+            qvel = self._state.root_qvel()
             return _to_world(self.root_quat_w, qvel[3:6]) if qvel is not None else self._derived_velocity()[:3]
 
     @property
     def root_ang_vel_b(self) -> Floats:
         """Angular velocity of the root, shape (3,), rad/s, body frame (as MuJoCo stores it)."""
-        with self._record.mirror.lock:
-            qvel = self._record.root_qvel()
+        with self._state.mirror.lock:
+            qvel = self._state.root_qvel()
             return qvel[3:6] if qvel is not None else _to_body(self.root_quat_w, self.root_ang_vel_w)
 
     def set_ctrl(self, values: Mapping[str, float], *, out_of_range: str | OutOfRange = "allow") -> None:
@@ -362,9 +327,9 @@ class URLabArticulation(URLabEntity):
         found = [(self.actuators[name], value) for name, value in given.items()]
         checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
-            self._record.drive()
+            self._state.drive()
         for where, value in checked:
-            self._record.ctrl[where] = value
+            self._state.ctrl[where] = value
 
     def get_ctrl(self) -> dict[str, float]:
         """Return the set-points that the next step sends, by actuator name."""
@@ -372,36 +337,12 @@ class URLabArticulation(URLabEntity):
 
     def get_qpos(self) -> dict[str, float]:
         """Return the first component of each joint's position, by joint name."""
-        values = self._record.qpos.tolist()
+        values = self._state.qpos.tolist()
         return {name: values[joint.qpos_local_offset] for name, joint in self.joints.items()}
 
     def get_sensors(self) -> dict[str, Floats]:
         """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
-        return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
-
-    def describe(self) -> ArticulationDescription:
-        """Return its parts, state and set-points as of the last reply.
-
-        `to_dict()` and `to_json()` of the result return plain data.
-        """
-        controller = self._record.controller
-        with self._record.mirror.lock:
-            return ArticulationDescription(
-                name=self.prefix,
-                actor_id=self.actor_id,
-                free_base=self.has_free_base,
-                pose=self._place(),
-                joints=[joint.describe() for joint in self.joints.values()],
-                actuators=[actuator.describe() for actuator in self.actuators.values()],
-                sensors=[sensor.describe() for sensor in self.sensors.values()],
-                cameras=[camera.describe() for camera in self.cameras.values()],
-                controller=None
-                if controller is None
-                else ControllerDescription(
-                    kind=controller.kind, in_force=self.control_mode is ControlMode.UE_CONTROLLER
-                ),
-                control_owner=self.control_owner,
-            )
+        return {name: np.asarray(reading) for name, reading in self._state.sensors.items()}
 
     def resolve_joint(self, name: str) -> str | None:
         """Return the live key of a joint for its live, compiled or original MJCF name, or None."""
@@ -438,8 +379,72 @@ class URLabArticulation(URLabEntity):
             body = next((name for name, handle in bodies.items() if handle.id == self.body_id), "")
         if not body:
             raise ValueError(f"{self.prefix}: the root body is not known without a local model; name the body")
-        self._record.apply_wrench(body, _wrench(force, torque))
-        self._record.drive()
+        self._state.apply_wrench(body, _wrench(force, torque))
+        self._state.drive()
+
+
+class URLabArticulation(LocalArticulation):
+    """A robot imported from MJCF.
+
+    Dictionaries are keyed by short names, without the articulation's prefix. Lookups also accept compiled names and
+    original MJCF names. Without a local model only actuators and cameras are known.
+    """
+
+    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, move: Move) -> None:
+        super().__init__(record)
+        self._session = session
+        self._publishers = publishers
+        self._move = move
+        self._controller: tuple[ControllerInfo, URLabController] | None = None
+        self._cameras: NameMap[URLabCameraView] = NameMap()
+
+    @property
+    def cameras(self) -> NameMap[URLabCameraView]:
+        """Cameras by name."""
+        topics = {name.removeprefix(f"{self.prefix}/"): info for name, info in self._state.info.camera_topics.items()}
+        if any(name not in self._cameras or self._cameras[name].info is not info for name, info in topics.items()):
+            views = {
+                name: self._cameras.get(name) or URLabCameraView(name, info, self._publishers)
+                for name, info in topics.items()
+            }
+            for name, info in topics.items():
+                views[name].camera.info = info
+            self._cameras = NameMap(views, kind="camera", owner=self.prefix)
+        return self._cameras
+
+    @property
+    def controller(self) -> URLabController | None:
+        """The controller, or None if the set-points go directly to the actuators."""
+        info = self._state.controller
+        if info is None:
+            return None
+        if self._controller is None or self._controller[0] is not info:
+            self._controller = info, make_controller(self._session, self.prefix, info)
+        return self._controller[1]
+
+    def describe(self) -> ArticulationDescription:
+        """Return its parts, state and set-points as of the last reply.
+
+        `to_dict()` and `to_json()` of the result return plain data.
+        """
+        controller = self._state.controller
+        with self._state.mirror.lock:
+            return ArticulationDescription(
+                name=self.prefix,
+                actor_id=self.actor_id,
+                free_base=self.has_free_base,
+                pose=self._place(),
+                joints=[joint.describe() for joint in self.joints.values()],
+                actuators=[actuator.describe() for actuator in self.actuators.values()],
+                sensors=[sensor.describe() for sensor in self.sensors.values()],
+                cameras=[camera.describe() for camera in self.cameras.values()],
+                controller=None
+                if controller is None
+                else ControllerDescription(
+                    kind=controller.kind, in_force=self.control_mode is ControlMode.UE_CONTROLLER
+                ),
+                control_owner=self.control_owner,
+            )
 
     async def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
         """Move joints to positions with their position servos, and return when they have settled.
@@ -486,7 +491,7 @@ class URLabArticulation(URLabEntity):
         if self._session.features.claims:
             request = ClaimControl(articulation=self.prefix, ttl_s=ttl, force=force)
             await self._session.call(request, timeout=timeout)
-        self._record.drive()
+        self._state.drive()
 
     async def release(self, *, timeout: Timeout = DEFAULT) -> None:
         """Let other clients control the articulation. The next write claims it again.
@@ -494,7 +499,7 @@ class URLabArticulation(URLabEntity):
         Args:
             timeout: Seconds to wait; None waits without limit.
         """
-        self._record.leave()
+        self._state.leave()
         await self._session.control.release(self.prefix, timeout=timeout)
 
     @property
@@ -504,12 +509,6 @@ class URLabArticulation(URLabEntity):
         None if no client controls it, if the owner is not known, and on servers whose robots have no owner.
         """
         return self._session.control.owner_of(self.prefix)
-
-    def _made(self) -> ArticulationElements:
-        layout = self._record.layout
-        if self._handles is None or self._handles[0] is not layout:
-            self._handles = layout, make_elements(self._record)
-        return self._handles[1]
 
 
 def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:

@@ -16,34 +16,33 @@ from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.values.descriptions import CameraDescription
 from urlab_client.values.html import fields
-from urlab_client.values.names import PublicDir
+from urlab_client.values.names import Local
 from urlab_client.values.pictures import Pixels, thumbnail
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
 
-class URLabCameraView(PublicDir):
-    """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
+class LocalCamera(Local):
+    """What both clients share of `URLabCameraView`: everything that sends nothing."""
 
-    delivered: bool
-    """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
+    __slots__ = ()
 
-    def __init__(self, name: str, info: CameraInfo, publishers: Publishers) -> None:
-        self.delivered = True
-        self._publishers = publishers
-        # For the client. Not declared above, to keep them out of the façade.
-        self.camera: Camera = Camera(name, info)
-        self.pictures: LatestPicture = LatestPicture(publishers.camera(self.camera, asked=False))
+    _state: LatestPicture
+
+    @property
+    def delivered(self) -> bool:
+        """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
+        return self._state.delivered
 
     @property
     def name(self) -> str:
         """Name without the articulation's prefix."""
-        return self.camera.name
+        return self._state.camera.name
 
     @property
     def info(self) -> CameraInfo:
         """Description from the handshake."""
-        return self.camera.info
+        return self._state.camera.info
 
     @property
     def latest_frame(self) -> Pixels | None:
@@ -52,22 +51,22 @@ class URLabCameraView(PublicDir):
         Each frame is a new array, which later frames do not overwrite. Until the next frame arrives, all callers get
         the same array.
         """
-        return self.pictures.newest()[0]
+        return self._state.newest()[0]
 
     @property
     def sim_time(self) -> float | None:
         """Simulation time of the newest frame, seconds; None in live mode unless the server sends it."""
-        return self.pictures.newest()[1]
+        return self._state.newest()[1]
 
     @property
     def frame_id(self) -> int | None:
         """Id of the state snapshot that the newest frame shows, comparable to `StepOk.frame_id`; None if not sent."""
-        return self.pictures.frame_id()
+        return self._state.newest()[2]
 
     @property
     def mode(self) -> CameraMode | str:
         """Meaning of the pixels; a plain string for a mode that this client does not know."""
-        return self.camera.mode
+        return self._state.camera.mode
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -88,6 +87,17 @@ class URLabCameraView(PublicDir):
         """Return name, mode, resolution and field of view."""
         width, height = self.resolution
         return CameraDescription(name=self.name, mode=str(self.mode), width=width, height=height, fovy=self.fovy)
+
+
+class URLabCameraView(LocalCamera):
+    """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
+
+    def __init__(self, name: str, info: CameraInfo, publishers: Publishers) -> None:
+        # For the client. Not declared above, to keep them out of the façade.
+        self.camera: Camera = Camera(name, info)
+        self.pictures: LatestPicture = LatestPicture(publishers.camera(self.camera, asked=False))
+        super().__init__(self.pictures)
+        self._publishers = publishers
 
     async def capture(self, *, timeout: Timeout = DEFAULT) -> CameraSample:
         """Take a picture now, in any step mode, without a step; it also becomes `latest_frame`.

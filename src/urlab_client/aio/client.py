@@ -8,11 +8,14 @@ import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from copy import copy
+from functools import partial
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar, cast
 
 from urlab_client.aio.arguments import integer, require
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.background import running_loop
+from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
@@ -26,14 +29,13 @@ from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
-from urlab_client.aio.state.capturing import Capturing
+from urlab_client.aio.state.capturing import take_pictures
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor, SessionKeeper
 from urlab_client.aio.state.derived_rows import DerivedRowSource
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.stepping import send_step, take_reset, take_steps
-from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.aio.streams.sources import RowFilter, RowSource
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS, Stream
@@ -63,7 +65,9 @@ from urlab_client.protocol.messages.streams import (
     StreamPolicyName,
 )
 from urlab_client.protocol.topics import TopicKind
+from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
 from urlab_client.values.html import fields
+from urlab_client.values.names import NameMap
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -193,26 +197,18 @@ class URLabClient(ClientState):
             read_only=read_only,
         )
         self._publishers = Publishers(
-            lambda: self._transport.endpoint,
-            self._state_port,
-            default_timeout=rcv_timeout_ms / 1000,
-            live=lambda: self._state.mode.live,
-            features=lambda: session.features,
-            keys=keys,
-            memory=memory,
+            session, self._state_port, live=lambda: self._state.mode.live, keys=keys, memory=memory
         )
         session.tell = self._publishers.events.publish
         if memory is not None:
             memory.tell = session.tell
-        if not read_only:
-            self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
         state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
-        self._motion = Motion(
-            state, step=self.step, explain=self.explain, locate=self._locate, stall_timeout=rcv_timeout_ms / 1000
-        )
+        self._motion = Motion(state, step=self.step, explain=self.explain, locate=self._locate)
         state.objects.move = self._motion.move_to
-        self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
-        super().__init__(config, session, state)
+        self._publishers.capture = partial(take_pictures, state)
+        super().__init__(state)
+        self._config = config
+        self._session = session
         self._discovery = Discovery(
             state,
             local_model=local_model,
@@ -222,7 +218,7 @@ class URLabClient(ClientState):
         )
         self._monitor = ConnectionMonitor(session, state)
         self._keeper = SessionKeeper(session, state, self._discovery)
-        self._transport.on_event = self._monitor.on_connection
+        self._transport.on_event = self._monitor.on_transport
         self._closed = False
         self._sim = SimNamespace(session, state, self._discovery)
         self._scene = SceneNamespace(session, self._sim)
@@ -233,6 +229,63 @@ class URLabClient(ClientState):
         self._farm = FarmNamespace(session)
         self._recording = RecordingNamespace(session, state)
         self._replay = ReplayNamespace(session, state)
+
+    @property
+    def address(self) -> str:
+        """The address given to the constructor."""
+        return self._config.address
+
+    @property
+    def config(self) -> ClientConfig:
+        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
+        return self._config
+
+    @property
+    def articulations(self) -> NameMap[URLabArticulation]:
+        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
+        return self._state.objects.articulations
+
+    @property
+    def articulations_by_id(self) -> dict[str, URLabArticulation]:
+        """Articulations that have an actor id, by that id."""
+        return self._state.objects.articulations_by_id
+
+    @property
+    def entities(self) -> NameMap[URLabEntity]:
+        """Every dynamic body by name, articulations included."""
+        return self._state.objects.entities
+
+    @property
+    def global_cameras(self) -> NameMap[URLabCameraView]:
+        """Scene-level cameras by name."""
+        return self._state.objects.global_cameras
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
+
+        Raises:
+            UnknownName: No camera or more than one has this name. It is a `KeyError`.
+        """
+        return self._state.objects.require_camera(name)
+
+    def describe(self) -> SceneDescription:
+        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
+
+        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
+        """
+        with self._state.mirror.lock:
+            described = [entity.describe() for entity in self.entities.values()]
+            model = self.model
+            return SceneDescription(
+                address=self.address,
+                playing=self.manager_present,
+                step_mode=str(self.step_mode),
+                sim_time=self.sim_time,
+                timestep=None if model is None else float(model.opt.timestep),
+                articulations=[one for one in described if isinstance(one, ArticulationDescription)],
+                entities=[one for one in described if isinstance(one, EntityDescription)],
+                cameras=[camera.describe() for camera in self.global_cameras.values()],
+            )
 
     # Namespaces
 
@@ -651,8 +704,7 @@ class URLabClient(ClientState):
         self._publishers.close()
         try:
             playing = self.connected and self.manager_present
-            if self._publishers.camera_switch is not None:
-                await self._publishers.camera_switch.aclose(connected=playing)
+            await self._publishers.camera_switch.aclose(connected=playing)
             await self._session.control.aclose(connected=playing)
             await self._keeper.aclose()
             await self._monitor.aclose()

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 
 from urlab_client._mujoco import saved_model
-from urlab_client.aio.articulation import URLabArticulation, URLabEntity
-from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.client_types import ClientConfig, ClientObserver, ServerInfo
-from urlab_client.aio.session.session import Session
+from urlab_client.aio.client_types import ClientObserver, ServerInfo
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.enums import StepMode
@@ -19,45 +16,33 @@ from urlab_client.errors import NoSession
 from urlab_client.protocol.codec import encode_message
 from urlab_client.protocol.messages.session import NOT_SENT
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.values.descriptions import ArticulationDescription, EntityDescription, SceneDescription
-from urlab_client.values.names import NameMap, PublicDir, unknown_name
+from urlab_client.values.names import Local
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
 
 
-class ClientState(PublicDir):
-    """The attributes of a client. Reading them sends nothing and does not block."""
+class ClientState(Local):
+    """The attributes of a client. Reading them sends nothing and does not block. Both clients share them."""
 
-    def __init__(self, config: ClientConfig, session: Session, state: SimState) -> None:
-        self._config = config
-        self._session = session
-        self._state = state
+    __slots__ = ()
 
-    @property
-    def address(self) -> str:
-        """The address given to the constructor."""
-        return self._config.address
-
-    @property
-    def config(self) -> ClientConfig:
-        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
-        return self._config
+    _state: SimState
 
     @property
     def connected(self) -> bool:
         """Whether the client is connected to a server at the moment."""
-        return self._session.transport.connected
+        return self._state.session.transport.connected
 
     @property
     def transport_stats(self) -> TransportStats:
         """Counters of requests, replies and connections, and with `transport="shm"` of the path that each took."""
-        return self._session.transport.stats
+        return self._state.session.transport.stats
 
     @property
     def session_id(self) -> str:
         """RPC session id; empty before `discover()`."""
-        return self._session.session_id
+        return self._state.session.session_id
 
     @property
     def urlab_version(self) -> str:
@@ -74,7 +59,7 @@ class ClientState(PublicDir):
         """The server's versions and features, as far as its replies have shown them."""
         hello = self._state.hello
         return ServerInfo(
-            features=self._session.features,
+            features=self._state.session.features,
             instance=None if hello is None else hello.instance,
             urlab_version=self.urlab_version,
             mujoco_version=self.mujoco_version,
@@ -117,26 +102,6 @@ class ClientState(PublicDir):
         return self._state.mirror.approximate
 
     @property
-    def articulations(self) -> NameMap[URLabArticulation]:
-        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
-        return self._state.objects.articulations
-
-    @property
-    def articulations_by_id(self) -> dict[str, URLabArticulation]:
-        """Articulations that have an actor id, by that id."""
-        return self._state.objects.articulations_by_id
-
-    @property
-    def entities(self) -> NameMap[URLabEntity]:
-        """Every dynamic body by name, articulations included."""
-        return self._state.objects.entities
-
-    @property
-    def global_cameras(self) -> NameMap[URLabCameraView]:
-        """Scene-level cameras by name."""
-        return self._state.objects.global_cameras
-
-    @property
     def step_count(self) -> int:
         """Steps since `discover()` or `reset()`, as counted by the server; constant in live mode."""
         return self._state.clocks.step_count
@@ -176,25 +141,6 @@ class ClientState(PublicDir):
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
         return self._state.clocks.recv_wall_time_ns
 
-    def describe(self) -> SceneDescription:
-        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
-
-        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
-        """
-        with self._state.mirror.lock:
-            described = [entity.describe() for entity in self.entities.values()]
-            model = self.model
-            return SceneDescription(
-                address=self.address,
-                playing=self.manager_present,
-                step_mode=str(self.step_mode),
-                sim_time=self.sim_time,
-                timestep=None if model is None else float(model.opt.timestep),
-                articulations=[one for one in described if isinstance(one, ArticulationDescription)],
-                entities=[one for one in described if isinstance(one, EntityDescription)],
-                cameras=[camera.describe() for camera in self.global_cameras.values()],
-            )
-
     def handshake(self) -> bytes:
         """Return the names, limits, cameras and the model that a client with `read_only=True` needs.
 
@@ -211,18 +157,6 @@ class ClientState(PublicDir):
             model = None if mirror.model is None or mirror.approximate else saved_model(mirror.model)
         shared = replace(hello, session_id="", mjb=model, mjb_base64=NOT_SENT, shm_session_dir=None)
         return encode_message(shared)
-
-    def camera(self, name: str) -> URLabCameraView:
-        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
-
-        Raises:
-            UnknownName: No camera or more than one has this name. It is a `KeyError`.
-        """
-        objects = self._state.objects
-        view = objects.camera(name)
-        if view is None:
-            raise unknown_name("camera", name, objects.camera_names())
-        return view
 
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Return whether a published state belongs to the world of the last handshake, as far as its fields show.

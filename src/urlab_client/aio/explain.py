@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import ControlMode, PIEState, StepMode
 from urlab_client.errors import RPC_ERRORS, SessionTakenOver, URLabError
 from urlab_client.protocol.messages.session import Meta
-from urlab_client.protocol.messages.sim import PieStatus
+from urlab_client.protocol.messages.sim import PieStatus, PieStatusOk
+from urlab_client.values.types import PIEStatus
 
 _CONNECT_S = 2.0
 _POLLS = 5
@@ -31,12 +32,7 @@ _LISTED = 8
 _CHANGED = "the mode was changed. Call runtime.set_mode() or discover()."
 
 
-class _Status(Protocol):
-    @property
-    def sim_time(self) -> float | None: ...
-
-
-S = TypeVar("S", bound=_Status)
+S = TypeVar("S", PieStatusOk, PIEStatus)
 
 
 async def watched(look: Callable[[], Awaitable[S]], first: S) -> S:
@@ -99,7 +95,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState, stat
 def _cameras(session: Session, state: SimState) -> Iterator[Finding]:
     """Check which cameras stream, on a server where they are off by default."""
     switch = state.publishers.camera_switch
-    if switch is None or not session.features.camera_switch:
+    if not session.features.camera_switch:
         return
     silent = [
         f"{art.prefix}/{name}"

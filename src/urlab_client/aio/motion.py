@@ -38,14 +38,14 @@ class Motion:
         step: Callable[[int], Awaitable[StepOk]],
         explain: Callable[[], Awaitable[Diagnosis]],
         locate: Callable[[], Awaitable[None]],
-        stall_timeout: float | None,
     ) -> None:
         self._state = state
         self._session = state.session
         self._step = step
         self._explain = explain
         self._locate = locate  # asks the server for the state if it is not known yet
-        self._stall_timeout = stall_timeout  # wall-clock seconds within which simulation time must advance
+        # Seconds of wall-clock time within which simulation time must advance.
+        self._stall_timeout = state.session.default_timeout
 
     async def run_for(self, seconds: float) -> float:
         """See `URLabClient.run_for`."""

@@ -11,21 +11,22 @@ import warnings
 from typing import Any, Protocol, TypeVar, cast, overload
 
 from urlab_client.sync._portal import Portal
-from urlab_client.values.names import NameMap, PublicDir
+from urlab_client.values.names import Local, NameMap
 
 A_co = TypeVar("A_co", covariant=True)
-F = TypeVar("F", bound="Facade")
+F = TypeVar("F", bound=Local)
 
 _FACADES: dict[type, type[Facade]] = {}
 
 
-class Facade(PublicDir):
+class Facade(Local):
     """Base of the generated classes: the blocking twin of one asynchronous object.
 
-    A subclass names the class that it wraps: `class Scene(Facade, twin=aio.Scene)`. Only `wrap` creates instances.
+    A subclass names the class that it wraps: `class Scene(Facade, twin=aio.Scene)`. Only `wrap` creates instances. What
+    both twins inherit from another `Local` reads the same state.
     """
 
-    __slots__ = ("__weakref__", "_aio", "_maps", "_portal")
+    __slots__ = ("_aio", "_maps", "_portal")
 
     _aio: Any
     _maps: dict[str, tuple[NameMap[Any], NameMap[Any]]]
@@ -37,6 +38,7 @@ class Facade(PublicDir):
             _FACADES[twin] = cls
 
     def __init__(self, aio: object, portal: Portal) -> None:
+        super().__init__(getattr(aio, "_state", None))
         self._aio = aio
         self._portal = portal
         self._maps = {}
@@ -79,17 +81,19 @@ class Facade(PublicDir):
 
 
 def wrap(portal: Portal, cls: type[F], aio: object) -> F:
-    """Return the façade twin of `aio`, always the same object.
+    """Return the façade twin of `aio`, always the same object; `aio` itself if both clients share its class.
 
     Args:
         portal: Portal to the loop of `aio`.
-        cls: Façade class of the declared type; for a derived class of `aio` the twin has its façade class.
-        aio: The asynchronous object.
+        cls: Declared type of the twin, for type checkers.
+        aio: The object of the async client.
     """
+    facade = next((_FACADES[base] for base in type(aio).__mro__ if base in _FACADES), None)
+    if facade is None:
+        return cast("F", aio)
 
     def make() -> Facade:
-        actual = next((_FACADES[base] for base in type(aio).__mro__ if base in _FACADES), cls)
-        twin = cast("Facade", object.__new__(actual))
+        twin = object.__new__(facade)
         Facade.__init__(twin, aio, portal)
         return twin
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
+import functools
 import logging
 import os
 import selectors
@@ -30,6 +30,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from urlab_client.aio.background import background_thread
@@ -42,7 +43,7 @@ GRACE = 1.0
 """Seconds allowed for clean-up, of an interrupted call and in each phase of stopping a loop."""
 
 # On Windows, Ctrl-C does not interrupt a lock wait, so the wait is sliced there.
-_WAIT_SLICE = 0.1 if sys.platform == "win32" else threading.TIMEOUT_MAX
+_WAIT_SLICE = 0.1 if sys.platform == "win32" else None
 
 # Nor does it interrupt select() there: the main thread must not run the loop.
 _MAIN_THREAD_DRIVES = sys.platform != "win32"
@@ -59,10 +60,6 @@ _ROUNDS = 3
 
 # Seconds after which the thread is asked again for the turn.
 _CLAIM_SLICE = 0.05
-
-# Seconds between two checks whether the portal still exists. Its finalizer does not run if a signal handler raises in
-# the garbage collector's callback before signals are deferred there.
-_ORPHAN_S = 5.0
 
 _log = logging.getLogger("urlab_client.sync")
 
@@ -95,40 +92,27 @@ class Job(Generic[T]):
     Attributes:
         error: The exception that it raised; otherwise `value` is its result.
         finished: Whether it has ended.
-        leave: Whether its caller should stop waiting for it.
     """
 
-    __slots__ = ("_waiter", "coro", "error", "finished", "leave", "task", "value")
+    __slots__ = ("_news", "coro", "error", "finished", "task", "value")
 
     value: T
 
     def __init__(self, coro: Coroutine[Any, Any, T]) -> None:
         self.coro = coro
-        self.task: asyncio.Task[None] | None = None
+        self.task: asyncio.Task[T] | None = None
         self.error: BaseException | None = None
         self.finished = False
-        self.leave = False
-        self._waiter: threading.Lock | None = None
+        self._news: SimpleQueue[None] = SimpleQueue()
 
-    @property
-    def started(self) -> bool:
-        """Whether the coroutine has started. One that has not must be closed, because cancelling has no effect."""
-        return inspect.getcoroutinestate(self.coro) != inspect.CORO_CREATED
-
-    def wait(self, timeout: float = threading.TIMEOUT_MAX) -> None:
-        """Block until the job is finished or its caller has to leave, at most `timeout` seconds."""
-        waiter = self._waiter = self._waiter or threading.Lock()
-        waiter.acquire(blocking=False)
-        while not (self.finished or self.leave) and timeout > 0:
-            piece = min(timeout, _WAIT_SLICE)
-            waiter.acquire(timeout=piece)
-            timeout -= piece
+    def wait(self, timeout: float | None = _WAIT_SLICE) -> None:
+        """Block until the caller has something to check, at most `timeout` seconds."""
+        with contextlib.suppress(Empty):
+            self._news.get(timeout=timeout)
 
     def wake(self) -> None:
         """Wake the caller, which checks the job's state."""
-        if self._waiter is not None:
-            with contextlib.suppress(RuntimeError):  # it has been woken already
-                self._waiter.release()
+        self._news.put(None)
 
 
 class CallerDrivenLoop:
@@ -138,13 +122,9 @@ class CallerDrivenLoop:
 
     Args:
         at_stop: Returns the coroutine that releases the resources on the loop; None if there are none.
-        owner: Weak reference to the portal; the loop ends when the portal is gone.
     """
 
-    def __init__(
-        self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None, owner: Callable[[], object | None]
-    ) -> None:
-        self._owner = owner
+    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
         # Not new_event_loop(): the user's loop policy is for the user's loop, and pyzmq needs a selector on Windows.
         self._loop = asyncio.SelectorEventLoop(_Selector())
         self._thread = background_thread("urlab-io", self._run)
@@ -172,11 +152,8 @@ class CallerDrivenLoop:
         """Start the thread."""
         try:
             self._thread.start()
-        except BaseException:
-            if self._thread.ident is None:
-                self._loop.close()
-            else:
-                self._request_stop()
+        except BaseException:  # the system refuses another thread
+            self._loop.close()
             raise
 
     @property
@@ -200,15 +177,12 @@ class CallerDrivenLoop:
             drives = self._begin(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
-                # First, because a signal that arrives between this line and the next ones sets it again. The other way
-                # round, its handler would not run before the job is done.
-                job.leave = False
                 if signals.arrived:
                     # Here and not in the loop: what a handler raises there would hit whatever task is running.
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
                 elif drives and not self._ended:
-                    self._drive(job)
+                    self._drive(job, signals)
                 else:
                     job.wait()
         except BaseException:
@@ -247,7 +221,6 @@ class CallerDrivenLoop:
 
     def _call_away(self, job: Job[Any]) -> None:
         """Make the caller of `job` check whether it should continue waiting."""
-        job.leave = True
         job.wake()
         if self._driven is job:
             self._poke(self._loop.stop)
@@ -264,28 +237,27 @@ class CallerDrivenLoop:
         self._ensure_driver()
         deadline = time.monotonic() + GRACE
         while not job.finished and (left := deadline - time.monotonic()) > 0:
-            job.leave = False
             job.wait(left)
         if not job.finished:
             _log.warning(
                 "%s is still running %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE
             )
 
-    def _drive(self, job: Job[Any]) -> None:
-        """Run the loop on this thread until `job` is finished or its caller must leave."""
+    def _drive(self, job: Job[Any], signals: DeferredSignals) -> None:
+        """Run the loop on this thread until `job` is finished or a signal has arrived."""
         while not self._turn.acquire(blocking=False):
-            if job.leave:
+            if signals.arrived:
                 return
             # Again in each slice: the thread may have taken the turn only after it was asked.
             self._poke(self._yield)
             if self._turn.acquire(timeout=_CLAIM_SLICE):
                 break
         try:
-            if job.task is None and not self._ended:  # otherwise this caller was called away, and comes back
+            if job.task is None and not self._ended:  # otherwise this caller comes back from a signal
                 self._start_job(job)
             self._driven = job
             # In a loop, because anything may stop the loop: another caller that wants the turn, or code of a task.
-            while not (job.finished or job.leave or self._ended):
+            while not (job.finished or signals.arrived or self._ended):
                 self._run_loop()
             self._driven = None
         finally:
@@ -330,34 +302,28 @@ class CallerDrivenLoop:
 
     def _start_job(self, job: Job[Any]) -> None:
         if job in self._jobs:
-            job.task = asyncio.Task(self._perform(job), loop=self._loop, name="urlab-call")
+            job.task = asyncio.Task(job.coro, loop=self._loop, name="urlab-call")
+            job.task.add_done_callback(functools.partial(self._take_result, job))
 
     def _cancel_job(self, job: Job[Any]) -> None:
-        if job.started and job.task is not None:
+        if job.task is not None:
             job.task.cancel()
         elif job in self._jobs:
             self._break_off(job)
 
-    async def _perform(self, job: Job[Any]) -> None:
-        # Not a callback of the task, which would take one more iteration of the loop.
-        if job.finished:
-            return
-        try:
-            job.value = await job.coro
-        except GeneratorExit:
-            raise  # The loop ended before the job.
-        except asyncio.CancelledError as error:
-            job.error = self._closed("during this call") if self._stopping else error.with_traceback(None)
-        except BaseException as error:  # noqa: BLE001  # raised by the caller
-            trace = error.__traceback__
-            job.error = error.with_traceback(None if trace is None else trace.tb_next)  # without this frame
-            del trace
+    def _take_result(self, job: Job[Any], task: asyncio.Task[Any]) -> None:
+        if task.cancelled():
+            job.error = self._closed("during this call") if self._stopping else asyncio.CancelledError()
+        else:
+            job.error = task.exception()
+            if job.error is None:
+                job.value = task.result()
         self._finish_job(job)
 
     def _break_off(self, job: Job[Any]) -> None:
         job.error = self._closed("during this call")
-        if not job.started:
-            job.coro.close()
+        if job.task is None:
+            job.coro.close()  # otherwise Python would warn that it was never awaited
         self._finish_job(job)
 
     def _finish_job(self, job: Job[Any]) -> None:
@@ -443,10 +409,7 @@ class CallerDrivenLoop:
         self._loop.stop()
 
     async def _main(self) -> None:
-        stop = asyncio.ensure_future(self._stop_requested.wait())
-        while not (await asyncio.wait((stop,), timeout=_ORPHAN_S))[0]:
-            if self._owner() is None:
-                self._request_stop()
+        await self._stop_requested.wait()
         if self._at_stop is not None:
             await _in_bounded_time(asyncio.ensure_future(self._at_stop()))
 

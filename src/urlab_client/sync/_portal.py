@@ -8,7 +8,6 @@ import sys
 import threading
 import weakref
 from collections.abc import Callable, Coroutine
-from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 from urlab_client.aio.streams.stream import Stream
@@ -76,12 +75,11 @@ class Portal:
         error, job.error = job.error, None
         if error is None:
             return job.value
-        # The message and notes of a refusal by the server are enough; frames of the client would hide them.
-        trace = None if isinstance(error, URLabRPCError) else _without_earlier_raise(error.__traceback__)
         try:
-            raise error.with_traceback(trace)
+            # The message and notes of a refusal by the server are enough; frames of the client would hide them.
+            raise error.with_traceback(None) if isinstance(error, URLabRPCError) else error
         finally:
-            del error, job, trace  # The traceback refers to this frame: avoid a cycle.
+            del error, job  # The traceback refers to this frame: avoid a cycle.
 
     def next(self, function: Callable[[], Coroutine[Any, Any, T]]) -> T:
         """`call` for a façade's `__next__`: `StopAsyncIteration` becomes `StopIteration`."""
@@ -119,22 +117,16 @@ class Portal:
             return
         if self._io is not None and self._io.is_current:
             raise _on_io_thread()
-        error: BaseException | None = None
-        with DeferredSignals() as signals:
+        with DeferredSignals():
             try:
                 if last is not None:
                     with contextlib.suppress(ClientClosed):  # Another thread was faster.
-                        io = self._ready()
-                        job = Job(last(*args, **kwargs))
-                        io.run(job, signals)
-                        error = job.error
+                        self.call(last, *args, **kwargs)
             finally:
                 with self._lock:
                     self._closed = True
                 if self._finalizer is not None:
                     self._finalizer()
-        if error is not None and not isinstance(error, ClientClosed):
-            raise error
 
     def twin(self, aio: object, make: Callable[[], A]) -> A:
         """Return the blocking twin of `aio`: the same object while it is referenced, otherwise a new one."""
@@ -157,7 +149,7 @@ class Portal:
                 if self._closed:
                     raise client_closed()
                 if self._io is None:
-                    io = CallerDrivenLoop(self._at_stop, weakref.ref(self))
+                    io = CallerDrivenLoop(self._at_stop)
                     io.start()
                     self._finalizer = weakref.finalize(self, io.stop)
                     self._io = io
@@ -194,27 +186,3 @@ def _on_io_thread() -> URLabError:
         "A blocking call was made on the client's own I/O thread, which would wait for itself.",
         hint="Move the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
     )
-
-
-def _without_earlier_raise(trace: TracebackType | None) -> TracebackType | None:
-    """Remove the part of `trace` that an earlier raise of the same exception object left at its end.
-
-    That part begins in a frame of the earlier call's callers and continues through `Portal.call`.
-    """
-    entry = trace
-    while entry is not None and entry.tb_frame.f_code is not Portal.call.__code__:
-        entry = entry.tb_next
-    if trace is None or entry is None:
-        return trace
-    callers = {entry.tb_frame}
-    frame = entry.tb_frame.f_back
-    while frame is not None:
-        callers.add(frame)
-        frame = frame.f_back
-    if trace.tb_frame in callers:
-        return trace  # A coroutine of this loop made a blocking call into another loop: nothing to remove.
-    last = trace
-    while last.tb_next is not None and last.tb_next.tb_frame not in callers:
-        last = last.tb_next
-    last.tb_next = None
-    return trace

@@ -35,7 +35,7 @@ class DeferredSignals:
         on_arrival: Callback invoked when a signal arrives, between any two instructions of the block. Must not raise.
     """
 
-    __slots__ = ("_arrived", "_handlers", "_holding", "_numbers", "_undelivered", "on_arrival")
+    __slots__ = ("_arrived", "_handlers", "_holding", "_numbers", "on_arrival")
 
     def __init__(self) -> None:
         self.on_arrival: Callable[[], object] | None = None
@@ -43,7 +43,6 @@ class DeferredSignals:
         self._numbers: list[int] = []
         self._handlers: list[Any] = []
         self._arrived: list[tuple[int, FrameType | None]] = []
-        self._undelivered: map[None] | None = None
 
     def __enter__(self) -> Self:
         if threading.get_ident() == threading.main_thread().ident:
@@ -60,11 +59,7 @@ class DeferredSignals:
                 self._holding = True
             except BaseException:  # raised by a handler that was not replaced yet
                 self._holding = True
-                try:
-                    self._put_back()
-                except BaseException:  # raised by another one
-                    self._put_back()
-                    raise
+                self._put_back()
                 raise
         return self
 
@@ -98,35 +93,31 @@ class DeferredSignals:
         return None
 
     def _put_back(self) -> None:
-        """Restore the handlers, and run those of arrived signals, one by one as Python does."""
+        """Restore the handlers, and run those of arrived signals, one by one as Python does.
+
+        Should several of them raise while they are restored, some stay replaced. They work all the same: see
+        `_on_signal`.
+        """
         mine = self._on_signal
-        # Except those that were replaced in the meantime.
-        replaced = [
-            (number, _last_in_place(number, handler))
-            for number, handler in zip(self._numbers, self._handlers)  # noqa: B905
-            if _get_handler(number) == mine
-        ]
+        restored = [*zip(self._numbers, self._handlers, strict=False)]
+        restored = [pair for pair in restored if _get_handler(pair[0]) == mine]  # others were replaced in the meantime
+        undelivered = map(_raise_soon, map(itemgetter(0), self._arrived))  # those that are still to come included
         try:
-            _consume(starmap(_set_handler, replaced))
+            _consume(starmap(_set_handler, restored))
         except BaseException:  # raised by a handler that was already restored; it ran once, so the second try succeeds
-            _consume(starmap(_set_handler, replaced))
+            _consume(starmap(_set_handler, restored))
             raise
         finally:
             self._holding = False
             # The restored handlers are run by Python, as after any signal: what they raise has the caller's line in its
             # traceback, and none runs inside another.
-            if self._undelivered is not None:
-                _consume(self._undelivered)
+            _consume(undelivered)
 
     def _replaced(self, number: int) -> Any:
         """Return the handler that was replaced, by this block or an outer one."""
         handler = dict(zip(self._numbers, self._handlers, strict=False)).get(number)
         outer = getattr(handler, "__self__", None)
         return outer._replaced(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
-
-    def left_in_place(self, number: int) -> Any:
-        """Return the handler that this object still replaces after its block; None while the block is active."""
-        return None if self._holding else dict(zip(self._numbers, self._handlers, strict=False)).get(number)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._holding:
@@ -135,15 +126,5 @@ class DeferredSignals:
             return
         if all(number != other for other, _ in self._arrived):
             self._arrived.append((number, frame))
-        if self._undelivered is None:
-            self._undelivered = map(_raise_soon, map(itemgetter(0), self._arrived))
         if self.on_arrival is not None:
             self.on_arrival()
-
-
-def _last_in_place(number: int, handler: Any) -> Any:
-    """Return the handler behind one that stayed in place after its block because several signals arrived at once."""
-    owner = getattr(handler, "__self__", None)
-    while isinstance(owner, DeferredSignals) and (before := owner.left_in_place(number)) is not None:
-        handler, owner = before, getattr(before, "__self__", None)
-    return handler

@@ -4,113 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 from urlab_client.aio import articulation as aio
+from urlab_client.aio.articulation import LocalArticulation
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.aio.session.control import CLAIM_S
-from urlab_client.enums import ControlMode, OutOfRange
-from urlab_client.protocol.base import Floats
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.controllers import URLabController
-from urlab_client.values.descriptions import ArticulationDescription, EntityDescription
+from urlab_client.values.descriptions import ArticulationDescription
 from urlab_client.values.names import NameMap
 
 
-class URLabEntity(Facade, twin=aio.URLabEntity):
-    """A dynamic body, or the root of an articulation.
-
-    The state is that of the last reply. Each array is a fresh copy. To read several consistent values from a thread
-    other than the one that steps, hold `client._data_lock`.
-    """
-
-    __slots__ = ()
-    _aio: aio.URLabEntity
-
-    @property
-    def name(self) -> str:
-        """Key in `client.entities`."""
-        return self._aio.name
-
-    @property
-    def body_id(self) -> int:
-        """Global MuJoCo id of the body (of the root body for an articulation, -1 without a local model)."""
-        return self._aio.body_id
-
-    @property
-    def has_free_base(self) -> bool:
-        """True if the body or root body has a free joint; False for an articulation without a local model."""
-        return self._aio.has_free_base
-
-    @property
-    def free_joint(self) -> str | None:
-        """Compiled name of the free joint, or None."""
-        return self._aio.free_joint
-
-    @property
-    def qpos_offset(self) -> int | None:
-        """Start of the 7 free-joint positions in `client.data.qpos`, or None without a free joint."""
-        return self._aio.qpos_offset
-
-    @property
-    def qvel_offset(self) -> int | None:
-        """Start of the 6 free-joint velocities in `client.data.qvel`, or None without a free joint."""
-        return self._aio.qvel_offset
-
-    @property
-    def root_pos_w(self) -> Floats:
-        """Position of the body frame's origin, shape (3,), metres, world frame."""
-        return self._aio.root_pos_w
-
-    @property
-    def root_quat_w(self) -> Floats:
-        """Orientation (w, x, y, z), shape (4,), world frame."""
-        return self._aio.root_quat_w
-
-    @property
-    def root_quat_xyzw(self) -> Floats:
-        """Orientation (x, y, z, w) as SciPy and ROS order it, shape (4,), world frame."""
-        return self._aio.root_quat_xyzw
-
-    @property
-    def root_lin_vel_w(self) -> Floats:
-        """Velocity of the body frame's origin, shape (3,), m/s, world frame."""
-        return self._aio.root_lin_vel_w
-
-    @property
-    def root_lin_vel_b(self) -> Floats:
-        """Velocity of the body frame's origin, shape (3,), m/s, body frame."""
-        return self._aio.root_lin_vel_b
-
-    @property
-    def projected_gravity_b(self) -> Floats:
-        """Unit vector in the direction of gravity, shape (3,), body frame; (0, 0, -1) when upright."""
-        return self._aio.projected_gravity_b
-
-    def apply_xfrc(self, *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)) -> None:
-        """Buffer a wrench at the body's centre of mass for the next `step()`, which clears it.
-
-        Inert in puppet mode, and in live mode, where the server ignores wrenches.
-
-        Args:
-            force: (fx, fy, fz), N, world frame.
-            torque: (tx, ty, tz), N m, world frame.
-
-        Raises:
-            TypeError: A component is not a number.
-            ValueError: A vector does not have three finite components.
-        """
-        self._aio.apply_xfrc(force=force, torque=torque)
-
-    def describe(self) -> EntityDescription | ArticulationDescription:
-        """Return name, kind and pose as of the last reply, in a form that encodes directly to JSON."""
-        return self._aio.describe()
-
-
-class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
+class URLabArticulation(Facade, LocalArticulation, twin=aio.URLabArticulation):
     """A robot imported from MJCF.
 
     Dictionaries are keyed by short names, without the articulation's prefix. Lookups also accept compiled names and
@@ -118,47 +25,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     """
 
     __slots__ = ()
-    _aio: aio.URLabArticulation  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
-
-    @property
-    def prefix(self) -> str:
-        """Articulation key."""
-        return self._aio.prefix
-
-    @property
-    def compiled_prefix(self) -> str:
-        """Prefix of its compiled names, without the underscore: the key, or the engine's name of the actor."""
-        return self._aio.compiled_prefix
-
-    @property
-    def user(self) -> dict[str, Any]:
-        """Values of the user channels that the level declares for it, by name; empty if the server has none."""
-        return self._aio.user
-
-    @property
-    def actor_id(self) -> str:
-        """Stable id given when it was spawned; empty if none was given."""
-        return self._aio.actor_id
-
-    @property
-    def actuators(self) -> NameMap[Actuator]:
-        """Actuators in id order."""
-        return self._aio.actuators
-
-    @property
-    def joints(self) -> NameMap[Joint]:
-        """Joints in id order."""
-        return self._aio.joints
-
-    @property
-    def sensors(self) -> NameMap[Sensor]:
-        """Sensors in id order."""
-        return self._aio.sensors
-
-    @property
-    def bodies(self) -> NameMap[Body]:
-        """Bodies in id order."""
-        return self._aio.bodies
+    _aio: aio.URLabArticulation
 
     @property
     def cameras(self) -> NameMap[URLabCameraView]:
@@ -170,146 +37,12 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """The controller, or None if the set-points go directly to the actuators."""
         return self._wrap(URLabController, self._aio.controller)
 
-    @property
-    def control_mode(self) -> ControlMode:
-        """Whether the controller turns set-points into actuator signals. Assign it before `step()`.
-
-        Raises:
-            ValueError: On assigning anything but `ue_controller` or `raw`.
-        """
-        return self._aio.control_mode
-
-    @control_mode.setter
-    def control_mode(self, mode: ControlMode | str) -> None:
-        self._aio.control_mode = mode
-
-    @property
-    def ctrl_array(self) -> Floats:
-        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place.
-
-        Writing makes this client control the robot, and reading does not. Assigning to the property checks the values;
-        `step()` refuses NaN and infinities that were written in place.
-
-        Raises:
-            TypeError: On assigning values that are not numbers.
-            ValueError: On assigning NaN, infinities or the wrong number of values.
-        """
-        return self._aio.ctrl_array
-
-    @ctrl_array.setter
-    def ctrl_array(self, values: Sequence[float] | Floats) -> None:
-        self._aio.ctrl_array = values
-
-    @property
-    def last_applied_ctrl(self) -> Floats:
-        """`mjData.ctrl` that the server applied last, after any controller, shape (n_actuators,)."""
-        return self._aio.last_applied_ctrl
-
-    @property
-    def act_array(self) -> Floats:
-        """Activation per actuator, shape (n_actuators,); 0 for stateless ones."""
-        return self._aio.act_array
-
-    @property
-    def qpos_array(self) -> Floats:
-        """Joint positions, shape (nq,), in joint order: radians, metres, quaternions (w, x, y, z)."""
-        return self._aio.qpos_array
-
-    @property
-    def qvel_array(self) -> Floats:
-        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; a free base's linear in world, angular in body."""
-        return self._aio.qvel_array
-
-    @property
-    def dof_qpos(self) -> Floats:
-        """Joint positions without the free base, shape (nq,) or (nq - 7,)."""
-        return self._aio.dof_qpos
-
-    @property
-    def dof_qvel(self) -> Floats:
-        """Joint velocities without the free base, shape (nv,) or (nv - 6,)."""
-        return self._aio.dof_qvel
-
-    @property
-    def twist_linear(self) -> Floats:
-        """Commanded linear velocity, shape (3,), m/s, base frame (ROS Twist)."""
-        return self._aio.twist_linear
-
-    @property
-    def twist_angular(self) -> Floats:
-        """Commanded angular velocity, shape (3,), rad/s, base frame (ROS Twist)."""
-        return self._aio.twist_angular
-
-    @property
-    def root_ang_vel_w(self) -> Floats:
-        """Angular velocity of the root, shape (3,), rad/s, world frame."""
-        return self._aio.root_ang_vel_w
-
-    @property
-    def root_ang_vel_b(self) -> Floats:
-        """Angular velocity of the root, shape (3,), rad/s, body frame (as MuJoCo stores it)."""
-        return self._aio.root_ang_vel_b
-
-    def set_ctrl(self, values: Mapping[str, float], *, out_of_range: str | OutOfRange = "allow") -> None:
-        """Set some set-points by actuator name; the others keep their last value.
-
-        Args:
-            values: Actuator name to set-point; the first input of an actuator with several.
-            out_of_range: Handling of a value outside its actuator's range; see `Actuator.set_control`.
-
-        Raises:
-            KeyError: A name is unknown; nothing was set.
-            TypeError: A value is not a number; nothing was set.
-            ValueError: A value is NaN or infinite or, with `error`, out of range; nothing was set.
-        """
-        self._aio.set_ctrl(values, out_of_range=out_of_range)
-
-    def get_ctrl(self) -> dict[str, float]:
-        """Return the set-points that the next step sends, by actuator name."""
-        return self._aio.get_ctrl()
-
-    def get_qpos(self) -> dict[str, float]:
-        """Return the first component of each joint's position, by joint name."""
-        return self._aio.get_qpos()
-
-    def get_sensors(self) -> dict[str, Floats]:
-        """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
-        return self._aio.get_sensors()
-
     def describe(self) -> ArticulationDescription:
         """Return its parts, state and set-points as of the last reply.
 
         `to_dict()` and `to_json()` of the result return plain data.
         """
         return self._aio.describe()
-
-    def resolve_joint(self, name: str) -> str | None:
-        """Return the live key of a joint for its live, compiled or original MJCF name, or None."""
-        return self._aio.resolve_joint(name)
-
-    def resolve_actuator(self, name: str) -> str | None:
-        """Return the live key of an actuator for its live, compiled or original MJCF name, or None."""
-        return self._aio.resolve_actuator(name)
-
-    def apply_xfrc(
-        self, body: str = "", *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)
-    ) -> None:
-        """Buffer a wrench on one of its bodies for the next `step()`, which clears it.
-
-        The wrench acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where
-        the server ignores wrenches.
-
-        Args:
-            body: Short body name; the root body if empty.
-            force: (fx, fy, fz), N, world frame.
-            torque: (tx, ty, tz), N m, world frame.
-
-        Raises:
-            KeyError: The articulation has no such body.
-            TypeError: A component is not a number.
-            ValueError: A vector does not have three finite components, or `body` is empty and the root is not known.
-        """
-        self._aio.apply_xfrc(body, force=force, torque=torque)
 
     def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
         """Move joints to positions with their position servos, and return when they have settled.

@@ -4,88 +4,23 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-
 from urlab_client.aio import cameras as aio
+from urlab_client.aio.cameras import LocalCamera
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams.publishers import SharedFrame
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
-from urlab_client.enums import CameraMode
-from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy, StreamPolicyName
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
-from urlab_client.values.descriptions import CameraDescription
-from urlab_client.values.pictures import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
 
-class URLabCameraView(Facade, twin=aio.URLabCameraView):
+class URLabCameraView(Facade, LocalCamera, twin=aio.URLabCameraView):
     """One camera. Frames arrive with `client.step(include_cameras=…)`, and automatically in live mode."""
 
     __slots__ = ()
     _aio: aio.URLabCameraView
-
-    @property
-    def delivered(self) -> bool:
-        """False if the last step that requested a frame got none; `latest_frame` is then older than the state."""
-        return self._aio.delivered
-
-    @property
-    def name(self) -> str:
-        """Name without the articulation's prefix."""
-        return self._aio.name
-
-    @property
-    def info(self) -> CameraInfo:
-        """Description from the handshake."""
-        return self._aio.info
-
-    @property
-    def latest_frame(self) -> Pixels | None:
-        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, otherwise (H, W, 4) BGRA.
-
-        Each frame is a new array, which later frames do not overwrite. Until the next frame arrives, all callers get
-        the same array.
-        """
-        return self._aio.latest_frame
-
-    @property
-    def sim_time(self) -> float | None:
-        """Simulation time of the newest frame, seconds; None in live mode unless the server sends it."""
-        return self._aio.sim_time
-
-    @property
-    def frame_id(self) -> int | None:
-        """Id of the state snapshot that the newest frame shows, comparable to `StepOk.frame_id`; None if not sent."""
-        return self._aio.frame_id
-
-    @property
-    def mode(self) -> CameraMode | str:
-        """Meaning of the pixels; a plain string for a mode that this client does not know."""
-        return self._aio.mode
-
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) in pixels."""
-        return self._aio.resolution
-
-    @property
-    def fovy(self) -> float:
-        """Vertical field of view, degrees."""
-        return self._aio.fovy
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """uint8, or float32 for depth."""
-        return self._aio.dtype
-
-    def describe(self) -> CameraDescription:
-        """Return name, mode, resolution and field of view."""
-        return self._aio.describe()
 
     def capture(self, *, timeout: Timeout = DEFAULT) -> CameraSample:
         """Take a picture now, in any step mode, without a step; it also becomes `latest_frame`.

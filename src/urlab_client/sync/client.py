@@ -10,7 +10,9 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from urlab_client.aio import client as aio
-from urlab_client.aio.client_types import STATE_PORT, CallRecord, Diagnosis, Resync
+from urlab_client.aio.articulation import URLabEntity
+from urlab_client.aio.client_state import ClientState
+from urlab_client.aio.client_types import STATE_PORT, CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.aio.defaults import DEFAULT, SESSION_LEVEL, SessionLevel, Timeout
 from urlab_client.aio.streams.stream import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.enums import (
@@ -35,7 +37,8 @@ from urlab_client.protocol.messages.streams import (
 )
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
-from urlab_client.sync.client_state import ClientState
+from urlab_client.sync.articulation import URLabArticulation
+from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.namespaces import (
     DebugNamespace,
     FarmNamespace,
@@ -48,6 +51,8 @@ from urlab_client.sync.namespaces import (
     ViewportNamespace,
 )
 from urlab_client.sync.streams import Stream
+from urlab_client.values.descriptions import SceneDescription
+from urlab_client.values.names import NameMap
 
 R = TypeVar("R", bound=Reply)
 
@@ -103,7 +108,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
     """
 
     __slots__ = ()
-    _aio: aio.URLabClient  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
+    _aio: aio.URLabClient
 
     def __init__(
         self,
@@ -155,6 +160,51 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 observe=observe,
             )
         )
+
+    @property
+    def address(self) -> str:
+        """The address given to the constructor."""
+        return self._aio.address
+
+    @property
+    def config(self) -> ClientConfig:
+        """The constructor's arguments. They can be pickled or encoded to JSON to create an equal client elsewhere."""
+        return self._aio.config
+
+    @property
+    def articulations(self) -> NameMap[URLabArticulation]:
+        """Articulations by key. Lookups also accept an actor id or a class name that is unambiguous."""
+        return self._map("articulations", URLabArticulation, self._aio.articulations)
+
+    @property
+    def articulations_by_id(self) -> dict[str, URLabArticulation]:
+        """Articulations that have an actor id, by that id."""
+        return {key: self._wrap(URLabArticulation, item) for key, item in self._aio.articulations_by_id.items()}
+
+    @property
+    def entities(self) -> NameMap[URLabEntity]:
+        """Every dynamic body by name, articulations included."""
+        return self._map("entities", URLabEntity, self._aio.entities)
+
+    @property
+    def global_cameras(self) -> NameMap[URLabCameraView]:
+        """Scene-level cameras by name."""
+        return self._map("global_cameras", URLabCameraView, self._aio.global_cameras)
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` if that is unambiguous.
+
+        Raises:
+            UnknownName: No camera or more than one has this name. It is a `KeyError`.
+        """
+        return self._wrap(URLabCameraView, self._aio.camera(name))
+
+    def describe(self) -> SceneDescription:
+        """Return all robots, other dynamic bodies and scene cameras as of the last reply.
+
+        Sends nothing. `to_dict()` and `to_json()` of the result return plain data.
+        """
+        return self._aio.describe()
 
     @property
     def scene(self) -> SceneNamespace:

@@ -135,11 +135,7 @@ class RuntimeOps(Facade, twin=aio_ops.RuntimeOps):
         return self._portal.call(self._aio.read_mocap_pose, body, timeout=timeout)
 
     def list_keyframes(self, *, timeout: Timeout = DEFAULT) -> list[KeyframeInfo]:
-        """List the compiled keyframes.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """List the compiled keyframes."""
         return self._portal.call(self._aio.list_keyframes, timeout=timeout)
 
 
@@ -150,11 +146,7 @@ class ReplayOps(Facade, twin=aio_ops.ReplayOps):
     _aio: aio_ops.ReplayOps
 
     def list_sessions(self, *, timeout: Timeout = DEFAULT) -> list[str]:
-        """List the loaded sessions.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """List the loaded sessions."""
         return self._portal.call(self._aio.list_sessions, timeout=timeout)
 
 
@@ -194,9 +186,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
     def save_level(self, *, timeout: Timeout = DEFAULT) -> None:
         """Save the open level.
 
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-
         Raises:
             SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
         """
@@ -204,9 +193,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
 
     def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
         """Return the package path of the open level; during play this is still the edited level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -218,9 +204,6 @@ class SceneOps(Facade, twin=aio_ops.SceneOps):
         """Ensure that the level has one manager actor, without which play never becomes ready.
 
         Returns whether the level already had one.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -296,9 +279,6 @@ class OutlinerOps(Facade, twin=aio_ops.OutlinerOps):
 
     def list_blueprints(self, *, timeout: Timeout = DEFAULT) -> list[BlueprintInfo]:
         """List the articulation blueprints of the project.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ListBlueprintsFailed: The content could not be searched.
@@ -627,9 +607,6 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
     def get_camera(self, *, timeout: Timeout = DEFAULT) -> CameraPose:
         """Read the viewport camera's pose.
 
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-
         Raises:
             NoViewport: The editor has no perspective viewport.
         """
@@ -691,11 +668,7 @@ class ViewportNamespace(Facade, twin=aio_ops.ViewportNamespace):
         )
 
     def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Stop tracking, and return whether it was active.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """Stop tracking, and return whether it was active."""
         return self._portal.call(self._aio.untrack, timeout=timeout)
 
 

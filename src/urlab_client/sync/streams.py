@@ -9,13 +9,14 @@ from typing import Generic, Self, TypeVar
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.streams import stream as aio_stream
-from urlab_client.protocol.messages.streams import StreamItem, StreamStats
+from urlab_client.aio.streams.stream import LocalStream
+from urlab_client.protocol.messages.streams import StreamItem
 from urlab_client.sync._facade import Facade
 
 T = TypeVar("T", bound=StreamItem)
 
 
-class Stream(Facade, Generic[T], twin=aio_stream.Stream):
+class Stream(Facade, LocalStream[T], Generic[T], twin=aio_stream.Stream):
     """Items that the server publishes, as they arrive.
 
     The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
@@ -39,35 +40,6 @@ class Stream(Facade, Generic[T], twin=aio_stream.Stream):
 
     __slots__ = ()
     _aio: aio_stream.Stream[T]
-
-    @property
-    def closed(self) -> bool:
-        """Whether the reader closed the stream."""
-        return self._aio.closed
-
-    @property
-    def stats(self) -> StreamStats:
-        """Counters up to now."""
-        return self._aio.stats
-
-    def latest(self) -> T | None:
-        """Return the newest item without waiting and without removing it from the buffer; None before the first.
-
-        The reader gets the same object.
-        """
-        return self._aio.latest()
-
-    def receive_nowait(self) -> T | None:
-        """Return the next item if one is buffered, otherwise None.
-
-        Returns None before the stream is opened and after it is closed.
-
-        Raises:
-            StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Another reader is waiting for the next item.
-            ClientClosed: The client was closed and all items that had arrived have been read.
-        """
-        return self._aio.receive_nowait()
 
     def receive(self, *, timeout: Timeout = DEFAULT) -> T:
         """Return the next item.

@@ -126,6 +126,17 @@ class PublicDir:
         return [name for name in super().__dir__() if not name.startswith("_") or name.startswith("__")]
 
 
+class Local(PublicDir):
+    """Base class of what the async and the blocking client share: it reads and writes `_state`, and never waits."""
+
+    __slots__ = ("__weakref__", "_state")
+
+    _state: Any
+
+    def __init__(self, state: object) -> None:
+        self._state = state
+
+
 class NameMap(PublicDir, dict[str, T]):
     """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
 
@@ -256,16 +267,20 @@ def split_prefix(names: Iterable[str], prefixes: Collection[str]) -> list[tuple[
     return [(owner, name if owner is None else name[len(owner) + 1 :]) for owner, name in owned]
 
 
-def compiled_names(name: str, prefixes: Mapping[str, str]) -> set[str]:
-    """Return what a user may mean by a name in the compiled model, besides that very name.
+def names_meant(name: str, names: Collection[str], prefixes: Mapping[str, str]) -> list[str]:
+    """Return the compiled names that a user may mean by a name: that very name or, without one, those of any robot.
 
     Args:
-        name: The name an articulation's author gave, or that with the articulation's key and `_` in front.
+        name: A compiled name, the name that an articulation's author gave, or that with the articulation's key and `_`
+            in front.
+        names: The names in the compiled model.
         prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
     """
+    if name in names:
+        return [name]
     local = {f"{prefix}_{name}" for prefix in prefixes.values()}
     keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
-    return local | keyed
+    return [found for found in names if found in local | keyed]
 
 
 def spellings(names: Iterable[str], prefixes: Mapping[str, str]) -> list[tuple[str, ...]]:
@@ -273,7 +288,7 @@ def spellings(names: Iterable[str], prefixes: Mapping[str, str]) -> list[tuple[s
 
     Args:
         names: Compiled names.
-        prefixes: As in `compiled_names`.
+        prefixes: As in `names_meant`.
 
     Returns:
         Per name, in order, the name itself, then `ARTICULATION/NAME` by the articulation's key and by its prefix, and

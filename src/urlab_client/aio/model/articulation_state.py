@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from urlab_client.protocol.messages.session import (
     EntityState,
     TwistState,
 )
+
+if TYPE_CHECKING:
+    from urlab_client.aio.model.elements import ArticulationElements
 
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
@@ -70,11 +73,7 @@ class MirroredEntity:
             self.pose = None
 
     def check_pose(self, state: EntityState, op: str) -> None:
-        """Reject a state whose arrays do not have the lengths of a pose and a velocity.
-
-        Raises:
-            ProtocolError: An array has the wrong length.
-        """
+        """Raise `ProtocolError` if an array does not have the length of a pose or a velocity."""
         for what, array, expected in (("qpos", state.qpos, 7), ("qvel", state.qvel, 6)):
             if array is not None and len(array) != expected:
                 raise ProtocolError(
@@ -156,6 +155,7 @@ class MirroredArticulation(MirroredEntity):
 
     Attributes:
         layout: Addresses of its values in the compiled model.
+        elements: Handles of its joints, actuators, sensors and bodies once they were asked for.
         info: Description from the handshake.
         controller: Controller block from the handshake, kept current.
         control_mode: Whether the controller is active.
@@ -189,6 +189,7 @@ class MirroredArticulation(MirroredEntity):
         """Adopt the description from a handshake. Keep set-points and control mode if they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
+        self.elements: ArticulationElements | None = None
         self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
         self._sensor_names = [*layout.sensor_dims]
         self._sensor_dims = [*layout.sensor_dims.values()]
@@ -248,11 +249,7 @@ class MirroredArticulation(MirroredEntity):
         return self.qvel[:6].copy() if self.has_free_base else None
 
     def check(self, state: ArticulationState, op: str) -> None:
-        """Reject a state whose arrays do not fit the model, before any part of the reply is applied.
-
-        Raises:
-            ProtocolError: An array has the wrong length.
-        """
+        """Raise `ProtocolError` if an array does not fit the model, before any part of the reply is applied."""
         if self.mirror.model is None:
             return
         # This runs for each robot in each reply: locate the problem only if there is one.
@@ -278,11 +275,7 @@ class MirroredArticulation(MirroredEntity):
             self._fits(op, f"sensor {name!r}", reading, self.layout.sensor_dims.get(name, len(reading)))
 
     def check_written(self, qpos: Floats) -> None:
-        """Reject positions that `set_qpos` cannot have written.
-
-        Raises:
-            ProtocolError: The positions cover neither the whole articulation nor its free base.
-        """
+        """Raise `ProtocolError` for positions that cover neither the whole articulation nor its free base."""
         if self.mirror.model is not None and not (self.has_free_base and len(qpos) == 7):
             self._fits("set_qpos", "qpos", qpos, len(self.layout.qpos_adr))
 
@@ -351,19 +344,11 @@ class MirroredArticulation(MirroredEntity):
         return self._driven or self.ctrl.tolist() != self._left
 
     def live_command(self) -> ArticulationCommand:
-        """Return the command of a live step; the server ignores everything but `ctrl`.
-
-        Raises:
-            ValueError: A set-point is NaN or infinite.
-        """
+        """Return the command of a live step; the server ignores everything but `ctrl`."""
         return ArticulationCommand(ctrl=self._set_points())
 
     def direct_command(self, wrenches: Wrenches | None) -> ArticulationCommand:
-        """Return the command of a direct step that carries these wrenches.
-
-        Raises:
-            ValueError: A set-point is NaN or infinite.
-        """
+        """Return the command of a direct step that carries these wrenches."""
         bypass = self.controller is not None and self.control_mode is ControlMode.RAW
         return ArticulationCommand(
             ctrl=self._set_points(),

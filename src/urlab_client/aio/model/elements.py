@@ -357,16 +357,19 @@ class ArticulationElements:
     bodies: NameMap[Body]
 
 
-def make_elements(record: MirroredArticulation) -> ArticulationElements:
-    """Create the handles of an articulation. Without a local model, only names and types of its actuators are known."""
+def elements_of(record: MirroredArticulation) -> ArticulationElements:
+    """Return the handles of an articulation. Without a local model, only names and types of its actuators are known."""
+    if record.elements is not None:
+        return record.elements
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
     bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
-    return ArticulationElements(
+    record.elements = ArticulationElements(
         joints=_named(record.info, "joint", _joints(record, model), original.joints),
         actuators=_named(record.info, "actuator", _actuators(record, model), original.actuators),
         sensors=_named(record.info, "sensor", _sensors(record, model), original.sensors),
         bodies=_named(record.info, "body", bodies, original.bodies),
     )
+    return record.elements
 
 
 H = TypeVar("H", Actuator, Joint, Sensor, Body)

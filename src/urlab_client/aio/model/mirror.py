@@ -152,11 +152,7 @@ class Mirror:
 
     @classmethod
     def load(cls, hello: HelloOk, *, trusted: bool) -> Loaded | None:
-        """Load the model from the handshake; None if it has none. Blocks and changes no state: run in a thread.
-
-        Raises:
-            ProtocolError: This MuJoCo cannot load the model.
-        """
+        """Load the model from the handshake; None if it has none. Blocks and changes no state: run in a thread."""
         import mujoco
 
         mismatch = cls.check_version(hello)
@@ -251,11 +247,7 @@ class Mirror:
             self.data.xfrc_applied[self._dragged] = perturbation.xfrc
 
     def check_finite(self) -> None:
-        """Check the data that a push will send, before the local step. Call under the lock.
-
-        Raises:
-            ValueError: The time or a value in `qpos`, `qvel` or `ctrl` is NaN or infinite.
-        """
+        """Raise `ValueError` if the data of a push are NaN or infinite. Before the local step, under the lock."""
         model, data = self.model, self.data
         if model is None or data is None:
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, overload
 
 from msgspec import Struct
 
@@ -36,9 +36,10 @@ class Namespace(PublicDir):
         return await self._session.call(request, timeout=timeout, on_progress=on_progress)
 
 
-def fill(kind: type[S], reply: Reply) -> S:
-    """Return a `kind` filled from the fields of the same names of a reply."""
-    return kind(**{name: getattr(reply, name) for name in kind.__struct_fields__})
+def fill(kind: type[S], *replies: Struct, **given: Any) -> S:
+    """Return a `kind` with the given fields, and the rest from the first reply that has a field of the same name."""
+    found = {name: getattr(reply, name) for reply in reversed(replies) for name in reply.__struct_fields__}
+    return kind(**({name: found[name] for name in kind.__struct_fields__ if name in found} | given))
 
 
 def target_by(by_name: bool) -> Literal["actor_id", "actor_name"]:

@@ -135,11 +135,7 @@ class RuntimeOps(Namespace):
         return fill(MocapPose, await self._call(ReadMocapPose(body=body), timeout))
 
     async def list_keyframes(self, *, timeout: Timeout = DEFAULT) -> list[KeyframeInfo]:
-        """List the compiled keyframes.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """List the compiled keyframes."""
         return (await self._call(ListKeyframes(), timeout)).keyframes
 
 
@@ -147,11 +143,7 @@ class ReplayOps(Namespace):
     """Generated part of `client.replay`."""
 
     async def list_sessions(self, *, timeout: Timeout = DEFAULT) -> list[str]:
-        """List the loaded sessions.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """List the loaded sessions."""
         return (await self._call(ReplayListSessions(), timeout)).sessions
 
 
@@ -188,9 +180,6 @@ class SceneOps(Namespace):
     async def save_level(self, *, timeout: Timeout = DEFAULT) -> None:
         """Save the open level.
 
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-
         Raises:
             SaveLevelFailed: The level has no path yet, a play session is running, or it could not be written.
         """
@@ -198,9 +187,6 @@ class SceneOps(Namespace):
 
     async def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
         """Return the package path of the open level; during play this is still the edited level.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -212,9 +198,6 @@ class SceneOps(Namespace):
         """Ensure that the level has one manager actor, without which play never becomes ready.
 
         Returns whether the level already had one.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             NotInEditor: The op needs the editor.
@@ -290,9 +273,6 @@ class OutlinerOps(Namespace):
 
     async def list_blueprints(self, *, timeout: Timeout = DEFAULT) -> list[BlueprintInfo]:
         """List the articulation blueprints of the project.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ListBlueprintsFailed: The content could not be searched.
@@ -641,9 +621,6 @@ class ViewportNamespace(Namespace):
     async def get_camera(self, *, timeout: Timeout = DEFAULT) -> CameraPose:
         """Read the viewport camera's pose.
 
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-
         Raises:
             NoViewport: The editor has no perspective viewport.
         """
@@ -710,11 +687,7 @@ class ViewportNamespace(Namespace):
         ).tracked_actor_path
 
     async def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
-        """Stop tracking, and return whether it was active.
-
-        Args:
-            timeout: Seconds to wait; None waits without limit.
-        """
+        """Stop tracking, and return whether it was active."""
         return (await self._call(Untrack(), timeout)).was_tracking
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.namespaces._base import fill
 from urlab_client.aio.namespaces._ops import OutlinerOps
 from urlab_client.protocol.messages.outliner import ActorRow, FindActors, ListActors
 from urlab_client.values.scene_types import ActorInfo
@@ -50,24 +51,15 @@ class OutlinerNamespace(OutlinerOps):
 
 
 def _info(row: ActorRow) -> ActorInfo:
-    quick = row.quick_convert
     kind = row.actor_class
-    return ActorInfo(
-        name=row.name,
-        actor_class=kind,
-        actor_id=row.actor_id,
+    return fill(
+        ActorInfo,
+        row,
+        *([] if row.quick_convert is None else [row.quick_convert]),
         is_articulation=_given(row.is_articulation, kind.endswith("_C") or kind == "MjArticulation"),
         has_quick_convert=_given(row.has_quick_convert, False),
-        location=row.location,
-        rotation_quat=row.rotation_quat,
         is_static_mesh_actor=_given(row.is_static_mesh_actor, kind == "StaticMeshActor"),
         is_light=_given(row.is_light, kind in _LIGHTS),
-        static=quick.static if quick else None,
-        complex_mesh=quick.complex_mesh if quick else None,
-        coacd_threshold=quick.coacd_threshold if quick else None,
-        driven_by_unreal=quick.driven_by_unreal if quick else None,
-        friction=quick.friction if quick else None,
-        label=row.label,
         tags=tuple(row.tags or ()),
     )
 

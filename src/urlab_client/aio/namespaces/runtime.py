@@ -20,7 +20,7 @@ from urlab_client.protocol.messages.runtime import (
     SetMocapPose,
     SetTwist,
 )
-from urlab_client.values.names import UnknownName, compiled_names
+from urlab_client.values.names import UnknownName, names_meant
 
 if TYPE_CHECKING:
     import mujoco
@@ -33,6 +33,7 @@ import numpy as np
 
 from urlab_client.aio.arguments import finite, is_array, mapping, require
 from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session.jobs import OnProgress
@@ -265,7 +266,7 @@ class RuntimeNamespace(RuntimeOps):
         wanted = {name: _transports(name, how) for name, how in given.items()}
         topics = {name: self._camera_topic("set_camera_streaming", name) for name in wanted}
         switch = self._state.publishers.camera_switch
-        if switch is None or not self._session.features.camera_switch:
+        if not self._session.features.camera_switch:
             return {name: self._always_on(name, how) for name, how in wanted.items()}
         states = (
             await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}
@@ -397,7 +398,7 @@ def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | No
         case SetTwist(articulation=str(name)) | SetControlSource(articulation=str(name)):
             robot = objects.articulations.get(name)
             return request if robot is None else replace(request, articulation=robot.prefix)
-        # MuJoCo crashes the process if a name is not text. Later checks report such names.
+        # Later checks report names that are not text.
         case SetMocapPose(body=str(body)) | ReadMocapPose(body=str(body)):
             return replace(request, body=_compiled("body", body, objects, model))
         case GetContacts(filter=names) if names is not None:
@@ -427,22 +428,13 @@ def as_written(reply: R, request: Request[Any]) -> R:
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
     if model is None:
         return name
-    import mujoco
-
-    number = mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
-
-    def exists(candidate: str) -> bool:
-        return mujoco.mj_name2id(model, number, candidate) >= 0
-
-    if exists(name):
-        return name
     prefixes = {
         called: robot.compiled_prefix
         for key, robot in objects.articulations.items()
         for called in (key, robot.actor_id)
         if called
     }
-    found = sorted(filter(exists, compiled_names(name, prefixes)))
+    found = names_meant(name, model_names(model, kind), prefixes)
     if len(found) > 1:
         raise UnknownName(kind, name, tuple(found), tuple(found), ())
     return found[0] if found else name

@@ -14,7 +14,7 @@ import anyio
 from urlab_client.aio.arguments import finite, require
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.upload import flatten, upload
-from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
+from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, fill, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.session.session import Session
@@ -178,16 +178,7 @@ class SceneNamespace(SceneOps):
         )
         reply = await self._call(request, timeout)
         # The location that the plugin echoes is wrong by a factor of 100 and in the sign of y.
-        return URLabSpawnHandle(
-            actor_id=reply.actor_id,
-            actor_name=reply.actor_name,
-            actor_path=reply.actor_path,
-            blueprint_class_path=reply.blueprint_class_path,
-            location=place,
-            rotation_quat=reply.rotation_quat,
-            was_existing=reply.was_existing,
-            requires_pie_restart=reply.requires_pie_restart,
-        )
+        return fill(URLabSpawnHandle, reply, location=place)
 
     async def spawn_light(
         self,
@@ -224,17 +215,7 @@ class SceneNamespace(SceneOps):
             color=as_vec3("color", color),
         )
         reply = await self._call(request, timeout)
-        return URLabLightHandle(
-            actor_id=reply.actor_id,
-            actor_name=reply.actor_name,
-            actor_path=reply.actor_path,
-            kind=reply.kind,
-            intensity=reply.intensity,
-            color=reply.color,
-            location=reply.location,
-            rotation_euler=reply.rotation_euler or euler,
-            requires_pie_restart=reply.requires_pie_restart,
-        )
+        return fill(URLabLightHandle, reply, rotation_euler=reply.rotation_euler or euler)
 
     async def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Remove an actor from the edited level.
@@ -294,11 +275,9 @@ class SceneNamespace(SceneOps):
         reply = await self._call(request, timeout)
         after = await self._call(ListActors(), timeout)
         copy = next((row for row in after.actors if row.name == reply.actor_name), None)
-        return URLabSpawnHandle(
-            actor_id=reply.actor_id,
-            actor_name=reply.actor_name,
-            actor_path=reply.actor_path,
-            blueprint_class_path=reply.blueprint_class_path,
+        return fill(
+            URLabSpawnHandle,
+            reply,
             location=request.location or (copy.location if copy else (0.0, 0.0, 0.0)),
             rotation_quat=copy.rotation_quat if copy else IDENTITY,
             was_existing=any(row.name == reply.actor_name for row in before.actors),
@@ -357,19 +336,7 @@ class SceneNamespace(SceneOps):
             scale=as_vec3("scale", scale),
         )
         reply = await self._call(request, timeout, on_progress)
-        return {
-            cell.actor_id: URLabSpawnHandle(
-                actor_id=cell.actor_id,
-                actor_name=cell.actor_name,
-                actor_path=cell.actor_path,
-                blueprint_class_path=reply.blueprint_class_path,
-                location=cell.location,
-                rotation_quat=rotation,
-                was_existing=cell.was_existing,
-                requires_pie_restart=reply.requires_pie_restart,
-            )
-            for cell in reply.actors
-        }
+        return {cell.actor_id: fill(URLabSpawnHandle, cell, reply, rotation_quat=rotation) for cell in reply.actors}
 
     async def upload_model(
         self,
@@ -490,18 +457,6 @@ def _class_path(blueprint: URLabBlueprint | str) -> str:
 
 
 def _scene_actor(row: SnapshotRow) -> SceneActor:
-    block = row.urlab
-    return SceneActor(
-        name=row.name,
-        label=row.label,
-        actor_class=row.actor_class,
-        actor_id=row.actor_id,
-        location=row.location,
-        rotation_quat=row.rotation_quat,
-        tags=tuple(row.tags),
-        is_articulation=block is not None,
-        joints=tuple(block.joints) if block else (),
-        actuators=tuple(block.actuators) if block else (),
-        sensors=tuple(block.sensors) if block else (),
-        cameras=tuple(block.cameras) if block else (),
-    )
+    parts = () if row.urlab is None else ("joints", "actuators", "sensors", "cameras")
+    names = {part: tuple(getattr(row.urlab, part)) for part in parts}
+    return fill(SceneActor, row, tags=tuple(row.tags), is_articulation=row.urlab is not None, **names)

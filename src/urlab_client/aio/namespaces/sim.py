@@ -12,14 +12,14 @@ import msgspec
 
 from urlab_client.aio.background import running_loop
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.namespaces._base import Namespace
+from urlab_client.aio.namespaces._base import Namespace, fill
 from urlab_client.aio.session.session import STOP, Session, leaves_open
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.enums import PIEState
 from urlab_client.errors import URLabError, URLabPIEError, URLabTimeoutError
-from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie
+from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie
 from urlab_client.values.types import PIEStartResult, PIEStatus
 
 _POLL_S = 0.25
@@ -139,7 +139,7 @@ class SimNamespace(Namespace):
         # In slices: while the server waits for the compile it answers no client, including this one.
         reply = await self._begin(turn, level_path, min(timeout_s, _SLICE_S))
         while reply.state == PIEState.TIMEOUT and not reply.compile_error and loop.time() < deadline:
-            status = _status(await turn.call(PieStatus()))
+            status = fill(PIEStatus, await turn.call(PieStatus()))
             if on_progress is not None:
                 on_progress(status)
             if status.state is PIEState.COMPILING:
@@ -185,7 +185,7 @@ class SimNamespace(Namespace):
             # The plugin replies as soon as the end has been requested.
             self._session.unsettled[STOP] = self._stop
             deadline = loop.time() + _WIND_DOWN_S
-            while _status(await turn.call(PieStatus())).state is not PIEState.OFF:
+            while fill(PIEStatus, await turn.call(PieStatus())).state is not PIEState.OFF:
                 if loop.time() > deadline:
                     raise URLabTimeoutError(f"stop_pie: play did not end within {_WIND_DOWN_S:g} s.", op="stop_pie")
                 await turn.aside(asyncio.sleep(_STOP_POLL_S))
@@ -213,8 +213,4 @@ class SimNamespace(Namespace):
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""
-        return _status(await self._call(PieStatus(), timeout))
-
-
-def _status(reply: PieStatusOk) -> PIEStatus:
-    return PIEStatus(state=reply.state, compile_error=reply.compile_error, sim_time=reply.sim_time)
+        return fill(PIEStatus, await self._call(PieStatus(), timeout))

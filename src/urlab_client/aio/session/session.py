@@ -70,6 +70,7 @@ class Session:
 
     Attributes:
         session_id: Id of the open session; empty without one.
+        default_timeout: Seconds until the deadline of a request, by default; None for no limit.
         hello_sent: Whether a handshake was sent, with any outcome.
         features: Features of the server, as far as its replies have shown them.
         control: The robots that this client owns.
@@ -117,7 +118,7 @@ class Session:
         self._transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
         self._way = self._call_records or transport
-        self._default_timeout = default_timeout
+        self.default_timeout = default_timeout
         self._json = json
         self.control: Control = Control(self, wanted=claim_control)
         self.request_lock: Mutex = Mutex()
@@ -270,11 +271,7 @@ class Session:
         await self._transport.aclose()
 
     def bound_loop(self) -> asyncio.AbstractEventLoop:
-        """Return the running loop, to which this session is bound.
-
-        Raises:
-            URLabError: The session is bound to another loop, or no asyncio loop is running.
-        """
+        """Return the running loop, to which this session is bound. Raises `URLabError` on any other."""
         bound = self._loop
         if bound is None or asyncio._get_running_loop() is not bound:  # noqa: SLF001  # as in `running_loop`
             bound = self._loop = running_loop(bound)
@@ -298,7 +295,7 @@ class Session:
             raise UnknownOp("unknown_op", "this server does not offer this op. Nothing was sent.", op=op.name)
 
     def deadlines(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Deadlines:
-        default = self._default_timeout
+        default = self.default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout
             return Deadlines(deadline, deadline)

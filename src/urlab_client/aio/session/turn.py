@@ -62,11 +62,7 @@ class Turn:
         return True
 
     async def begin(self) -> None:
-        """Wait for the turn.
-
-        Raises:
-            URLabTimeoutError: Other tasks had their turns until the deadline; nothing was sent.
-        """
+        """Wait for the turn, or raise `URLabTimeoutError` after the deadline. Nothing was sent by then."""
         session, op = self._session, self._op
         deadlines = self._asked or session.deadlines(op, self._timeout, self._began)
         self._asked = deadlines
@@ -166,11 +162,7 @@ async def _await_reply(op: Op, answer: Awaitable[R | OpStarted]) -> R:
 
 
 def require_reply(op: Op, answer: R | OpStarted) -> R:
-    """Return the reply to an op that may not run as a job.
-
-    Raises:
-        ProtocolError: The server has started a job instead.
-    """
+    """Return the reply to an op that may not run as a job, or raise `ProtocolError`."""
     if isinstance(answer, OpStarted):
         raise ProtocolError(f"{op.name}: the server started {answer.job_id} instead of replying.", op=op.name)
     return answer

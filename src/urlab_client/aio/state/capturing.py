@@ -46,75 +46,67 @@ _HINT = (
 _ASSUMED = "The server's step mode is unknown, and outside live mode it may publish no pictures."
 
 
-class Capturing:
-    """Takes pictures for one client."""
+async def take_pictures(state: SimState, cameras: Sequence[Camera], timeout: Timeout) -> list[CameraSample]:
+    """Return a picture of each camera, taken after this call.
 
-    def __init__(self, state: SimState, default_timeout: float | None) -> None:
-        self._state = state
-        self._default_timeout = default_timeout
+    Raises:
+        URLabError: A camera is no longer in the scene; nothing was sent.
+        PictureTimeout: A camera delivered no picture in time.
+        NoActiveManager: No play session is running.
+        ModeLocked: The project pins a mode in which only steps deliver pictures.
+    """
+    first = Meta if state.session.read_only else Step
+    async with state.session.turn(first, timeout=timeout, each=True) as turn:
+        state.require_handshake("capture")
+        if state.hello is not None and not state.hello.manager_present:
+            raise NoActiveManager("no_active_manager", "no play session is running. Nothing was sent.", op="capture")
+        views = _views(state, cameras)
+        taking = _Taking(state, turn, views, _deadline(state, views, timeout))
+        try:
+            if state.mode.assumed and not state.session.read_only:
+                await _learn_mode(state, turn)
+            if state.mode.live or state.mode.assumed:
+                await taking.in_live_mode(certain=not state.mode.assumed)
+            else:
+                async with state.mode.stopped_live(turn):
+                    await taking.in_live_mode(certain=True)
+                taking.note_time(state.clocks.sim_time)
+        except ModeLocked as locked:
+            locked.hint = "In this mode, pictures come with steps: call client.step(include_cameras=…)."
+            raise
+    return taking.delivered()
 
-    async def take(self, cameras: Sequence[Camera], timeout: Timeout) -> list[CameraSample]:
-        """Return a picture of each camera, taken after this call.
 
-        Raises:
-            URLabError: A camera is no longer in the scene; nothing was sent.
-            PictureTimeout: A camera delivered no picture in time.
-            NoActiveManager: No play session is running.
-            ModeLocked: The project pins a mode in which only steps deliver pictures.
-        """
-        state = self._state
-        first = Meta if state.session.read_only else Step
-        async with state.session.turn(first, timeout=timeout, each=True) as turn:
-            state.require_handshake("capture")
-            if state.hello is not None and not state.hello.manager_present:
-                raise NoActiveManager(
-                    "no_active_manager", "no play session is running. Nothing was sent.", op="capture"
-                )
-            views = self._views(cameras)
-            taking = _Taking(state, turn, views, self._deadline(views, timeout))
-            try:
-                if state.mode.assumed and not state.session.read_only:
-                    await self._learn_mode(turn)
-                if state.mode.live or state.mode.assumed:
-                    await taking.in_live_mode(certain=not state.mode.assumed)
-                else:
-                    async with state.mode.stopped_live(turn):
-                        await taking.in_live_mode(certain=True)
-                    taking.note_time(state.clocks.sim_time)
-            except ModeLocked as locked:
-                locked.hint = "In this mode, pictures come with steps: call client.step(include_cameras=…)."
-                raise
-        return taking.delivered()
+def _views(state: SimState, cameras: Sequence[Camera]) -> list[URLabCameraView]:
+    present = {id(view.camera): view for view in state.objects.views()}
+    missing = [camera.name for camera in cameras if id(camera) not in present]
+    if missing:
+        raise URLabError(
+            f"capture: camera {missing[0]!r} is no longer in the scene. Nothing was sent.",
+            hint="Call client.camera() to get a camera of the current scene.",
+        )
+    return [present[id(camera)] for camera in cameras]
 
-    def _views(self, cameras: Sequence[Camera]) -> list[URLabCameraView]:
-        present = {id(view.camera): view for view in self._state.objects.views()}
-        missing = [camera.name for camera in cameras if id(camera) not in present]
-        if missing:
-            raise URLabError(
-                f"capture: camera {missing[0]!r} is no longer in the scene. Nothing was sent.",
-                hint="Call client.camera() to get a camera of the current scene.",
-            )
-        return [present[id(camera)] for camera in cameras]
 
-    def _deadline(self, views: Sequence[URLabCameraView], timeout: Timeout) -> float | None:
-        seconds = self._default_timeout if timeout is DEFAULT else timeout
-        if seconds is None:
-            return None
-        if timeout is DEFAULT:
-            seconds = max(seconds, first_picture_s(views))
-        return asyncio.get_running_loop().time() + seconds
+def _deadline(state: SimState, views: Sequence[URLabCameraView], timeout: Timeout) -> float | None:
+    seconds = state.session.default_timeout if timeout is DEFAULT else timeout
+    if seconds is None:
+        return None
+    if timeout is DEFAULT:
+        seconds = max(seconds, first_picture_s(views))
+    return asyncio.get_running_loop().time() + seconds
 
-    async def _learn_mode(self, turn: Turn) -> None:
-        """Determine the server's mode, because outside live mode a request for pictures might be a step."""
-        state = self._state
-        before = (await turn.call(PieStatus())).sim_time
-        if before is None:
-            return
-        await turn.aside(asyncio.sleep(_MOVES_S))
-        if (await turn.call(PieStatus())).sim_time != before:
-            state.mode.note(StepMode.LIVE)  # no other client holds the session, so physics runs on its own
-        else:
-            await state.mode.find_out(turn)
+
+async def _learn_mode(state: SimState, turn: Turn) -> None:
+    """Determine the server's mode, because outside live mode a request for pictures might be a step."""
+    before = (await turn.call(PieStatus())).sim_time
+    if before is None:
+        return
+    await turn.aside(asyncio.sleep(_MOVES_S))
+    if (await turn.call(PieStatus())).sim_time != before:
+        state.mode.note(StepMode.LIVE)  # no other client holds the session, so physics runs on its own
+    else:
+        await state.mode.find_out(turn)
 
 
 class _Taking:
@@ -158,7 +150,7 @@ class _Taking:
         for view in self._views:
             sample = self._found[id(view)]
             view.pictures.deliver(sample.pixels, sample.sim_time, sample.frame_id)
-            view.delivered = True
+            view.pictures.delivered = True
         return [self._found[id(view)] for view in self._views]
 
     async def _ask(self) -> None:

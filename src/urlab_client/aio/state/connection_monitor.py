@@ -41,7 +41,7 @@ _SILENCE_S = 1.0  # while play runs, a snapshot arrives every 100 ms in every mo
 _PROBE_DELAYS_S = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 
 
-class ConnectionMonitor:
+class ConnectionMonitor(MessageHandler):
     """Monitors one client in a task that runs only while there is something to find out.
 
     In live mode it always watches the state. In the other modes, where the client does not otherwise use the state
@@ -54,7 +54,6 @@ class ConnectionMonitor:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._presence = _Presence(self._on_state_line, self._on_sign_of_play)
         self._present = False
         self._announced = False
         self._received = 0
@@ -63,7 +62,7 @@ class ConnectionMonitor:
         state.publishers.events.on_listener = self._on_listener
         state.on_adopted = self._on_adopted
 
-    def on_connection(self, event: ClientEvent) -> None:
+    def on_transport(self, event: ClientEvent) -> None:
         publishers = self._state.publishers
         if isinstance(event, ServerLost):
             self._session.confirmed = False
@@ -71,7 +70,7 @@ class ConnectionMonitor:
         publishers.events.publish(event)
         if isinstance(event, ServerReconnected):
             self._session.was_down = self._session.was_down or event.refused
-            publishers.resume_regions()
+            publishers.refresh()
             self._investigate()
 
     async def aclose(self) -> None:
@@ -102,7 +101,7 @@ class ConnectionMonitor:
         if not self._present:
             self._present = True
             try:
-                subscriptions.attach(self._presence, self._wanted)
+                subscriptions.attach(self, self._wanted)
             except (URLabError, ValueError) as error:
                 log.debug("the state socket cannot be watched: %s", error)
         subscriptions.refresh()
@@ -110,20 +109,24 @@ class ConnectionMonitor:
     def _wanted(self) -> Subscription:
         # While play runs, the open connection shows it. Afterwards only a snapshot does: the socket may stay open.
         subscription = self._state.publishers.state().subscription()
-        filters = () if self._playing or self._announced else (STATE_FULL,)
+        filters = () if self._state.playing or self._announced else (STATE_FULL,)
         return Subscription(subscription.endpoint, filters, subscription.accepts)
 
-    @property
-    def _playing(self) -> bool:
-        return self._state.playing
+    # Called for the state socket
 
-    def _on_state_line(self, connected: bool) -> None:
-        if self._playing and not connected:
+    def on_connection(self, connected: bool) -> None:
+        if self._state.playing and not connected:
             self._investigate()
 
-    def _on_sign_of_play(self) -> None:
-        if not (self._playing or self._announced):
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        if not (self._state.playing or self._announced):
             self._investigate()
+
+    def on_malformed(self, problem: str) -> None:
+        self.on_message(b"", b"")  # a sign of play, too
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """Do nothing: the client is being closed."""
 
     def _tick(self) -> None:
         if self._closed or self._loop is None:
@@ -131,7 +134,7 @@ class ConnectionMonitor:
         self._timer = self._loop.call_later(_SILENCE_S, self._tick)
         received = self._state.live_received
         flowing = received != self._received
-        if self._flowing and not flowing and self._playing and self._state.live:
+        if self._flowing and not flowing and self._state.playing and self._state.live:
             self._investigate()
         self._received, self._flowing = received, flowing
 
@@ -143,10 +146,10 @@ class ConnectionMonitor:
             self._task = background_task("urlab-watch", self._find_out(), tell=self._session.tell)
 
     async def _find_out(self) -> None:
-        before = self._playing
+        before = self._state.playing
         for pause in _PROBE_DELAYS_S:
             await asyncio.sleep(pause)
-            if self._state.switching_play or before != self._playing or not self._session.transport.connected:
+            if self._state.switching_play or before != self._state.playing or not self._session.transport.connected:
                 return
             try:
                 reply = await self._session.probe(ListKeyframes(), timeout=_PROBE_S)
@@ -163,26 +166,6 @@ class ConnectionMonitor:
                 self._state.publishers.events.publish(PlayStarted())
                 self._attend()
                 return
-
-
-class _Presence(MessageHandler):
-    """Watches the connection to the state socket."""
-
-    def __init__(self, on_connection: Callable[[bool], None], on_sign: Callable[[], None]) -> None:
-        self._on_line = on_connection
-        self._on_sign = on_sign
-
-    def on_connection(self, connected: bool) -> None:
-        self._on_line(connected)
-
-    def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        self._on_sign()
-
-    def on_malformed(self, problem: str) -> None:
-        self._on_sign()
-
-    def on_end(self, error: Callable[[], URLabError]) -> None:
-        """Do nothing: the client is being closed."""
 
 
 _PROBE_INTERVAL_S: Final = 5.0  # interval between checks that this client still holds the session

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.model.layout import FREE
-from urlab_client.aio.streams.handler import Source
+from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.aio.streams.sources import RowFilter, StateSource, sample
-from urlab_client.aio.transport.subscriber import MessageHandler
-from urlab_client.errors import ProtocolError, URLabError
+from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 from urlab_client.protocol.messages.streams import RowSample, StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, Row, SceneRow, SensorRow, TwistRow
@@ -31,38 +31,35 @@ class DerivedRowSource(Source[RowSample]):
         self._states = states
         self._robots = robots
         self._wanted = wanted
-        self._feeds: dict[MessageHandler, _RowFeed] = {}
 
-    def attach(self, handler: MessageHandler) -> None:
-        feed = _RowFeed(handler, self._rows)
-        self._states.attach(feed)
-        self._feeds[handler] = feed
+    def attach(self, handler: StreamHandler[Any]) -> None:
+        self._states.attach(handler)
 
-    def detach(self, handler: MessageHandler) -> None:
-        feed = self._feeds.pop(handler, None)
-        if feed is not None:
-            self._states.detach(feed)
+    def detach(self, handler: StreamHandler[Any]) -> None:
+        self._states.detach(handler)
 
     def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
         return sample(topic, payload)
 
-    def first_after(self, handler: MessageHandler) -> float:
-        return self._states.first_after(self._feeds[handler])
+    def first_after(self, handler: StreamHandler[Any]) -> float:
+        return self._states.first_after(handler)
 
-    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
-        return self._states.silence(self._feeds[handler], seconds)
+    def silence(self, handler: StreamHandler[Any], seconds: float) -> tuple[str, str]:
+        return self._states.silence(handler, seconds)
 
-    def _rows(self, snapshot: StateSnapshot) -> Iterator[tuple[bytes, Row]]:
-        """Yield the wanted rows of a snapshot with their topics."""
+    def parts(self, topic: bytes, payload: BytesLike) -> list[tuple[bytes, BytesLike]]:
+        try:
+            snapshot = StateSnapshot.decode(payload, topic.decode())
+            return [(name.encode(), row.encode()) for name, row in self._rows(snapshot) if self._wanted.has(name)]
+        except (ValueError, IndexError) as error:
+            raise ProtocolError(f"{self.name}: the snapshot does not fit the known model: {error}.") from error
+
+    def _rows(self, snapshot: StateSnapshot) -> Iterator[tuple[StreamTopic, Row]]:
         robots = self._robots()
         for key in self._wanted.articulations & snapshot.per_articulation.keys() & robots.keys():
-            for topic, row in _rows_of(key, robots[key], snapshot.per_articulation[key]):
-                if self._wanted.has(topic):
-                    yield topic.encode(), row
+            yield from _rows_of(key, robots[key], snapshot.per_articulation[key])
         for name, state in snapshot.entities.items():
-            for topic, row in _rows_of_entity(name, state):
-                if self._wanted.has(topic):
-                    yield topic.encode(), row
+            yield from _rows_of_entity(name, state)
 
 
 def _rows_of(key: str, robot: URLabArticulation, state: ArticulationState) -> Iterator[tuple[StreamTopic, Row]]:
@@ -95,33 +92,3 @@ def _rows_of_entity(name: str, state: EntityState) -> Iterator[tuple[StreamTopic
     for kind, vector in values.items():
         if vector is not None:
             yield StreamTopic(kind, name), SceneRow(kind, np.asarray(vector, np.float64))
-
-
-class _RowFeed(MessageHandler):
-    """Passes the rows of each snapshot to a reader of rows."""
-
-    def __init__(self, reader: MessageHandler, rows: Callable[[StateSnapshot], Iterator[tuple[bytes, Row]]]) -> None:
-        self._reader = reader
-        self._rows = rows
-
-    def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        try:
-            for name, row in self._rows(StateSnapshot.decode(payload, topic.decode())):
-                self._reader.on_message(name, row.encode())
-        except (ProtocolError, ValueError, IndexError) as error:  # the snapshot does not fit the known model
-            self._reader.on_malformed(str(error))
-
-    def on_malformed(self, problem: str) -> None:
-        self._reader.on_malformed(problem)
-
-    def on_end(self, error: Callable[[], URLabError]) -> None:
-        self._reader.on_end(error)
-
-    def on_drained(self) -> None:
-        self._reader.on_drained()
-
-    def on_connection(self, connected: bool) -> None:
-        self._reader.on_connection(connected)
-
-    def on_gap(self, why: str) -> None:
-        self._reader.on_gap(why)

@@ -60,11 +60,7 @@ class Discovery:
         return hello
 
     async def open_read_only(self, turn: Turn, handshake: bytes) -> None:
-        """Apply the result of another client's `handshake()` without opening a session.
-
-        Raises:
-            ValueError: `handshake` is not the result of `handshake()`.
-        """
+        """Apply the result of another client's `handshake()`, or raise `ValueError`, without opening a session."""
         session = self._state.session
         try:
             hello = decode_reply(op_of(Hello), HelloOk, handshake)
@@ -157,8 +153,7 @@ class Discovery:
         state.pending.play = state.pending.handshake = False
         views = state.objects.views()  # binds the cameras to the handshake's descriptions
         state.publishers.refresh()
-        if state.publishers.camera_switch is not None:
-            state.publishers.camera_switch.restart([view.info for view in views])
+        state.publishers.camera_switch.restart([view.info for view in views])
         if hello.manager_present and not played:
             state.publishers.events.publish(PlayStarted(articulations=list(state.objects.articulations)))
         if state.on_adopted is not None:

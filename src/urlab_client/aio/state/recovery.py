@@ -76,8 +76,7 @@ async def _resync(
         else:
             state.absorb(reply, "forward", into_mirror=not state.mode.puppet)
         await _settle(state, turn, list(state.session.unsettled))
-        if state.publishers.camera_switch is not None:
-            await turn.aside(state.publishers.camera_switch.settle())
+        await turn.aside(state.publishers.camera_switch.settle())
     if applied is not None:
         pending.restore_wrenches(applied)
     return Resync(

@@ -104,11 +104,7 @@ class SceneObjects:
         return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
 
     def camera_name(self, name: str) -> str:
-        """Resolve `<articulation>/<camera>` or just `<camera>` to one of `camera_names`.
-
-        Raises:
-            UnknownName: The name matches no camera or several.
-        """
+        """Resolve `<articulation>/<camera>` or just `<camera>` to one of `camera_names`. Raises `UnknownName`."""
         names = self.camera_names()
         owner, slash, short = text("camera", name).rpartition("/")
         if slash:
@@ -146,11 +142,7 @@ class SceneObjects:
             return None
 
     def require_camera(self, name: str) -> URLabCameraView:
-        """Return the camera named `<articulation>/<camera>` or just `<camera>`.
-
-        Raises:
-            KeyError: The name matches no camera or several.
-        """
+        """Return the camera named `<articulation>/<camera>` or just `<camera>`. Raises `UnknownName`."""
         if name in self.global_cameras:
             return self.global_cameras[name]
         owner, _, short = self.camera_name(name).rpartition("/")
@@ -163,7 +155,7 @@ class SceneObjects:
         for view in views:
             if view.delivered and id(view) not in delivered:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
-            view.delivered = id(view) in delivered
+            view.pictures.delivered = id(view) in delivered
 
     def _bind_articulations(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
         wrappers: dict[str, URLabArticulation] = {}
@@ -222,11 +214,7 @@ class Examined(Struct, frozen=True):
 
 
 def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
-    """Check a handshake against its model and derive the layouts and entities.
-
-    Raises:
-        ProtocolError: A value of the handshake is invalid.
-    """
+    """Check a handshake against its model and derive the layouts and entities. Raises `ProtocolError`."""
     keys = [info.prefix for info in hello.articulations]
     if "" in keys or len(set(keys)) < len(keys):
         raise _refused(f"its articulations are called {', '.join(map(repr, keys))}; keys must be unique and not empty")

@@ -174,11 +174,7 @@ class SimState:
         return None if articulation is None else articulation.prefix
 
     def require_handshake(self, op: str) -> None:
-        """Reject an op that depends on the handshake if the handshake is unknown.
-
-        Raises:
-            NoSession: The handshake of the session or of a new play session was abandoned.
-        """
+        """Raise `NoSession` for an op that depends on a handshake that was abandoned."""
         if self.hello is None and self.session.hello_sent:
             raise NoSession("discover() did not finish. Nothing was sent.", op=op)
         if self.pending.play:
@@ -239,11 +235,7 @@ class SimState:
         self.absorb(snapshot, "state/full")
 
     def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
-        """Apply the state in a reply completely or not at all.
-
-        Raises:
-            ProtocolError: The state does not fit the model or the cameras; nothing was applied.
-        """
+        """Apply the state in a reply completely, or raise `ProtocolError` and apply nothing."""
         received = time.time_ns()
         self._write(reply, self._checked(reply, op), received, into_mirror=into_mirror)
         self._publish(reply)
@@ -257,11 +249,7 @@ class SimState:
         self._write(reply, self._checked(reply, op), received, into_mirror=True)
 
     def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Parts:
-        """Check a state against the model and the cameras, and return each part with its target.
-
-        Raises:
-            ProtocolError: A part of the state does not fit.
-        """
+        """Return each part of a state that fits the model and the cameras, with its target. Raises `ProtocolError`."""
         if not math.isfinite(reply.time):
             raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
         records = self.objects.records
@@ -344,11 +332,7 @@ class SimState:
             self.mirror.mark_stale()
 
     def mirror_options(self, options: SimOptions) -> None:
-        """Mirror the options that `set_sim_options` returned, all or none.
-
-        Raises:
-            ProtocolError: An option is invalid.
-        """
+        """Mirror the options that `set_sim_options` returned, all or none. Raises `ProtocolError`."""
         try:
             check_sim_options(options)
             if self.mirror.model is not None:
@@ -373,8 +357,7 @@ class SimState:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
-        if self.publishers.camera_switch is not None:
-            self.publishers.camera_switch.forget()
+        self.publishers.camera_switch.forget()
         self.mode.end_play()
         self.recording = False
         self.session.unsettled.clear()

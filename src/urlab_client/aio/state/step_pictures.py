@@ -112,11 +112,7 @@ class StepPictures:
         self.take(reply)
 
     def account(self, reply: StepOk, *, came: bool) -> None:
-        """Mark the cameras whose pictures are missing, after the reply was applied.
-
-        Raises:
-            CancelledError: The wait for pictures was cancelled.
-        """
+        """Mark the cameras whose pictures are missing, after the reply was applied; raise an `interruption`."""
         if came:
             self._state.objects.note_missing_frames(self.names, reply)
         if self.interruption is not None:

@@ -16,7 +16,7 @@ from urlab_client.enums import CameraTiming, StepMode
 from urlab_client.errors import StepTimeout, UnknownKeyframe, URLabError
 from urlab_client.protocol.codec import check_finite, op_of
 from urlab_client.protocol.messages.session import ArticulationCommand, Reset, ResetOk, Step, StepOk
-from urlab_client.values.names import compiled_names
+from urlab_client.values.names import names_meant
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
@@ -277,11 +277,8 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     if model is None:
         return name
     compiled = [key for key in model_names(model, "key") if key]
-    if name in compiled:
-        return name
     prefixes = {key: art.compiled_prefix for key, art in state.objects.articulations.items()}
-    wanted = compiled_names(name, prefixes)
-    matches = [key for key in compiled if key in wanted]
+    matches = names_meant(name, compiled, prefixes)
     if len(matches) == 1:
         return matches[0]
     problem = (

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 from typing import Any
 
 from urlab_client.aio.arguments import integer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
 
+@dataclass(slots=True, eq=False)
 class BufferedMessage:
     """A message on its way to the reader.
 
@@ -24,18 +26,15 @@ class BufferedMessage:
         malformed: Whether decoding failed; for the reader's use.
     """
 
-    __slots__ = ("dropped", "gap", "item", "malformed", "payload", "seq", "size", "topic", "wall_ns")
-
-    def __init__(self, topic: bytes, payload: Any, size: int, wall_ns: int, seq: int) -> None:
-        self.topic: bytes = topic
-        self.payload: Any = payload
-        self.size: int = size
-        self.wall_ns: int = wall_ns
-        self.seq: int = seq
-        self.dropped: int = 0
-        self.gap: str | None = None
-        self.item: Any = None
-        self.malformed: bool = False
+    topic: bytes
+    payload: Any
+    size: int
+    wall_ns: int
+    seq: int
+    dropped: int = 0
+    gap: str | None = None
+    item: Any = None
+    malformed: bool = False
 
 
 class StreamBuffer:
@@ -105,10 +104,6 @@ class StreamBuffer:
         self.size -= entry.size
         return entry
 
-    def skip(self, entry: BufferedMessage) -> None:
-        """Drop a popped entry that is malformed; the next entry inherits its losses."""
-        self._pass_on_losses(entry)
-
     def reject(self) -> None:
         """Count a message that is malformed on arrival."""
         self.received += 1
@@ -137,9 +132,10 @@ class StreamBuffer:
         self._overflowed += 1
         if entry is self.newest:
             self.newest = None
-        self._pass_on_losses(entry)
+        self.skip(entry)
 
-    def _pass_on_losses(self, entry: BufferedMessage) -> None:
+    def skip(self, entry: BufferedMessage) -> None:
+        """Let the next entry inherit the losses of one that was removed and cannot be read."""
         following = next(iter(self._waiting.values()), None)
         if following is None:
             self._carried += entry.dropped + 1

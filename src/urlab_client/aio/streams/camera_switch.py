@@ -138,7 +138,7 @@ class CameraSwitch:
                 log.debug("cameras could not be switched off: %s", error)
 
     def _follow(self) -> None:
-        if self._closed or not self._session.features.camera_switch or not self._due():
+        if self._closed or not self._due():
             return
         if self._task is None or self._task.done():
             self._failure = None
@@ -147,6 +147,8 @@ class CameraSwitch:
             )
 
     def _due(self) -> dict[str, CameraTransports]:
+        if self._session.read_only or not self._session.features.camera_switch:
+            return {}
         return {topic: wanted for topic in self._infos if (wanted := self._wanted(topic)) != self._on.get(topic, _OFF)}
 
     def _wanted(self, topic: str) -> CameraTransports:

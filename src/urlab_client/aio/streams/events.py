@@ -11,37 +11,11 @@ from urlab_client.aio.arguments import collection
 from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.aio.streams.stream import Stream
 from urlab_client.aio.transport.subscriber import client_closed
-from urlab_client.events import (
-    ClientEvent,
-    PlayEnded,
-    PlayStarted,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-    SessionLost,
-    SessionOpened,
-    TaskFailed,
-)
+from urlab_client.events import ClientEvent
 from urlab_client.protocol.messages.streams import StreamPolicy
 from urlab_client.values.names import did_you_mean
 
-_KINDS: dict[str, type[ClientEvent]] = {
-    str(kind.__struct_config__.tag): kind
-    for kind in (
-        ServerConnected,
-        ServerLost,
-        ServerReconnected,
-        ServerSilent,
-        ServerAnswers,
-        SessionOpened,
-        SessionLost,
-        PlayStarted,
-        PlayEnded,
-        TaskFailed,
-    )
-}
+_KINDS = {str(kind.__struct_config__.tag): kind for kind in ClientEvent.__subclasses__()}
 
 
 class EventBus:
@@ -49,13 +23,16 @@ class EventBus:
 
     Attributes:
         on_listener: Callback invoked on any thread when a listener is added.
+        lock: Guards the listeners, and the end.
+        listeners: The listeners, with the kinds of events that each wants.
+        closed: Whether the client was closed.
     """
 
     def __init__(self) -> None:
         self.on_listener: Callable[[], None] | None = None
-        self._lock = threading.Lock()
-        self._listeners: dict[StreamHandler[ClientEvent], frozenset[type[ClientEvent]]] = {}
-        self._closed = False
+        self.lock: threading.Lock = threading.Lock()
+        self.listeners: dict[StreamHandler[ClientEvent], frozenset[type[ClientEvent]]] = {}
+        self.closed: bool = False
 
     def stream(self, kinds: Collection[str | type[ClientEvent]], buffer: int) -> Stream[ClientEvent]:
         """Return a stream of future events that buffers the last `buffer` of them. Call from any thread.
@@ -70,42 +47,28 @@ class EventBus:
 
     def publish(self, event: ClientEvent) -> None:
         """Publish an event to all listeners. Call from the event loop."""
-        with self._lock:
-            listeners = [one for one, kinds in self._listeners.items() if type(event) in kinds]
+        with self.lock:
+            listeners = [one for one, kinds in self.listeners.items() if type(event) in kinds]
         for listener in listeners:
             listener.push(b"", deepcopy(event), 0)  # its own copy, in which the stream notes what was dropped
             listener.on_drained()
 
     def close(self) -> None:
         """End every stream with `ClientClosed`. Call from the event loop. Idempotent."""
-        with self._lock:
-            self._closed = True
-            listeners = tuple(self._listeners)
-            self._listeners.clear()
+        with self.lock:
+            self.closed = True
+            listeners = tuple(self.listeners)
+            self.listeners.clear()
         for listener in listeners:
             listener.on_end(client_closed)
 
-    def add(self, listener: StreamHandler[Any], kinds: frozenset[type[ClientEvent]]) -> None:
-        """Start publishing to a listener. Call from any thread."""
-        with self._lock:
-            if self._closed:
-                raise client_closed()
-            self._listeners[listener] = kinds
-        if self.on_listener is not None:
-            self.on_listener()
-
     @property
     def heard(self) -> bool:
-        return bool(self._listeners)
-
-    def remove(self, listener: StreamHandler[Any]) -> None:
-        """Stop publishing to a listener. Call from any thread. Idempotent."""
-        with self._lock:
-            self._listeners.pop(listener, None)
+        return bool(self.listeners)
 
 
 class _EventSource(Source[ClientEvent]):
-    """The events of some kinds; what the bus passes to a stream are the items themselves."""
+    """The events of some kinds; what the bus passes to a stream are the items themselves. For any thread."""
 
     name = "events"
 
@@ -114,10 +77,16 @@ class _EventSource(Source[ClientEvent]):
         self._kinds = kinds
 
     def attach(self, handler: StreamHandler[Any]) -> None:
-        self._bus.add(handler, self._kinds)
+        with self._bus.lock:
+            if self._bus.closed:
+                raise client_closed()
+            self._bus.listeners[handler] = self._kinds
+        if self._bus.on_listener is not None:
+            self._bus.on_listener()
 
     def detach(self, handler: StreamHandler[Any]) -> None:
-        self._bus.remove(handler)
+        with self._bus.lock:
+            self._bus.listeners.pop(handler, None)
 
     def decode(self, topic: bytes, payload: ClientEvent) -> ClientEvent:
         return payload

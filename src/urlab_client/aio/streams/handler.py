@@ -9,7 +9,7 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from urlab_client.aio.background import running_loop
@@ -60,6 +60,10 @@ class Source(ABC, Generic[T_co]):
         """Return whether a message is relevant to the reader."""
         return True
 
+    def parts(self, topic: bytes, payload: BytesLike) -> Iterable[tuple[bytes, BytesLike]]:
+        """Return what the reader wants of a message, each with its topic. Raises `ProtocolError` if it is malformed."""
+        return ((topic, payload),) if self.wants(topic, payload) else ()
+
     def first_after(self, handler: StreamHandler[Any]) -> float:
         """Return the seconds that the first item may take to arrive; 0 if no delay is expected."""
         return 0.0
@@ -106,8 +110,11 @@ class StreamHandler(MessageHandler, Generic[T]):
     # Called by the source
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
-        if self._source.wants(topic, payload):
-            self.push(topic, payload, len(payload))
+        try:
+            for name, part in self._source.parts(topic, payload):
+                self.push(name, part, len(part))
+        except ProtocolError as error:
+            self.on_malformed(str(error))
 
     def push(self, topic: bytes, payload: object, size: int) -> None:
         """Keep what the source will decode, as the policy says."""

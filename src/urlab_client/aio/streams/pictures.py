@@ -39,9 +39,16 @@ _IDLE_S: Final = 5.0
 
 
 class LatestPicture(MessageHandler):
-    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access."""
+    """The newest picture of a camera, from replies and, in live mode, from its stream. Converted on first access.
+
+    Attributes:
+        camera: The camera.
+        delivered: False if the last step that requested a picture got none.
+    """
 
     def __init__(self, source: CameraSource) -> None:
+        self.camera: Camera = source.camera
+        self.delivered: bool = True
         self._source = source
         self._lock = Lock()
         self._message: tuple[bytes, BytesLike] | None = None
@@ -76,13 +83,11 @@ class LatestPicture(MessageHandler):
     def came(self) -> bool:
         return self._pixels is not None or self._message is not None
 
-    def frame_id(self) -> int | None:
-        """Return the number of the snapshot that the newest picture shows, or None if unknown. Call from any thread."""
-        self.newest()
-        return self._frame_id
+    def newest(self) -> tuple[Pixels | None, float | None, int | None]:
+        """Return the newest picture, its simulation time and the number of its snapshot, each None if missing.
 
-    def newest(self) -> tuple[Pixels | None, float | None]:
-        """Return the newest picture and its simulation time, each None if missing. Call from any thread."""
+        Call from any thread.
+        """
         with self._lock:
             if self._message is not None:
                 (topic, payload), self._message = self._message, None
@@ -95,7 +100,7 @@ class LatestPicture(MessageHandler):
                 else:
                     self._pixels, self._sim_time = sample.pixels, sample.sim_time
                     self._frame_id = sample.frame_id
-            return self._pixels, self._sim_time
+            return self._pixels, self._sim_time, self._frame_id
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         if self._lock.acquire(blocking=False):  # held during conversion: skip this picture, the next one follows
@@ -222,9 +227,7 @@ class StepStreams:
     async def opened(self) -> None:
         try:
             async with asyncio.timeout(_OPENING_S):
-                switch = self._publishers.camera_switch
-                if switch is not None:
-                    await switch.settled()
+                await self._publishers.camera_switch.settled()
                 for listener in tuple(self._listeners.values()):
                     await _connected(listener, self._publishers)
         except TimeoutError:

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Sequence
 import numpy as np
 
 from urlab_client.aio.defaults import Timeout
-from urlab_client.aio.features import Features
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.camera_switch import CameraSwitch
 from urlab_client.aio.streams.events import EventBus
 from urlab_client.aio.streams.sources import Camera, CameraSource, OwnSteps, RowFilter, RowSource, StateSource
@@ -48,11 +48,11 @@ class Publishers:
     """The publishing side of a server. Sockets and regions are opened only when something is received.
 
     Attributes:
-        default_timeout: The argument of that name.
+        default_timeout: The session's.
         subscriptions: Active subscriptions.
         events: Events of the client.
         regions: Active shared memory regions; None if the client does not use shared memory.
-        camera_switch: Switch that turns cameras on and off; None if they always stream.
+        camera_switch: Switch that turns cameras on and off.
         capture: Callback that takes pictures without a step; set by the client.
         own_steps: Delivers the client's own steps to receivers of snapshots.
     """
@@ -61,25 +61,22 @@ class Publishers:
 
     def __init__(
         self,
-        rpc_endpoint: Callable[[], str],
+        session: Session,
         state_port: Callable[[], int],
         *,
-        default_timeout: float | None,
         live: Callable[[], bool],
-        features: Callable[[], Features] = Features,
         keys: ClientKeys | None = None,
         memory: ServerRegions | None = None,
     ) -> None:
-        self.default_timeout = default_timeout
+        self.default_timeout: float | None = session.default_timeout
         self.subscriptions: Subscriptions = Subscriptions(keys)
         self.events: EventBus = EventBus()
-        self.camera_switch: CameraSwitch | None = None
+        self.camera_switch: CameraSwitch = CameraSwitch(session, self.subscriptions.refresh)
         self.own_steps: OwnSteps = OwnSteps()
         self.regions: Regions | None = None if memory is None else Regions(memory, self.subscriptions)
-        self._rpc_endpoint = rpc_endpoint
+        self._session = session
         self._state_port = state_port
         self._live = live
-        self._features = features
 
     def state(self, policy: str = StreamPolicy.LATEST) -> StateSource:
         """Return the source of snapshots for a stream of that policy."""
@@ -95,7 +92,7 @@ class Publishers:
         return None if policy == StreamPolicy.ALL else self.regions  # a region keeps only the newest
 
     def _only_own(self) -> bool:
-        return not (self._features().publishes_steps or self._live())
+        return not (self._session.features.publishes_steps or self._live())
 
     def rows(self, wanted: RowFilter) -> RowSource:
         return RowSource(self.subscriptions, self._state_endpoint, wanted)
@@ -130,7 +127,7 @@ class Publishers:
         return SharedFrame(pixels, publication.sequence, valid)
 
     def refresh(self) -> None:
-        """Reconnect after a handshake: publishers may have moved."""
+        """Reconnect after a handshake, or after the server has returned: publishers may have moved."""
         self.subscriptions.refresh()
         if self.regions is not None:
             self.regions.refresh()
@@ -139,11 +136,6 @@ class Publishers:
         """Release the shared memory of a play session that ends or of a server that has gone."""
         if self.regions is not None:
             self.regions.release()
-
-    def resume_regions(self) -> None:
-        """Look for shared memory again after the server has returned."""
-        if self.regions is not None:
-            self.regions.refresh()
 
     def check_open(self) -> None:
         """Raise `ClientClosed` if the client was closed."""
@@ -166,7 +158,7 @@ class Publishers:
         return base if scheme == "tcp" else "127.0.0.1"
 
     def _base(self) -> tuple[str, str]:
-        endpoint = self._rpc_endpoint()
+        endpoint = self._session.transport.endpoint
         scheme, _, rest = endpoint.partition("://")
         if scheme not in {"tcp", "ipc"}:
             raise URLabError(f"{endpoint} has not been started yet.", hint="Call discover() first.")

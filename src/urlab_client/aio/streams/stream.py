@@ -12,7 +12,7 @@ from urlab_client.aio.streams.buffer import StreamBuffer
 from urlab_client.aio.streams.handler import Source, StreamHandler
 from urlab_client.errors import URLabError
 from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamPolicyName, StreamStats
-from urlab_client.values.names import PublicDir
+from urlab_client.values.names import Local
 
 T = TypeVar("T", bound=StreamItem)
 
@@ -23,7 +23,50 @@ BUFFER_BYTES = 64 * 1024 * 1024
 """Default limit of a stream's buffer, bytes."""
 
 
-class Stream(PublicDir, Generic[T]):
+class LocalStream(Local, Generic[T]):
+    """What both clients share of `Stream`: everything that does not wait."""
+
+    __slots__ = ()
+
+    _state: StreamHandler[T]
+
+    @property
+    def closed(self) -> bool:
+        """Whether the reader closed the stream."""
+        return self._state.closed
+
+    @property
+    def stats(self) -> StreamStats:
+        """Counters up to now."""
+        return self._state.stats()
+
+    def latest(self) -> T | None:
+        """Return the newest item without waiting and without removing it from the buffer; None before the first.
+
+        The reader gets the same object.
+        """
+        return self._state.latest()
+
+    def receive_nowait(self) -> T | None:
+        """Return the next item if one is buffered, otherwise None.
+
+        Returns None before the stream is opened and after it is closed.
+
+        Raises:
+            StreamOverflow: Items were lost; see the class.
+            ConcurrentReadError: Another reader is waiting for the next item.
+            ClientClosed: The client was closed and all items that had arrived have been read.
+        """
+        try:
+            return self._state.receive_nowait()
+        except StopAsyncIteration:
+            return None
+
+    def __repr__(self) -> str:
+        return repr(self._state)
+
+
+class Stream(LocalStream[T], Generic[T]):
     """Items that the server publishes, as they arrive.
 
     The stream opens on first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
@@ -83,43 +126,13 @@ class Stream(PublicDir, Generic[T]):
             require("max_rate", max_rate, SupportsFloat, "a number above 0")
             if not 0 < float(max_rate) < math.inf:
                 raise ValueError(f"max_rate must be a number above 0, got {max_rate}")
-        self._handler = StreamHandler(
-            source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout, max_rate=max_rate
+        super().__init__(
+            StreamHandler(
+                source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout, max_rate=max_rate
+            )
         )
         if eager:
-            self._handler.attach()
-
-    @property
-    def closed(self) -> bool:
-        """Whether the reader closed the stream."""
-        return self._handler.closed
-
-    @property
-    def stats(self) -> StreamStats:
-        """Counters up to now."""
-        return self._handler.stats()
-
-    def latest(self) -> T | None:
-        """Return the newest item without waiting and without removing it from the buffer; None before the first.
-
-        The reader gets the same object.
-        """
-        return self._handler.latest()
-
-    def receive_nowait(self) -> T | None:
-        """Return the next item if one is buffered, otherwise None.
-
-        Returns None before the stream is opened and after it is closed.
-
-        Raises:
-            StreamOverflow: Items were lost; see the class.
-            ConcurrentReadError: Another reader is waiting for the next item.
-            ClientClosed: The client was closed and all items that had arrived have been read.
-        """
-        try:
-            return self._handler.receive_nowait()
-        except StopAsyncIteration:
-            return None
+            self._state.attach()
 
     async def receive(self, *, timeout: Timeout = DEFAULT) -> T:
         """Return the next item.
@@ -136,17 +149,17 @@ class Stream(PublicDir, Generic[T]):
             URLabError: The stream was closed.
         """
         try:
-            return await self._handler.receive(timeout)
+            return await self._state.receive(timeout)
         except StopAsyncIteration:
             raise self._was_closed() from None
 
     async def aclose(self) -> None:
         """Stop receiving and discard buffered items. A running iteration ends. Idempotent."""
-        self._handler.close()
+        self._state.close()
 
     async def __aenter__(self) -> Self:
         try:
-            self._handler.open()
+            self._state.open()
         except StopAsyncIteration:
             raise self._was_closed() from None
         return self
@@ -154,20 +167,17 @@ class Stream(PublicDir, Generic[T]):
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._handler.close()
-
-    def __repr__(self) -> str:
-        return repr(self._handler)
+        self._state.close()
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> T:
         """Return the next item; see `receive` for the errors. A closed client ends the iteration."""
-        return await self._handler.next()
+        return await self._state.next()
 
     def __del__(self) -> None:
-        handler: StreamHandler[T] | None = getattr(self, "_handler", None)  # None if the constructor failed
+        handler: StreamHandler[T] | None = getattr(self, "_state", None)  # None if the constructor failed
         if handler is not None:
             handler.abandon()
 

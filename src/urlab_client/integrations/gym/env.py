@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.articulation import URLabEntity
 from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.disturbances import Disturbances
@@ -29,7 +30,7 @@ from urlab_client.integrations.gym.task import EpisodeEnd, Task, judged, succeed
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
-from urlab_client.sync.articulation import URLabArticulation, URLabEntity
+from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import NameMap
 

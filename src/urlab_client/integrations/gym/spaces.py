@@ -17,7 +17,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import CameraMode
 from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.base import Floats
-from urlab_client.values.names import compiled_names
+from urlab_client.values.names import names_meant
 
 if TYPE_CHECKING:
     import mujoco
@@ -177,13 +177,12 @@ class SpaceMapping:
             UnknownKeyframe: No keyframe, or more than one, has this name.
         """
         known = model_names(self._model, "key")
-        wanted = {name, *compiled_names(name, self.prefixes)}
-        found = [i for i, full in enumerate(known) if full in wanted]
+        found = names_meant(name, known, self.prefixes)
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(known) or 'none'}"
             )
-        return found[0]
+        return known.index(found[0])
 
     def held(self, keyframe: str | None) -> dict[str, Floats]:
         """Return the set-points that hold a keyframe, or the initial state, by articulation, shape (n_ctrl,).

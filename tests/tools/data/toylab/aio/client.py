@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Self
@@ -28,7 +27,7 @@ class Client:
     robots: NameMap[Robot]
     """Robots by name."""
 
-    __slots__ = ("__weakref__", "_data_lock", "_session", "bodies_by_id", "options", "robots", "scene")
+    __slots__ = ("__weakref__", "_session", "bodies_by_id", "options", "robots", "scene")
 
     def __init__(self, address: str = "tcp://localhost", *, step_mode: str | None = "auto", **options: int) -> None:
         """Make a client; nothing is sent.
@@ -43,14 +42,10 @@ class Client:
         self._session = Session()
         self._session.log.append((address, step_mode, options))
         self.options = options
-        self._data_lock = self._session.lock
         self.scene = Scene(self._session)
         dog = Robot(self._session, "dog_1")
         self.robots = NameMap({"dog_1": dog}, {"dog": ["dog_1"]}, "robot")
         self.bodies_by_id: dict[int, Body] = {1: Body(self._session, "ball"), 2: dog}
-
-    _data_lock: threading.RLock
-    """Guards what steps write."""
 
     bodies_by_id: dict[int, Body]
     """Bodies and robots by id."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from toylab.aio.session import DEFAULT, Session, Timeout
-from urlab_client.values.names import NameMap
+from urlab_client.values.names import Local, NameMap
 
 if TYPE_CHECKING:
     from toylab.aio.streams import Stream
@@ -80,14 +80,49 @@ class Body:
     def _hidden(self) -> None: ...
 
 
+class Battery(Local):
+    """Local, and never anything else: both flavours share the class."""
+
+    __slots__ = ()
+
+    _state: list[float]
+
+    @property
+    def charge(self) -> float:
+        """What is left of 1."""
+        return self._state[-1]
+
+
+class LocalCharger(Battery):
+    """Local, but a derived class is not: a base class of both flavours."""
+
+    __slots__ = ()
+
+    def charge_to(self, level: float) -> None:
+        """Note a level."""
+        self._state.append(level)
+
+
+class Charger(LocalCharger):
+    """A charger."""
+
+    async def wait(self) -> float:
+        """Wait until it is full."""
+        return self.charge
+
+
 class Robot(Body):
     """A robot."""
 
     joints: NameMap[Joint]
     """Its joints."""
 
+    batteries: NameMap[Battery]
+    """Its batteries, of which one is in a charger."""
+
     def __init__(self, session: Session, name: str) -> None:
         super().__init__(session, name)
+        self.batteries = NameMap({"spare": Battery([0.5]), "main": Charger([0.9])}, {}, "battery")
         self.joints = NameMap({"hip": Joint("hip")}, {}, "joint")
         self._controller: Controller | None = PDController(session)
 

@@ -20,7 +20,6 @@ Timeout = float | Default | None
 class Session:
     def __init__(self) -> None:
         self.log: list[object] = []
-        self.lock = threading.RLock()
         self.threads: set[str] = set()
 
     async def call(self, *what: object) -> None:
