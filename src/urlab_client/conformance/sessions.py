@@ -13,7 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final, Self, TypeAlias, cast
 
@@ -90,9 +90,14 @@ class Ports:
             raise ValueError(f"{host} can be reached by others, so it needs a key (--listen-key)")
         self.host = host
         self._keys = keys
-        self.context: zmq.Context[Socket] = zmq.Context()
-        self.context.setsockopt(zmq.LINGER, 0)
         self.sockets = contextlib.ExitStack()
+
+    @cached_property
+    def context(self) -> zmq.Context[Socket]:
+        """The context of its sockets, which exists when there is one: until then nothing has to be closed."""
+        made: zmq.Context[Socket] = zmq.Context()
+        made.setsockopt(zmq.LINGER, 0)
+        return made
 
     def socket(self, kind: int) -> Socket:
         """Return a socket, which is among `sockets`."""
