@@ -24,7 +24,6 @@ from urlab_client.integrations.gym.episode import rendered_camera, space_mapping
 from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
 from urlab_client.integrations.gym.spaces import Field, Observation, with_cameras
-from urlab_client.integrations.gym.task import States, add_observed, with_task
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
@@ -113,17 +112,14 @@ class URLabBatchEnv(Vectorized):
         declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
         super().__init__(
             num_envs=num_envs,
+            model=model,
             settings=settings,
             mapping=mapping,
-            observation_space=with_task(
-                with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}), settings.task
-            ),
+            observation_space=with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}),
             autoreset_mode=autoreset_mode,
             randomise=declared,
         )
         self.model = model
-        self._memory = settings.memory(model, mapping, range(num_envs))
-        self._recent: tuple[Indices, States] | None = None
         self._pictures = BatchPictures(
             self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
         )
@@ -144,7 +140,6 @@ class URLabBatchEnv(Vectorized):
         self._bodies = element_ids(model_names(model, "body"), mapping.prefixes, "body")
         for push in () if declared is None else declared.push:
             self._body(push.body)
-        self._step_count = np.zeros(num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of the current state of each copy, shape (H, W, 3), RGB; None without a render mode.
@@ -165,7 +160,7 @@ class URLabBatchEnv(Vectorized):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the drawing context, and let the task serve another environment."""
-        self._settings.release()
+        super().close_extras(**kwargs)
         self._pictures.close()
 
     def _copies(self, indices: Indices) -> list[Visible]:
@@ -181,15 +176,12 @@ class URLabBatchEnv(Vectorized):
     def _advance(
         self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
     ) -> Mapping[int, Exception]:
-        self._recent = None
         if len(fresh):
             self._start(fresh, keyframe)
         if len(acting):
             self._act(acting, applied)
-            if self._memory is not None:
-                self._recent = acting, self._memory.updated(acting, applied.actions[acting], *self._state(acting))
         moved = np.sort(np.concatenate([fresh, acting]))
-        put(self._observations, moved, self._observe(moved))
+        put(self._fields, moved, self._observe(moved))
         return {}
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
@@ -206,11 +198,11 @@ class URLabBatchEnv(Vectorized):
             noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
             for i in map(int, indices):
                 for joints in noisy:
-                    noise.add(self._rngs[i], self.model, joints, qpos[i])
+                    noise.add(self.rngs[i], self.model, joints, qpos[i])
             self._batch.forward(indices)
         if self._memory is not None:
             for i in map(int, indices):
-                qpos[i] = self._memory.begin(i, self._rngs[i], qpos[i])
+                qpos[i] = self._memory.begin(i, self.rngs[i], qpos[i])
             self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
@@ -218,8 +210,8 @@ class URLabBatchEnv(Vectorized):
                 self._pictures.begin(i, int(seeds[i]), visible)
 
     def _act(self, indices: Indices, applied: Applied) -> None:
-        forces, pushes, n_substeps = self._forces(indices), self._arrays["xfrc_applied"], self._settings.n_substeps
-        for i, pushed in forces.items():
+        pushes, n_substeps = self._arrays["xfrc_applied"], self._settings.n_substeps
+        for i, pushed in applied.forces.items():
             for body, force in pushed.items():
                 pushes[i, self._body(body), :3] = force
         late = applied.late[indices]
@@ -230,7 +222,7 @@ class URLabBatchEnv(Vectorized):
                 for key, values in applied.set_points.items()
             }
             self._step(indices, now, end - begin)
-        pushes[list(forces)] = 0.0
+        pushes[list(applied.forces)] = 0.0
         self._step_count[indices] += n_substeps
 
     def _step(self, indices: Indices, set_points: Mapping[str, Floats], n_steps: int) -> None:
@@ -259,32 +251,18 @@ class URLabBatchEnv(Vectorized):
             self._controllers[key].write(values, qpos, qvel, ctrl)
         self._arrays["ctrl"][indices] = ctrl
 
-    def _clocks(self) -> dict[str, NDArray[Any]]:
-        return {"sim_time": self._arrays["time"].copy(), "step_count": self._step_count.copy()}
-
     def _observe(self, indices: Indices) -> Observation:
         def read(key: str, field: Field) -> Floats:
             return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
 
         observation = self.mapping.observe(read)
-        if self.task is not None:
-            observation = add_observed(observation, self.task, self.task.observe(self._states(indices)))
         if self._settings.cameras:
             times = self._arrays["time"][indices].tolist()
             observation["cameras"] = self._pictures.observe(indices.tolist(), times, self._copies(indices))
         return observation
 
-    def _states(self, indices: Indices) -> States:
-        if self._memory is None:
-            raise URLabError("This environment has no task.")
-        if self._recent is None or not np.array_equal(self._recent[0], indices):
-            self._recent = indices, self._memory.states(indices, *self._state(indices))
-        return self._recent[1]
-
-    def _state(self, indices: Indices) -> tuple[Floats, Floats, Floats]:
-        """Return positions, velocities and times of some copies."""
-        qpos, qvel, time = (self._arrays[name][indices] for name in ("qpos", "qvel", "time"))
-        return qpos, qvel, time
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        return self._arrays["qpos"], self._arrays["qvel"], self._arrays["time"]
 
     def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
         match field:

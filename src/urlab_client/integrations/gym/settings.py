@@ -83,7 +83,6 @@ class EpisodeSettings:
     articulations: Sequence[str] | None
     render_mode: str | None
     render_camera: str | None
-    scene: TaskScene | None = None
 
     @classmethod
     def of(cls, **options: Unpack[EpisodeOptions]) -> EpisodeSettings:
@@ -140,18 +139,17 @@ class EpisodeSettings:
             raise ValueError(f"max_episode_steps must be at least 1 or None, not {settings.max_episode_steps}")
         return settings
 
-    def memory(self, model: mujoco.MjModel, mapping: SpaceMapping, index: Sequence[int]) -> Memory | None:
-        """Return what the task keeps of these environments, None without a task; set the task up the first time.
+    def memory(self, model: mujoco.MjModel, mapping: SpaceMapping, n: int) -> Memory | None:
+        """Set the task up and return what it keeps of `n` environments; None without a task.
 
-        From then on it serves no other environment, until `release`.
+        From then on the task serves no other environment, until `release`.
         """
         if self.task is None:
             return None
-        if self.scene is None:
-            _SERVING[id(self.task)] = self
-            self.scene = TaskScene(model, mapping)
-            self.task.setup(self.scene)
-        return Memory(self.task, self.scene, index)
+        _SERVING[id(self.task)] = self
+        scene = TaskScene(model, mapping)
+        self.task.setup(scene)
+        return Memory(self.task, scene, n)
 
     def release(self) -> None:
         """Let the task serve another environment."""

@@ -314,10 +314,10 @@ class SpaceMapping:
     def _make_observation_space(self) -> Space:
         seen = {key: self._parts[key] for key in self.observed}
         if self.mode == "flat":
-            return _unbounded(sum(part.widths[field] for part in seen.values() for field in self.fields))
+            return unbounded(sum(part.widths[field] for part in seen.values() for field in self.fields))
         return dict_space(
             {
-                key: dict_space({field: _unbounded(part.widths[field]) for field in self.fields})
+                key: dict_space({field: unbounded(part.widths[field]) for field in self.fields})
                 for key, part in seen.items()
             }
         )
@@ -356,7 +356,8 @@ def _bounded(low: Floats, high: Floats) -> Space:
     return spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
-def _unbounded(n: int) -> Space:
+def unbounded(n: int) -> Space:
+    """Return the space of `n` numbers without bounds."""
     return spaces.Box(-np.inf, np.inf, (n,), dtype=np.float64)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 from collections.abc import Awaitable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from urlab_client.values.plain import Serializable
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
     from urlab_client.integrations.gym.episode import EnvEpisode
+    from urlab_client.integrations.gym.task import Memory
     from urlab_client.integrations.record import AsyncRecorder, Recorder
 
 Verdict = EpisodeOutcome | Literal["quit"]
@@ -204,6 +206,7 @@ class _Session:
         self._task = task
         self._n_steps = max(1, round(1.0 / (hz * timestep)))
         self._starts: EnvEpisode | None = None
+        self._memory: Memory | None = None
         if task is not None:
             from urlab_client.integrations.gym.episode import EnvEpisode
             from urlab_client.integrations.gym.settings import EpisodeSettings
@@ -211,6 +214,7 @@ class _Session:
             settings = EpisodeSettings.of(task=task, cameras=())
             self._n_steps = settings.n_substeps
             self._starts = EnvEpisode(client, settings=settings)
+            self._memory = settings.memory(model, self._starts.mapping, 1)
         self._hand = HandControl(client) if hand is None else hand
         self._period = self._n_steps * timestep
         self._tally = TeleopTally()
@@ -275,12 +279,14 @@ class _Session:
             await self._client.reset()
         else:
             seed = None if self._starts.randomise is None else int(self._rng.integers(2**31))
-            await self._starts.reset(self._rng, seed=seed)
+            begin = None if self._memory is None else partial(self._memory.begin, 0)
+            await self._starts.reset(self._rng, seed=seed, begin=begin)
 
     def _goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         """Return the goal of the episode, and whether the current state is a success."""
-        if self._starts is None or self._task is None:
+        if self._starts is None or self._memory is None or self._task is None:
             return {}, None
-        states = self._starts.states()
+        qpos, qvel, time = self._starts.state()
+        states = self._memory.states(np.zeros(1, dtype=np.intp), qpos[None].copy(), qvel[None].copy(), np.array([time]))
         found = self._task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])
