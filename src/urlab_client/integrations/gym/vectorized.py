@@ -122,6 +122,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
         self._keyframe: str | None = None
+        self._success: Bools | None = None
+        self._all = np.arange(num_envs)
+        self._all.flags.writeable = False
         self.rngs: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
         self._recent: States | None = None
         self._memory = settings.memory(model, mapping, num_envs)
@@ -195,7 +198,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         set_points = self._set_points(actions)  # validates before anything moves
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
-        fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
+        fresh, acting = (
+            (np.flatnonzero(resetting), np.flatnonzero(~resetting)) if resetting.any() else (_NONE, self._all)
+        )
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
         errors = self._move(fresh, self._keyframe, acting, self.mapping.flat(actions), set_points)
         infos = self._infos(errors)
@@ -243,12 +248,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             disturbances.begin(self.rngs[i], keyframe)
         applied = _NOTHING if set_points is None else self._applied(acting, set_points)
         errors = self._advance(fresh, keyframe, acting, applied)
-        self._recent = None
-        moved, acted = (
-            np.array([i for i in indices if i not in errors], dtype=np.intp) if errors else indices
-            for indices in (np.sort(np.concatenate([fresh, acting])), acting)
-        )
-        self._ask_task(moved, acted, actions)
+        moved = acting if not len(fresh) else np.sort(np.concatenate([fresh, acting]))
+        if errors:
+            moved, acted = (np.array([i for i in each if i not in errors], dtype=np.intp) for each in (moved, acting))
+        else:
+            moved, acted = self._all if len(moved) == self.num_envs else moved, acting
+        if self.task is not None and len(moved):
+            self._ask(self.task, moved, acted, actions)
         if self._observations_disturbed:
             for i, disturbances in self._disturbed(moved):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
@@ -259,22 +265,26 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._ended[list(errors)] = True
         return errors
 
-    def _ask_task(self, moved: Indices, acted: Indices, actions: Floats | None) -> None:
-        """Let the task update what it keeps after actions, and add what it observes in the environments that moved."""
-        if self.task is None or self._memory is None or not len(moved):
-            return
-        if actions is not None and len(acted):
+    def _ask(self, task: Task, moved: Indices, acted: Indices, actions: Floats | None) -> None:
+        """Let the task update what it keeps after actions; ask what it observes, and for success, after all moves."""
+        self._recent = None
+        if self._memory is not None and actions is not None and len(acted):
             rows = (values[acted] for values in self._state())
             self._recent = self._memory.updated(acted, actions[acted], *rows)
-        found = observed(self.task, self._states(moved))
+        states = self._states(moved)
+        found, success = observed(task, states), succeeded(task, states)
         if self._of_task is not None:
             self._of_task[moved] = found
+        if success is not None:
+            if self._success is None:
+                self._success = np.zeros(self.num_envs, dtype=bool)
+            self._success[moved] = success
 
     def _states(self, indices: Indices) -> States:
         """Return the states of some environments in the form passed to the task."""
         if self._memory is None:
             raise ValueError("this environment has no task")
-        if self._recent is None or not np.array_equal(self._recent.index, indices):
+        if self._recent is None or self._recent.index is not indices:
             self._recent = self._memory.states(indices, *(values[indices] for values in self._state()))
         return self._recent
 
@@ -286,7 +296,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self.reward_fn is not None or self.termination_fn is not None:
             after = mapped(np.copy, self._observations)
         if self.task is not None and not infos.get("_error", terminated).all():  # otherwise there may be no goal
-            rewards, terminated = judged(self.task, self._states(np.arange(self.num_envs)), actions)
+            rewards, terminated = judged(self.task, self._states(self._all), actions)
         if self.reward_fn is not None:
             rewards[:] = self.reward_fn(before, actions, after, infos)
         if self.termination_fn is not None:
@@ -295,7 +305,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return rewards, terminated & stepped
 
     def _tell_ends(self, task: Task, ended: Bools, terminated: Bools, infos: dict[str, Any]) -> None:
-        states = self._states(np.arange(self.num_envs))
+        states = self._states(self._all)
         success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
         for i in np.flatnonzero(ended).tolist():
             steps, total = int(self._elapsed[i]), float(self._totals[i])
@@ -320,10 +330,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         for name, values in self._clocks().items():
             infos[name], infos[f"_{name}"] = values, everywhere.copy()
         known = self._begun & ~failed
-        if self.task is not None and known.any():
-            success = succeeded(self.task, self._states(np.arange(self.num_envs)))
-            if success is not None:
-                infos["success"], infos["_success"] = success & known, known
+        if self._success is not None and known.any():
+            infos["success"], infos["_success"] = self._success & known, known
         if errors:
             infos["error"], infos["_error"] = np.full(self.num_envs, None, dtype=object), failed
             for i, error in errors.items():
