@@ -195,14 +195,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        set_points = self._set_points(actions)  # validates before anything moves
+        flat = self.mapping.flat(actions)  # validates before anything moves
+        if flat.ndim != 2 or len(flat) != self.num_envs:
+            raise ValueError(f"the actions have shape {flat.shape}; their first axis must be {self.num_envs} long")
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
         fresh, acting = (
             (np.flatnonzero(resetting), np.flatnonzero(~resetting)) if resetting.any() else (_NONE, self._all)
         )
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
-        errors = self._move(fresh, self._keyframe, acting, self.mapping.flat(actions), set_points)
+        errors = self._move(fresh, self._keyframe, acting, flat)
         infos = self._infos(errors)
         stepped = ~resetting
         stepped[list(errors)] = False
@@ -240,13 +242,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         keyframe: str | None,
         acting: Indices = _NONE,
         actions: Floats | None = None,
-        set_points: Mapping[str, Floats] | None = None,
     ) -> Mapping[int, Exception]:
         """Start episodes and continue others; return the failures by index."""
         keyframe = self._settings.keyframe if keyframe is None else keyframe
         for i, disturbances in self._disturbed(fresh):
             disturbances.begin(self.rngs[i], keyframe)
-        applied = _NOTHING if set_points is None else self._applied(acting, set_points)
+        applied = _NOTHING if actions is None else self._applied(acting, self.mapping.set_points_of(actions))
         errors = self._advance(fresh, keyframe, acting, applied)
         moved = acting if not len(fresh) else np.sort(np.concatenate([fresh, acting]))
         if errors:
@@ -342,16 +343,6 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Return the entries of `infos` that every environment has, by name."""
         clocks: dict[str, NDArray[Any]] = {"sim_time": self._state()[2].copy(), "step_count": self._step_count.copy()}
         return {**clocks, "episode_seed": self.episode_seeds()} if self._disturbances else clocks
-
-    def _set_points(self, actions: Any) -> dict[str, Floats]:
-        """Return the set-points of each articulation, shape (environments, n_ctrl)."""
-        found = self.mapping.set_points(actions)
-        for key, values in found.items():
-            if values.ndim != 2 or len(values) != self.num_envs:
-                raise ValueError(
-                    f"the actions of {key} have shape {values.shape}; their first axis must be {self.num_envs} long"
-                )
-        return found
 
     def _shown(self) -> Observation:
         """Return the observations with all disturbances. Rewards and terminations are computed from the true ones."""
