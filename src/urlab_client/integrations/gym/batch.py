@@ -92,7 +92,7 @@ class URLabBatchEnv(Vectorized):
             raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
             raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
-        settings = EpisodeSettings.of(**options)
+        settings = EpisodeSettings(**options)
         address = with_model_options(address)
         with URLabClient(address, **client_defaults(client_options)) as client:
             client.discover()

@@ -113,7 +113,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             ValueError: An option is out of range, the scene has no camera to render, the task serves another
                 environment, or one of its hooks or attributes is misspelt.
         """
-        settings = EpisodeSettings.of(**options)
+        settings = EpisodeSettings(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
         episode = EnvEpisode(aio_of(client), settings=settings, randomise=declared)
         self._alone = _Alone(episode, settings, portal_of(client))

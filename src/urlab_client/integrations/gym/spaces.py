@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import control_counts
+from urlab_client.aio.arguments import collection
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, driven_joint
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import CameraMode
@@ -64,7 +65,7 @@ class Actions:
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
     """Return the fields of an observation level, or the given field names."""
     if not isinstance(observations, str):
-        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
+        return tuple(collection("observations", observations))  # type: ignore[return-value]  # SpaceMapping rejects others
     if observations not in LEVELS:
         raise ValueError(
             f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"

@@ -200,7 +200,7 @@ class URLabVectorEnv(OverWire):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
-        settings = EpisodeSettings.of(**options)
+        settings = EpisodeSettings(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
         if declared is not None:
             text = declared.to_json()

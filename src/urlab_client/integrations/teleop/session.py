@@ -211,7 +211,7 @@ class _Session:
             from urlab_client.integrations.gym.episode import EnvEpisode
             from urlab_client.integrations.gym.settings import EpisodeSettings
 
-            settings = EpisodeSettings.of(task=task, cameras=())
+            settings = EpisodeSettings(task=task, cameras=())
             self._n_steps = settings.n_substeps
             self._starts = EnvEpisode(client, settings=settings)
             self._memory = settings.memory(model, self._starts.mapping, 1)
