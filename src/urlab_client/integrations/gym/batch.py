@@ -217,19 +217,15 @@ class URLabBatchEnv(Vectorized):
         late = applied.late[indices]
         for begin, end in itertools.pairwise(np.unique([0, *late, n_substeps]).tolist()):
             waiting = (late > begin)[:, None]
-            now = {
-                key: np.where(waiting, applied.before[key][indices], values[indices])
-                for key, values in applied.set_points.items()
-            }
-            self._step(indices, now, end - begin)
+            self._step(indices, np.where(waiting, applied.before[indices], applied.set_points[indices]), end - begin)
         pushes[list(applied.forces)] = 0.0
         self._step_count[indices] += n_substeps
 
-    def _step(self, indices: Indices, set_points: Mapping[str, Floats], n_steps: int) -> None:
-        """Step some copies with these set-points, shape (n, n_ctrl) for each articulation."""
+    def _step(self, indices: Indices, set_points: Floats, n_steps: int) -> None:
+        """Step some copies with these set-points, shape (n, n_actions)."""
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
-        for key, exact in set_points.items():
+        for key, exact in self.mapping.split(set_points).items():
             values, controller = exact.astype(self._target_type), self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -175,40 +174,32 @@ class EnvEpisode:
                 await self.over_wire.undo()
 
     async def step(
-        self,
-        set_points: Mapping[str, Floats],
-        forces: Mapping[str, Floats] = MappingProxyType({}),
-        before: Mapping[str, Floats] = MappingProxyType({}),
-        late_steps: int = 0,
+        self, set_points: Floats, forces: Mapping[str, Floats], before: Floats, late_steps: int
     ) -> Observation:
         """Apply set-points for `n_substeps` and return the observation after them.
 
         Args:
-            set_points: Set-points of each articulation, shape (n_ctrl,).
+            set_points: Set-points of all articulations, shape (n_actions,).
             forces: Forces on bodies meanwhile, N, world frame, shape (3,).
             before: Set-points that are in force during the first `late_steps` physics steps.
             late_steps: Number of these steps, less than `n_substeps`.
         """
         if late_steps:
-            await self._apply(before, forces, late_steps)
+            await self._apply(before, forces, late_steps, {})
         cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
         await self._apply(set_points, forces, self._settings.n_substeps - late_steps, cameras)
         self._take_frames()
         return self._observe()
 
     async def _apply(
-        self,
-        set_points: Mapping[str, Floats],
-        forces: Mapping[str, Floats],
-        n_steps: int,
-        cameras: Mapping[str, str] = MappingProxyType({}),
+        self, set_points: Floats, forces: Mapping[str, Floats], n_steps: int, cameras: dict[str, str]
     ) -> None:
-        for key, values in set_points.items():
+        for key, values in self.mapping.split(set_points).items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)
             articulation.apply_xfrc(name, force=force.tolist())
-        await self.client.step(n_steps, include_cameras=dict(cameras) or False, observations=self._level)
+        await self.client.step(n_steps, include_cameras=cameras or False, observations=self._level)
 
     async def _place(self, qpos: Floats) -> None:
         """Place the articulations whose positions in `qpos` differ from the scene's."""

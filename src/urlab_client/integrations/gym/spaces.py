@@ -254,12 +254,15 @@ class SpaceMapping:
         Raises:
             ValueError: The action has the wrong shape, or contains NaN or infinity.
         """
-        return self.set_points_of(self.flat(action))
+        return self.split(self.scaled(self.flat(action)))
 
-    def set_points_of(self, flat: Floats) -> dict[str, Floats]:
-        """Return the set-points of each articulation, shape (…, n_ctrl), from the result of `flat`."""
-        whole = self._offset + self._scale * np.clip(flat, *self._clip)
-        return {key: whole[..., where] for key, where in self._inputs.items()}
+    def scaled(self, flat: Floats) -> Floats:
+        """Return the set-points of all articulations, shape (…, n_actions), from actions likewise."""
+        return self._offset + self._scale * np.clip(flat, *self._clip)
+
+    def split(self, flat: Floats) -> dict[str, Floats]:
+        """Return the part of each articulation with actuators, as a view, shape (…, n_ctrl)."""
+        return {key: flat[..., where] for key, where in self._inputs.items()}
 
     def _declare(self, key: str, actions: Actions) -> None:
         """Let the actions of an articulation become set-points as declared."""

@@ -60,10 +60,8 @@ class OverWire(Vectorized):
             begin = None if self._memory is None else partial(self._memory.begin, i)
             observation = await episode.reset(self.rngs[i], keyframe, seed, begin)
         else:
-            now, before = (
-                {key: values[i] for key, values in each.items()} for each in (applied.set_points, applied.before)
-            )
-            observation = await episode.step(now, applied.forces.get(i, {}), before, int(applied.late[i]))
+            now, before, late, forces = applied
+            observation = await episode.step(now[i], forces.get(i, {}), before[i], int(late[i]))
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
         self._step_count[i] = episode.client.step_count

@@ -30,19 +30,19 @@ class Applied(NamedTuple):
     """What all environments do during one action.
 
     Attributes:
-        set_points: Set-points of each articulation, shape (environments, n_ctrl).
+        set_points: Set-points of all articulations, shape (environments, n_actions).
         before: Set-points that are in force during the first `late` physics steps of the action, likewise.
         late: Number of these physics steps, shape (environments,).
         forces: Forces on bodies, N, world frame, shape (3,), by environment; those without a push are omitted.
     """
 
-    set_points: Mapping[str, Floats]
-    before: Mapping[str, Floats]
+    set_points: Floats
+    before: Floats
     late: Indices
-    forces: Mapping[int, Mapping[str, Floats]]
+    forces: dict[int, Mapping[str, Floats]]
 
 
-_NOTHING = Applied({}, {}, _NONE, {})
+_NOTHING = Applied(np.zeros((0, 0)), np.zeros((0, 0)), _NONE, {})
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
@@ -247,7 +247,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         keyframe = self._settings.keyframe if keyframe is None else keyframe
         for i, disturbances in self._disturbed(fresh):
             disturbances.begin(self.rngs[i], keyframe)
-        applied = _NOTHING if actions is None else self._applied(acting, self.mapping.set_points_of(actions))
+        applied = _NOTHING if actions is None else self._applied(acting, self.mapping.scaled(actions))
         errors = self._advance(fresh, keyframe, acting, applied)
         moved = acting if not len(fresh) else np.sort(np.concatenate([fresh, acting]))
         if errors:
@@ -348,21 +348,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Return the observations with all disturbances. Rewards and terminations are computed from the true ones."""
         return mapped(np.copy, self._sensed)
 
-    def _applied(self, indices: Indices, set_points: Mapping[str, Floats]) -> Applied:
+    def _applied(self, indices: Indices, set_points: Floats) -> Applied:
         """Return what takes effect now in some environments, which may be pushed, and whose actions may be delayed."""
-        before, now, late = set_points, set_points, np.zeros(self.num_envs, dtype=np.intp)
-        forces: dict[int, Mapping[str, Floats]] = {}
-        if self.randomise is not None and self.randomise.delays_actions:
-            before, now = ({key: values.copy() for key, values in set_points.items()} for _ in range(2))
+        applied = Applied(set_points, set_points.copy(), np.zeros(self.num_envs, dtype=np.intp), {})
         for i, disturbances in self._disturbed(indices):
             if pushes := disturbances.forces():
-                forces[i] = pushes
-            if now is not set_points:
-                earlier, later = disturbances.delayed({key: values[i] for key, values in set_points.items()})
-                late[i] = disturbances.late_steps
-                for key in set_points:
-                    before[key][i], now[key][i] = earlier[key], later[key]
-        return Applied(now, before, late, forces)
+                applied.forces[i] = pushes
+            if self.randomise is not None and self.randomise.delays_actions:
+                applied.before[i], applied.set_points[i] = disturbances.delayed(set_points[i])
+                applied.late[i] = disturbances.late_steps
+        return applied
 
     def _disturbed(self, indices: Indices) -> list[tuple[int, Disturbances]]:
         """Return the disturbances of some environments."""
