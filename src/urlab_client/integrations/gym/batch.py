@@ -190,20 +190,15 @@ class URLabBatchEnv(Vectorized):
         if self._varied is not None:
             self._varied.begin(indices, seeds)
         self._batch.reset(indices, key)
-        if self._varied is not None:
-            for i in map(int, indices):
+        noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
+        for i in map(int, indices):
+            if self._varied is not None:
                 self._varied.start(i, qpos[i])
-            self._batch.forward(indices)
-        if noise:
-            noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
-            for i in map(int, indices):
-                for joints in noisy:
-                    noise.add(self.rngs[i], self.model, joints, qpos[i])
-            self._batch.forward(indices)
-        if self._memory is not None:
-            for i in map(int, indices):
+            for joints in noisy if noise else ():
+                noise.add(self.rngs[i], self.model, joints, qpos[i])
+            if self._memory is not None:
                 qpos[i] = self._memory.begin(i, self.rngs[i], qpos[i])
-            self._batch.forward(indices)
+        self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
             for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):

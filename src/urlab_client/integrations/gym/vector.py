@@ -105,7 +105,6 @@ class _Session:
         """Drop the session and begin to start a new one, which the next reset waits for."""
         if self._opening is None:
             self._opening = background_task("urlab-environment", self._reopen())
-            self._opening.add_done_callback(self._opened)
         return self._opening
 
     async def close(self) -> None:
@@ -132,16 +131,16 @@ class _Session:
         self.restarts += 1
 
     async def _reopen(self) -> None:
-        await self._close_client()
-        await self.open()
+        try:
+            await self._close_client()
+            await self.open()
+        finally:
+            self._opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
     async def _close_client(self) -> None:
         episode, self.episode = self.episode, None
         if episode is not None:
             await episode.client.close()
-
-    def _opened(self, task: asyncio.Task[None]) -> None:
-        self._opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
 
 class URLabVectorEnv(OverWire):
