@@ -276,12 +276,12 @@ def test_an_episode_whose_server_died_runs_again_on_a_new_one(cluster: Any, tmp_
 
 
 def test_a_worker_keeps_its_server_for_equal_episodes_and_not_beyond_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    from urlab_client.cluster.episodes import Job, Setup, Worker
+    from urlab_client.cluster.episodes import Job, Worker, setup_of
     from urlab_client.errors import ConnectionLost, UnknownActor
 
     monkeypatch.setattr(Worker, "node_id", lambda _: "here")
     job = Job(id=3, seed=1, scene="sim://arm", attempt=2)
-    setup, other = (Setup.of({"max_episode_steps": steps}, {}, lease_timeout=1.0) for steps in (2, 3))
+    setup, other = (setup_of({"max_episode_steps": steps}, {}) for steps in (2, 3))
     worker = Worker()
 
     def steps(setup: Any = setup, error: Exception | None = None) -> Any:

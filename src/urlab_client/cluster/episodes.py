@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +88,7 @@ class Job:
     attempt: int = 1
     run: str = ""
     leases: LeasePool | None = None
+    lease_timeout: float = 0.0
 
     @property
     def holder(self) -> str:
@@ -96,21 +96,10 @@ class Job:
         return f"{self.run}/{self.id}/{self.attempt}"
 
 
-@dataclass(frozen=True, slots=True)
-class Setup:
-    """Configuration of the environments of a run; `key` is equal for equal options, whose environments are reused."""
-
-    key: str
-    env_options: Mapping[str, Any]
-    client_options: Mapping[str, Any]
-    lease_timeout: float
-
-    @classmethod
-    def of(cls, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> Self:
-        """Build the configuration."""
-        options = dict(env_options), dict(client_options)
-        # Ray's pickle also serialises functions by value.
-        return cls(hashlib.sha256(_ray.cloudpickle.dumps(options)).hexdigest(), *options, lease_timeout)
+def setup_of(env_options: Mapping[str, Any], client_options: Mapping[str, Any]) -> bytes:
+    """Return the configuration of the environments of a run; for equal options, environments are reused."""
+    # Ray's pickle also serialises functions by value.
+    return _ray.cloudpickle.dumps((dict(env_options), dict(client_options)))
 
 
 def seed_of(seed: int, episode: int) -> int:
@@ -125,21 +114,21 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._made_for = ("", "")  # address and key of the setup
+        self._made_for = ("", b"")  # address and setup
         self._env: URLabEnv | None = None
 
     def node_id(self) -> str:
         """Return Ray's id of this node; the answer shows that the worker is up."""
         return str(_ray.get_runtime_context().get_node_id())
 
-    def run(self, policy: Policy, setup: Setup, job: Job) -> Episode:
+    def run(self, policy: Policy, setup: bytes, job: Job) -> Episode:
         """Run one attempt of an episode."""
         started, clock = time.time(), time.perf_counter()
         try:
             with ExitStack() as leased:
                 address, keep = job.scene, None
                 if job.leases is not None:
-                    lease = leased.enter_context(job.leases.lease(job.holder, timeout=setup.lease_timeout))
+                    lease = leased.enter_context(job.leases.lease(job.holder, timeout=job.lease_timeout))
                     address, keep = lease.address, lease.keep
                     leased.callback(self.close)  # before another holder gets the address
                     leased.enter_context(lease.of_server(self._environment(address, setup).client))
@@ -188,13 +177,12 @@ class Worker:
         if env is not None:
             env.close()
 
-    def _environment(self, address: str, setup: Setup) -> URLabEnv:
-        wanted = (address, setup.key)
-        if self._env is not None and self._made_for == wanted:
-            return self._env
-        self.close()
-        self._env = URLabEnv.connect(address, client_options=setup.client_options, **setup.env_options)
-        self._made_for = wanted
+    def _environment(self, address: str, setup: bytes) -> URLabEnv:
+        if self._env is None or self._made_for != (address, setup):
+            self.close()
+            env_options, client_options = _ray.cloudpickle.loads(setup)
+            self._env = URLabEnv.connect(address, client_options=client_options, **env_options)
+            self._made_for = address, setup
         return self._env
 
 
@@ -236,10 +224,9 @@ def run_episode(
     Raises:
         URLabError: The server failed.
     """
-    setup = Setup.of({**env_options, "max_episode_steps": max_episode_steps}, client_options, lease_timeout=0.0)
     worker = Worker()
-    job = Job(id=episode, seed=seed_of(seed, episode), scene=scene)
+    setup = setup_of({**env_options, "max_episode_steps": max_episode_steps}, client_options)
     try:
-        return worker.run(policy, setup, job)
+        return worker.run(policy, setup, Job(id=episode, seed=seed_of(seed, episode), scene=scene))
     finally:
         worker.close()

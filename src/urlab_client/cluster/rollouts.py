@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 
 import anyio.to_thread
 
-from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Setup, Worker, seed_of
+from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Worker, seed_of, setup_of
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.errors import URLabError, refused_for_good
 
@@ -119,7 +119,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
     def __init__(
         self,
         policy: Policy,
-        setup: Setup,
+        setup: bytes,
         jobs: Sequence[Job],
         *,
         workers: WorkerPool,
@@ -368,14 +368,14 @@ def rollouts(
             scene=names[i * len(names) // n],
             run=run,
             leases=leases,
+            lease_timeout=lease_timeout,
         )
         for i in chosen
     ]
     most = pool.n_workers or (leases.size if leases else int(_ray.cluster_resources().get("CPU", 1)))
-    options = {**env_options, "max_episode_steps": max_episode_steps}
     return Rollouts(
         policy,
-        Setup.of(options, client_options, lease_timeout),
+        setup_of({**env_options, "max_episode_steps": max_episode_steps}, client_options),
         jobs,
         workers=pool,
         owns_workers=workers is None,
