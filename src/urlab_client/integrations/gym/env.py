@@ -13,7 +13,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import (
@@ -22,6 +21,7 @@ from urlab_client.integrations.gym.settings import (
     RewardFn,
     TerminationFn,
     client_defaults,
+    served_address,
 )
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
 from urlab_client.integrations.gym.task import Task
@@ -144,10 +144,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             URLabError: The server cannot be reached or has no articulation.
         """
-        if address.startswith(SCHEME) and options.get("randomise") is not None:
-            declared = options["randomise"] = Randomisation.of(options["randomise"])
-            address = with_option(address, "randomise", declared.to_json())
-        client = URLabClient(with_model_options(address), **client_defaults(client_options))
+        if (declared := options.get("randomise")) is not None:
+            declared = options["randomise"] = Randomisation.of(declared)
+        client = URLabClient(served_address(address, declared), **client_defaults(client_options))
         try:
             client.discover()
             return cls(client, owns_client=True, **options)

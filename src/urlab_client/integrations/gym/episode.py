@@ -334,11 +334,8 @@ def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | Non
         return None
     if settings.render_camera:
         return settings.render_camera
-    for key, articulation in client.articulations.items():
-        for name, view in articulation.cameras.items():
-            if view.mode == CameraMode.REAL:
-                return f"{key}/{name}"
-    for name, view in client.global_cameras.items():
+    views = {f"{key}/{name}": view for key, it in client.articulations.items() for name, view in it.cameras.items()}
+    for name, view in (*views.items(), *client.global_cameras.items()):
         if view.mode == CameraMode.REAL:
             return name
     raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")

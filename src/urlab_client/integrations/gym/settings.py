@@ -9,8 +9,10 @@ from weakref import WeakValueDictionary
 import mujoco
 
 from urlab_client.aio.arguments import collection, integer, require, text
+from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.integrations.gym.spaces import Actions, Field, Observation, SpaceMapping, SpaceMode, fields_of
 from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_spelling
+from urlab_client.randomise.declaration import Randomisation
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""
@@ -151,6 +153,13 @@ def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
     warns about it.
     """
     return {"step_mode": "direct", "mujoco_version_check": False, **options}
+
+
+def served_address(address: str, randomise: Randomisation | None) -> str:
+    """Return an address whose server, if it is started for it, varies its scene and honours the model's `<option>`."""
+    if randomise is not None and address.startswith(SCHEME):
+        address = with_option(address, "randomise", randomise.to_json())
+    return with_model_options(address)
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:

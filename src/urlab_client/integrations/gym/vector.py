@@ -6,6 +6,7 @@ import asyncio
 import os
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Unpack
@@ -15,20 +16,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from urlab_client._platform.processors import processor_count
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
+from urlab_client.aio.launch import SCHEME, with_start_timeout
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.episode import EnvEpisode
-from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
-
-
-def _processors() -> int:
-    """Return how many servers may start at the same time: each occupies a processor until it is up."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class OverWire(Vectorized):
@@ -70,32 +67,24 @@ class OverWire(Vectorized):
         return self._qpos, self._qvel, self._time
 
 
+@dataclass(eq=False)
 class _Session:
     """The client of one environment, and how to start it again."""
 
-    def __init__(
-        self,
-        address: str,
-        starts: asyncio.Semaphore,
-        client_options: Mapping[str, Any],
-        *,
-        settings: EpisodeSettings,
-        randomise: Randomisation | None,
-    ) -> None:
-        self.address = address
-        self.restarts = -1
-        self.episode: EnvEpisode | None = None
-        self._starts = starts
-        self._client_options = client_options
-        self._settings = settings
-        self._randomise = randomise
-        self._opening: asyncio.Task[None] | None = None
-        self._earlier: EnvEpisode | None = None
+    address: str
+    client_options: Mapping[str, Any]
+    settings: EpisodeSettings
+    randomise: Randomisation | None
+    starts: asyncio.Semaphore
+    restarts: int = -1
+    episode: EnvEpisode | None = None
+    opening: asyncio.Task[None] | None = None
+    earlier: EnvEpisode | None = None
 
     async def ready(self) -> EnvEpisode:
         """Return the episodes. Without a client, start one; cancelling this call does not stop that."""
         if self.episode is None:
-            opening = self._opening or self.reopen()
+            opening = self.opening or self.reopen()
             await asyncio.shield(opening)
         if self.episode is None:
             raise URLabError("The environment was closed.")
@@ -103,27 +92,27 @@ class _Session:
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
-        if self._opening is None:
-            self._opening = background_task("urlab-environment", self._reopen())
-        return self._opening
+        if self.opening is None:
+            self.opening = background_task("urlab-environment", self._reopen())
+        return self.opening
 
     async def close(self) -> None:
         """Close the client."""
-        if self._opening is not None:
-            self._opening.cancel()
-            await asyncio.wait((self._opening,))
+        if self.opening is not None:
+            self.opening.cancel()
+            await asyncio.wait((self.opening,))
         if self.episode is not None:
             await self.episode.close()
         await self._close_client()
 
     async def open(self) -> None:
         """Start the session as soon as a start slot is free."""
-        async with self._starts:
-            client = URLabClient(with_model_options(self.address), **self._client_options)
+        async with self.starts:
+            client = URLabClient(self.address, **self.client_options)
             try:
                 await client.discover()
-                self.episode = self._earlier = EnvEpisode(
-                    client, settings=self._settings, randomise=self._randomise, earlier=self._earlier
+                self.episode = self.earlier = EnvEpisode(
+                    client, settings=self.settings, randomise=self.randomise, earlier=self.earlier
                 )
             except BaseException:
                 await client.close()
@@ -135,7 +124,7 @@ class _Session:
             await self._close_client()
             await self.open()
         finally:
-            self._opening = None  # a waiting reset raises its error; otherwise the next reset tries again
+            self.opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
     async def _close_client(self) -> None:
         episode, self.episode = self.episode, None
@@ -199,22 +188,13 @@ class URLabVectorEnv(OverWire):
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
         settings = EpisodeSettings(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
-        if declared is not None:
-            text = declared.to_json()
-            addresses = [with_option(a, "randomise", text) if a.startswith(SCHEME) else a for a in addresses]
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
         client_options = client_defaults(client_options)
-        starts = asyncio.Semaphore(_processors())
+        starts = asyncio.Semaphore(processor_count())
         self._sessions = [
-            _Session(
-                with_start_timeout(address, start_timeout),
-                starts,
-                client_options,
-                settings=settings,
-                randomise=declared,
-            )
-            for address in addresses
+            _Session(served_address(address, declared), client_options, settings, declared, starts)
+            for address in (with_start_timeout(address, start_timeout) for address in addresses)
         ]
         self._portal = Portal()
         try:
