@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import batch_class
+from urlab_client._mujoco import batch_class, spans
 from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
@@ -131,7 +131,8 @@ class URLabBatchEnv(Vectorized):
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
-        self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
+        sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
+        self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}
         self._varied = None
         if declared is not None and declared.vary:
             self._varied = _CopyVariation(
@@ -338,8 +339,3 @@ def _controller(
     controller = attach_controller(model, actuated, config)
     controller.configure(params)
     return controller
-
-
-def _sensor_addresses(model: mujoco.MjModel, layout: ArticulationLayout) -> Indices:
-    ranges = [np.arange(model.sensor_dim[i], dtype=np.intp) + model.sensor_adr[i] for i in layout.sensors.values()]
-    return np.concatenate(ranges) if ranges else np.zeros(0, dtype=np.intp)

@@ -268,15 +268,13 @@ class URLabVectorEnv(OverWire):
         """Reset and step environments; return the failures, and begin to replace the clients that were lost."""
         tasks = {i: asyncio.create_task(self._move_one(i, keyframe, None)) for i in fresh}
         tasks |= {i: asyncio.create_task(self._move_one(i, keyframe, applied)) for i in acting}
-        late: set[asyncio.Task[None]] = set()
         try:
             # One deadline for all: a deadline per environment would cost a tenth of the client's work.
             await asyncio.wait(tasks.values(), timeout=self._step_timeout)
         finally:
-            for task in tasks.values():
-                if not task.done():
-                    late.add(task)
-                    task.cancel()
+            late = [task for task in tasks.values() if not task.done()]
+            for task in late:
+                task.cancel()
             if late:
                 await asyncio.wait(late)
         errors: dict[int, Exception] = {}
