@@ -57,14 +57,10 @@ class WireVariation(ClientObserver):
         declared: Randomisation,
         earlier: WireVariation | None = None,
     ) -> None:
-        """Look up what varies.
+        """Look up what varies, and refuse what no op changes.
 
         `earlier` is the variation of an earlier session with the server, which may have left gravity and gains varied;
         if None, the current gravity and gains count as unvaried.
-
-        Raises:
-            UnsupportedRandomisation: No op changes one of the quantities.
-            ValueError: A name matches no element.
         """
         from urlab_client.randomise.quantities import START, elements_of
         from urlab_client.randomise.variation import Variation, field_of

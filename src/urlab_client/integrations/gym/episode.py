@@ -60,20 +60,7 @@ class EnvEpisode:
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
     ) -> None:
-        """Set up the episodes of a client.
-
-        Args:
-            client: The client, discovered and in `direct` or `puppet` mode.
-            settings: Settings of the episodes.
-            randomise: What varies from episode to episode. If None, the server's own declaration applies.
-            earlier: Episodes of the earlier client that this client replaces.
-
-        Raises:
-            URLabError: The client cannot serve an environment, or its server varies the scene differently.
-            UnsupportedRandomisation: The server varies nothing itself, and no op does.
-            KeyError: A camera is unknown.
-            ValueError: An option is out of range, or the scene has no camera to render.
-        """
+        """Set up the episodes of a client, which may replace that of `earlier` episodes; see `URLabEnv` for errors."""
         model, data = client.model, client.data
         if model is None or data is None or not client.articulations:
             raise URLabError(
@@ -115,11 +102,7 @@ class EnvEpisode:
             self._pushed(push.body)
 
     def state(self) -> tuple[Floats, Floats, float]:
-        """Return the positions and velocities of the whole scene, and the simulation time.
-
-        Raises:
-            URLabError: The client has lost its model.
-        """
+        """Return the positions and velocities of the whole scene, and the simulation time."""
         data = self.client.data
         if data is None:
             raise URLabError("The client has no model.", hint="Call discover() with local_model=True.")
@@ -138,11 +121,7 @@ class EnvEpisode:
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        Args:
-            rng: Generator of the start.
-            keyframe: Keyframe in place of the one in the settings.
-            seed: What determines the variation; None if nothing varies.
-            begin: Returns the positions in which a task starts, shape (nq,), given those that it may change.
+        `seed` determines what varies; `begin` lets a task choose the start, by positions of the shape (nq,).
         """
         client = self.client
         keyframe = self._settings.keyframe if keyframe is None else keyframe
@@ -176,14 +155,7 @@ class EnvEpisode:
     async def step(
         self, set_points: Floats, forces: Mapping[str, Floats], before: Floats, late_steps: int
     ) -> Observation:
-        """Apply set-points for `n_substeps` and return the observation after them.
-
-        Args:
-            set_points: Set-points of all articulations, shape (n_actions,).
-            forces: Forces on bodies meanwhile, N, world frame, shape (3,).
-            before: Set-points that are in force during the first `late_steps` physics steps.
-            late_steps: Number of these steps, less than `n_substeps`.
-        """
+        """Apply set-points for `n_substeps` and return the observation after them; see `Applied`."""
         if late_steps:
             await self._apply(before, forces, late_steps, {})
         cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}

@@ -369,11 +369,7 @@ class EpisodeEnd:
 
 
 def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools]:
-    """Return the rewards and the terminations, checked.
-
-    Raises:
-        ValueError: A method of the task returned the wrong shape, or NaN or infinity.
-    """
+    """Return the rewards and the terminations; refuse wrong shapes, NaN and infinity."""
     rewards = _answer(task, "reward", task.reward(states, actions), len(states)).astype(np.float64)
     if not np.isfinite(rewards).all():
         first = int(np.flatnonzero(~np.isfinite(rewards))[0])
@@ -384,21 +380,13 @@ def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools]:
 
 
 def succeeded(task: Task, states: States) -> Bools | None:
-    """Return which states are a success, shape (n,), or None if the task defines none.
-
-    Raises:
-        ValueError: The task returned the wrong shape.
-    """
+    """Return which states are a success, shape (n,), or None if the task defines none."""
     success = task.success(states)
     return None if success is None else _answer(task, "success", success, len(states)).astype(bool)
 
 
 def observed(task: Task, states: States) -> Floats:
-    """Return what a task observes, shape (n, n_observed).
-
-    Raises:
-        ValueError: The task returned another number of values.
-    """
+    """Return what a task observes, shape (n, n_observed)."""
     found = np.asarray(task.observe(states))
     if found.shape[-1:] != (task.n_observed,):
         raise ValueError(
@@ -419,11 +407,7 @@ def _answer(task: Task, hook: str, answer: Any, n: int) -> NDArray[Any]:
 
 
 def check_spelling(task: Task) -> None:
-    """Check that the hooks and attributes of a task are the ones that environments use.
-
-    Raises:
-        ValueError: A name is nearly that of a hook or attribute, or a hook takes other arguments.
-    """
+    """Refuse a name that is nearly that of a hook or attribute of `Task`, and a hook that takes other arguments."""
     kind = type(task)
     own = {name for one in kind.__mro__ if issubclass(one, Task) and one is not Task for name in vars(one)}
     for name in sorted(own | vars(task).keys()):
