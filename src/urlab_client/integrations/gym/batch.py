@@ -14,19 +14,17 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import batch_class, spans
-from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import ControllerKind
-from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
-from urlab_client.integrations.gym.episode import rendered_camera, space_mapping
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
-from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
-from urlab_client.integrations.gym.spaces import Field, Observation, with_cameras
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
+from urlab_client.integrations.gym.spaces import Field, Observation
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
+from urlab_client.randomise.variation import EpisodeDraws, Variation
 from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
 from urlab_client.sync._facade import aio_of
@@ -93,33 +91,21 @@ class URLabBatchEnv(Vectorized):
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
             raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
         settings = EpisodeSettings(**options)
-        address = with_model_options(address)
-        with URLabClient(address, **client_defaults(client_options)) as client:
+        with URLabClient(served_address(address, None), **client_defaults(client_options)) as client:
             client.discover()
-            model = client.model
-            if model is None or not client.articulations:
-                raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
-            self._rendered = rendered_camera(aio_of(client), settings)
+            first = EnvEpisode(aio_of(client), settings=settings)
+            model, mapping, self._rendered = first.model, first.mapping, first.rendered_camera
             drawn = [*settings.cameras, *([self._rendered] if self._rendered else [])]
             self._scene = PictureScene.of(aio_of(client), model, drawn)
-            mapping = space_mapping(aio_of(client), model, settings)
             self._controllers = {
                 key: _controller(model, mapping.layout(key), str(found.kind), found.params)
                 for key, articulation in client.articulations.items()
                 if (found := articulation.controller)
             }
             self._target_type = np.float64 if client.server.features.exact_controls else np.float32
-        declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
-        super().__init__(
-            num_envs=num_envs,
-            model=model,
-            settings=settings,
-            mapping=mapping,
-            observation_space=with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}),
-            autoreset_mode=autoreset_mode,
-            randomise=declared,
-        )
-        self.model = model
+        declared = first.randomise if randomise is None else Randomisation.of(randomise)
+        super().__init__(first, num_envs, autoreset_mode, declared)
+        self.model: mujoco.MjModel = model
         self._pictures = BatchPictures(
             self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
         )

@@ -38,11 +38,11 @@ from urlab_client.values.names import NameMap
 class _Alone(OverWire):
     """A vector environment of one, over a client that it is given."""
 
-    def __init__(self, episode: EnvEpisode, settings: EpisodeSettings, portal: Portal) -> None:
-        super().__init__(episode, 1, settings, AutoresetMode.DISABLED)
+    def __init__(self, episode: EnvEpisode, portal: Portal) -> None:
+        super().__init__(episode, 1, AutoresetMode.DISABLED)
         self.episode = episode
         self._portal = portal
-        reward_fn, termination_fn = settings.reward_fn, settings.termination_fn
+        reward_fn, termination_fn = self.reward_fn, self.termination_fn
         if reward_fn is not None:
             self.reward_fn = lambda before, action, after, infos: [
                 reward_fn(of_one(before), of_one(action), of_one(after), info_of(infos))
@@ -116,7 +116,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         settings = EpisodeSettings(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
         episode = EnvEpisode(aio_of(client), settings=settings, randomise=declared)
-        self._alone = _Alone(episode, settings, portal_of(client))
+        self._alone = _Alone(episode, portal_of(client))
         self.client = client
         self.task: Task | None = settings.task
         self.randomise: Randomisation | None = episode.randomise

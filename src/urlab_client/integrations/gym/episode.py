@@ -46,8 +46,10 @@ class EnvEpisode:
     Attributes:
         client: The client.
         model: Its model.
+        settings: Settings of the episodes.
         mapping: Its articulations as spaces.
         observation_space: The space of the observed fields and pictures.
+        rendered_camera: The camera that `render` shows, or None.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
     """
@@ -74,15 +76,15 @@ class EnvEpisode:
             )
         self.client = client
         self.model: mujoco.MjModel = model
-        self._settings = settings
-        self.mapping: SpaceMapping = space_mapping(client, model, settings)
+        self.settings = settings
+        self.mapping: SpaceMapping = _space_mapping(client, model, settings)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._sensors = {key: [*layout.sensors] for key, layout in layouts.items()}
         minimal = set(settings.fields) <= set(LEVELS["minimal"])
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
-        self._rendered = rendered_camera(client, settings)
+        self.rendered_camera: str | None = _rendered_camera(client, settings)
         self._cameras = {
-            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self._rendered))
+            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self.rendered_camera))
         }
         self._frames: dict[str, Pixels] = {}
         images = {
@@ -124,7 +126,7 @@ class EnvEpisode:
         `seed` determines what varies; `begin` lets a task choose the start, by positions of the shape (nq,).
         """
         client = self.client
-        keyframe = self._settings.keyframe if keyframe is None else keyframe
+        keyframe = self.settings.keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
         if self._variation is not None and seed is not None:
@@ -135,9 +137,9 @@ class EnvEpisode:
         qpos = np.array(self.state()[0])
         if self.over_wire is not None and self._draws is not None:
             self.over_wire.variation.start(self._draws, qpos)
-        if self._settings.reset_noise:
+        if self.settings.reset_noise:
             for key in self.mapping.keys:
-                self._settings.reset_noise.add(rng, self.model, self.mapping.scalar_joints(key, self.model), qpos)
+                self.settings.reset_noise.add(rng, self.model, self.mapping.scalar_joints(key, self.model), qpos)
         if begin is not None:
             qpos = begin(rng, qpos)
         await self._place(qpos)
@@ -159,7 +161,7 @@ class EnvEpisode:
         if late_steps:
             await self._apply(before, forces, late_steps, {})
         cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
-        await self._apply(set_points, forces, self._settings.n_substeps - late_steps, cameras)
+        await self._apply(set_points, forces, self.settings.n_substeps - late_steps, cameras)
         self._take_frames()
         return self._observe()
 
@@ -232,16 +234,20 @@ class EnvEpisode:
     def _observe(self) -> Observation:
         """Return the current observation, without what a task adds."""
         observation = self.mapping.observe(self._read)
-        if self._settings.cameras:
+        if self.settings.cameras:
             observation["cameras"] = {
-                name: observed_pixels(self._frames[name], self._cameras[name].mode) for name in self._settings.cameras
+                name: observed_pixels(self._frames[name], self._cameras[name].mode) for name in self.settings.cameras
             }
         return observation
 
     def rendered(self) -> NDArray[np.uint8] | None:
         """Return the last picture for `render`, shape (H, W, 3), RGB; None if there is none yet."""
-        frame = self._frames.get(self._rendered or "")
-        return None if frame is None or self._rendered is None else to_rgb(frame, self._cameras[self._rendered].mode)
+        frame = self._frames.get(self.rendered_camera or "")
+        return (
+            None
+            if frame is None or self.rendered_camera is None
+            else to_rgb(frame, self._cameras[self.rendered_camera].mode)
+        )
 
     def _read(self, key: str, field: Field) -> Floats:
         articulation = self.client.articulations[key]
@@ -273,7 +279,7 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
     return randomise
 
 
-def space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
+def _space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
     """Return the articulations of a discovered client as the spaces of an environment."""
     prefixes = compiled_prefixes(client)
     controlled = {
@@ -300,7 +306,7 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     return client.global_cameras[name]
 
 
-def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
+def _rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
     """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
     if settings.render_mode is None:
         return None

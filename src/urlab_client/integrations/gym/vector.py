@@ -31,16 +31,8 @@ from urlab_client.sync._portal import Portal
 class OverWire(Vectorized):
     """Environments that are each over a client of their own."""
 
-    def __init__(self, first: EnvEpisode, num_envs: int, settings: EpisodeSettings, autoreset_mode: AutoresetMode):
-        super().__init__(
-            num_envs=num_envs,
-            model=first.model,
-            settings=settings,
-            mapping=first.mapping,
-            observation_space=first.observation_space,
-            autoreset_mode=autoreset_mode,
-            randomise=first.randomise,
-        )
+    def __init__(self, first: EnvEpisode, num_envs: int, autoreset_mode: AutoresetMode) -> None:
+        super().__init__(first, num_envs, autoreset_mode, first.randomise)
         self._qpos = np.tile(first.model.qpos0, (num_envs, 1))
         self._qvel = np.zeros((num_envs, first.model.nv))
         self._time = np.zeros(num_envs)
@@ -198,7 +190,7 @@ class URLabVectorEnv(OverWire):
         ]
         self._portal = Portal()
         try:
-            super().__init__(self._portal.call(self._open_all), len(addresses), settings, autoreset_mode)
+            super().__init__(self._portal.call(self._open_all), len(addresses), autoreset_mode)
         except BaseException:
             self._portal.close(self._close_all)
             raise

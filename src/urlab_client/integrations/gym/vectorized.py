@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
@@ -15,7 +14,8 @@ from numpy.typing import NDArray
 
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
-from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
+from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
 from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, observed, succeeded, with_task
 from urlab_client.randomise.declaration import Randomisation
@@ -72,18 +72,11 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     single_action_space: Space
 
     def __init__(
-        self,
-        *,
-        num_envs: int,
-        model: mujoco.MjModel,
-        settings: EpisodeSettings,
-        mapping: SpaceMapping,
-        observation_space: Space,
-        autoreset_mode: AutoresetMode,
-        randomise: Randomisation | None,
+        self, first: EnvEpisode, num_envs: int, autoreset_mode: AutoresetMode, randomise: Randomisation | None
     ) -> None:
-        """Set up the task and the arrays; `observation_space` is that of one environment, without the task's part."""
-        self.mapping = mapping
+        """Set up the task, and arrays for environments like that of `first`."""
+        settings = first.settings
+        mapping = self.mapping = first.mapping
         self.randomise = randomise
         self.task: Task | None = settings.task
         self.reward_fn: RewardFn | None = settings.reward_fn
@@ -100,7 +93,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.num_envs = num_envs
         self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space = with_task(observation_space, self.task)
+        self.single_observation_space = with_task(first.observation_space, self.task)
         self.single_action_space = mapping.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(mapping.action_space, num_envs)
@@ -127,7 +120,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._all.flags.writeable = False
         self.rngs: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
         self._recent: States | None = None
-        self._memory = settings.memory(model, mapping, num_envs)
+        self._memory = settings.memory(first.model, mapping, num_envs)
 
     @abstractmethod
     def _advance(
