@@ -45,7 +45,7 @@ class Disturbances:
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int, n_substeps: int) -> None:
-        self.seed = -1
+        self.seed: int = -1
         self.late_steps: int = 0
         self._n_substeps = n_substeps
         self._declaration = declaration

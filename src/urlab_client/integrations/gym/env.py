@@ -122,7 +122,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self.randomise: Randomisation | None = episode.randomise
         self.reward_fn: RewardFn | None = settings.reward_fn
         self.termination_fn: TerminationFn | None = settings.termination_fn
-        self.render_mode = settings.render_mode
+        self.render_mode: str | None = settings.render_mode
         self.action_space: gymnasium.Space[Any] = self._alone.single_action_space
         self.observation_space: gymnasium.Space[Any] = self._alone.single_observation_space
         self.metadata = {

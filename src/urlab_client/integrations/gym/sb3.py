@@ -64,7 +64,7 @@ class Sb3VecEnv(_VecEnv):
         observations, infos = self.env.reset(seed=list(self._seeds))
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [info_of(infos, i) for i in range(self.env.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [info_of(infos, i) for i in range(self.env.num_envs)]
         return observations
 
     def step_async(self, actions: Any) -> None:
