@@ -199,7 +199,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
         errors = self._move(fresh, self._keyframe, acting, flat)
         infos = self._infos(errors)
-        stepped = ~resetting
+        stepped = np.zeros(self.num_envs, dtype=bool)
+        stepped[acting] = True
         stepped[list(errors)] = False
         rewards, terminated = self._judged(before, actions, stepped, infos)
         truncated = np.zeros(self.num_envs, dtype=bool)
@@ -252,9 +253,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self._observations_disturbed:
             for i, disturbances in self._disturbed(moved):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
-        self._elapsed[fresh], self._totals[fresh] = 0, 0.0
+        if len(fresh):
+            self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
         self._elapsed[acting] += 1
-        self._ended[fresh] = False
         self._begun[moved] = True
         self._ended[list(errors)] = True
         return errors
@@ -343,11 +344,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _applied(self, indices: Indices, set_points: Floats) -> Applied:
         """Return what takes effect now in some environments, which may be pushed, and whose actions may be delayed."""
-        applied = Applied(set_points, set_points.copy(), np.zeros(self.num_envs, dtype=np.intp), {})
+        delayed = self.randomise is not None and self.randomise.delays_actions
+        before = set_points.copy() if delayed else set_points
+        applied = Applied(set_points, before, np.zeros(self.num_envs, dtype=np.intp), {})
         for i, disturbances in self._disturbed(indices):
             if pushes := disturbances.forces():
                 applied.forces[i] = pushes
-            if self.randomise is not None and self.randomise.delays_actions:
+            if delayed:
                 applied.before[i], applied.set_points[i] = disturbances.delayed(set_points[i])
                 applied.late[i] = disturbances.late_steps
         return applied
