@@ -280,7 +280,7 @@ class URLabVectorEnv(OverWire):
             except Exception as error:  # noqa: BLE001 - reported in `infos`
                 error.add_note(f"environment {i} at {self._addresses[i]}")
                 errors[i] = error
-        for i, error in errors.items():
-            if not refused_for_good(error):
+        for i, failure in errors.items():
+            if not refused_for_good(failure):
                 self._sessions[i].reopen()
         return errors
