@@ -46,7 +46,7 @@ AWAITED = {
     "web/file_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
     "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
     "integrations/forwarding.py:until_first": "the task group of one connection, which ends with the error",
-    "integrations/gym/vector.py:_all": "waits for all tasks; the caller gets each result or error",
+    "integrations/gym/vector.py:_move_all": "waits for all tasks; the caller gets each result or error",
     "integrations/gym/engines.py:__init__": "a pool, whose results the caller reads",
     "cli/mcp.py:_serve_stdio_and_console": "waits for the task and raises its error",
     "cli/mcp.py:_serve_unless_start_fails": "waits for both tasks, and raises or returns the error of the first",

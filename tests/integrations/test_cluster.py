@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import secrets
@@ -18,7 +17,6 @@ from typing import Any
 import anyio.to_thread
 import numpy as np
 import pytest
-from waiting import DEADLINE_S, until
 
 from urlab_client import URLabClient
 from urlab_client.errors import LeaseBusy
@@ -278,12 +276,12 @@ def test_an_episode_whose_server_died_runs_again_on_a_new_one(cluster: Any, tmp_
 
 
 def test_a_worker_keeps_its_server_for_equal_episodes_and_not_beyond_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    from urlab_client.cluster.episodes import Job, Setup, Worker
+    from urlab_client.cluster.episodes import Job, Worker, setup_of
     from urlab_client.errors import ConnectionLost, UnknownActor
 
     monkeypatch.setattr(Worker, "node_id", lambda _: "here")
-    job = Job(id=3, seed=1, scene="sim://arm", attempt=2, holder="", leases=None)
-    setup, other = (Setup.of({"max_episode_steps": steps}, {}, lease_timeout=1.0) for steps in (2, 3))
+    job = Job(id=3, seed=1, scene="sim://arm", attempt=2)
+    setup, other = (setup_of({"max_episode_steps": steps}, {}) for steps in (2, 3))
     worker = Worker()
 
     def steps(setup: Any = setup, error: Exception | None = None) -> Any:
@@ -314,40 +312,27 @@ def test_a_worker_keeps_its_server_for_equal_episodes_and_not_beyond_a_failure(m
         worker.close()
 
 
-async def test_addresses_pass_from_holder_to_holder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_addresses_pass_from_holder_to_holder(monkeypatch: pytest.MonkeyPatch) -> None:
     from urlab_client.cluster import leases
 
     now = 100.0
     monkeypatch.setattr(leases, "time", SimpleNamespace(monotonic=lambda: now))
     book = leases.Book(["a", "b"], ttl=30.0)
-    assert [await book.take(holder, 60.0) for holder in ("one", "two")] == ["a", "b"]
-    assert await book.take("late", 0.0) is None
-    third, fourth = (asyncio.create_task(book.take(holder, 60.0)) for holder in ("three", "four"))
-    await until(lambda: book._waiting == {"three", "four"})
-    await book.give_back("one")
-    assert await third == "a"
-    await book.give_back("four")
-    assert await fourth is None, "nobody waits for one that is ended"
-    assert await book.holders() == {"a": "three", "b": "two"}
+    assert [book.take(holder) for holder in ("one", "two", "late")] == ["a", "b", None]
+    book.give_back("one")
+    assert book.take("three") == "a"
+    assert book.holders() == {"a": "three", "b": "two"}
     now = 125.0
-    assert await book.renew("three")
+    assert book.renew("three")
     now = 130.0
-    assert await book.holders() == {"a": "three", "b": None}
-    assert not await book.renew("two")
-    assert await book.take("five", 60.0) == "b"
-    await book.give_back("two")
-    assert await book.holders() == {"a": "three", "b": "five"}, "what an earlier holder gives back is no longer its own"
-    assert await book.server_lease("a") is None
-    await book.note_server_lease("a", "first")
-    await book.note_server_lease("a", "second")
-    assert (await book.server_lease("a"), await book.server_lease("b")) == ("second", None)
-
-
-async def test_an_address_whose_lease_expires_goes_to_whoever_waits() -> None:
-    from urlab_client.cluster.leases import Book
-
-    book = Book(["a"], ttl=0.02)
-    assert [await book.take(holder, DEADLINE_S) for holder in ("one", "two")] == ["a", "a"]
+    assert book.holders() == {"a": "three", "b": None}
+    assert not book.renew("two")
+    assert book.take("five") == "b", "it goes to whoever waits"
+    book.give_back("two")
+    assert book.holders() == {"a": "three", "b": "five"}, "what an earlier holder gives back is no longer its own"
+    assert book.server_lease("a") is None
+    assert [book.server_lease("a", lease) for lease in ("first", "second")] == ["first", "second"]
+    assert (book.server_lease("a"), book.server_lease("b")) == ("second", None)
 
 
 def test_a_cluster_that_cannot_place_a_worker_is_not_waited_for(cluster: Any) -> None:

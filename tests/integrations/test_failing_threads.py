@@ -150,7 +150,7 @@ def test_the_restart_of_an_environment(caplog: pytest.LogCaptureFixture, monkeyp
             session = envs._sessions[0]
             with monkeypatch.context() as patch:
                 patch.setattr(session, "open", fail)
-                patch.setattr(session, "step", lose)
+                patch.setattr(session.episode, "step", lose)
                 infos = envs.step(envs.action_space.sample())[4]
                 assert "gone" in str(infos["error"][0])
                 eventually(lambda: logged(caplog, "urlab-environment"))

@@ -184,8 +184,8 @@ def test_rewards_terminations_and_truncation_come_from_the_users_functions(make_
     action = np.zeros(env.action_space.shape)
     first = env.step(action)
     assert first[1:4] == (1.0, False, False)
-    assert seen[0][0] is start
-    assert seen[0][2] is first[0]
+    assert np.array_equal(seen[0][0], start)
+    assert np.array_equal(seen[0][2], first[0])
     assert env.step(action)[1:4] == (2.0, False, True)
     assert env.step(action)[1:4] == (3.0, True, True)
 

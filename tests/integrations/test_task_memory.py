@@ -103,6 +103,8 @@ def test_what_a_task_keeps_is_the_same_on_servers_and_in_a_batch_and_reset_with_
         for a, b in zip(ours[:4], theirs[:4], strict=True):
             assert np.array_equal(a, b)
         over = step % (5 if mode is AutoresetMode.NEXT_STEP else 4) == 0
+        if over and mode is AutoresetMode.NEXT_STEP:
+            assert not theirs[1].any(), "a reset earns nothing"
         up = np.array([0.0, 10.0]) if over else up + (actions[:, 0] > 0)
         assert theirs[0][:, -4].tolist() == up.tolist()
         chosen = np.zeros(2) if over else actions[:, 0].astype(np.float64)

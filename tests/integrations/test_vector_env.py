@@ -267,7 +267,7 @@ def test_no_more_servers_start_at_once_than_there_are_processors(
             starting -= 1
 
     monkeypatch.setattr(LaunchedTransport, "_launch", counted)
-    monkeypatch.setattr("urlab_client.integrations.gym.vector._processors", lambda: 1)
+    monkeypatch.setattr("urlab_client.integrations.gym.vector.processor_count", lambda: 1)
     env = URLabVectorEnv("sim://ball", 2, start_timeout=120.0)
     made.append(env)
     assert most == 1

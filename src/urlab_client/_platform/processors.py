@@ -37,8 +37,12 @@ def crowded() -> bool:
 def _ask() -> bool:
     if not hasattr(os, "getloadavg"):
         return False
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return os.getloadavg()[0] > _CROWDED_LOAD * processors
+    return os.getloadavg()[0] > _CROWDED_LOAD * processor_count()
+
+
+def processor_count() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def no_fence() -> None:

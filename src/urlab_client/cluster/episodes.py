@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.cluster.leases import Lease, LeasePool
+from urlab_client.cluster.leases import LeasePool
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.env import URLabEnv
+from urlab_client.integrations.gym.spaces import mapped
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 
@@ -79,31 +80,26 @@ class Episode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One attempt at one episode; `holder` names it in the lease pool."""
+    """One attempt at one episode of a run."""
 
     id: int
     seed: int
     scene: str
-    attempt: int
-    holder: str
-    leases: LeasePool | None
+    attempt: int = 1
+    run: str = ""
+    leases: LeasePool | None = None
+    lease_timeout: float = 0.0
+
+    @property
+    def holder(self) -> str:
+        """Name of the attempt in the lease pool."""
+        return f"{self.run}/{self.id}/{self.attempt}"
 
 
-@dataclass(frozen=True, slots=True)
-class Setup:
-    """Configuration of the environments of a run; `key` is equal for equal options, whose environments are reused."""
-
-    key: str
-    env_options: Mapping[str, Any]
-    client_options: Mapping[str, Any]
-    lease_timeout: float
-
-    @classmethod
-    def of(cls, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> Self:
-        """Build the configuration."""
-        options = dict(env_options), dict(client_options)
-        # Ray's pickle also serialises functions by value.
-        return cls(hashlib.sha256(_ray.cloudpickle.dumps(options)).hexdigest(), *options, lease_timeout)
+def setup_of(env_options: Mapping[str, Any], client_options: Mapping[str, Any]) -> bytes:
+    """Return the configuration of the environments of a run; for equal options, environments are reused."""
+    # Ray's pickle also serialises functions by value.
+    return _ray.cloudpickle.dumps((dict(env_options), dict(client_options)))
 
 
 def seed_of(seed: int, episode: int) -> int:
@@ -118,53 +114,43 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._made_for = ("", "")  # address and key of the setup
+        self._made_for = ("", b"")  # address and setup
         self._env: URLabEnv | None = None
 
     def node_id(self) -> str:
         """Return Ray's id of this node; the answer shows that the worker is up."""
         return str(_ray.get_runtime_context().get_node_id())
 
-    def run(self, policy: Policy, setup: Setup, job: Job) -> Episode:
+    def run(self, policy: Policy, setup: bytes, job: Job) -> Episode:
         """Run one attempt of an episode."""
+        started, clock = time.time(), time.perf_counter()
         try:
-            if job.leases is None:
-                return self._run(policy, setup, job, None)
-            with job.leases.lease(job.holder, timeout=setup.lease_timeout) as lease:
-                try:
-                    env = self._environment(lease.address, setup)
-                    with lease.of_server(env.client):
-                        return self._run(policy, setup, job, lease)
-                finally:
-                    self.close()  # before another holder gets the address
+            with ExitStack() as leased:
+                address, keep = job.scene, None
+                if job.leases is not None:
+                    lease = leased.enter_context(job.leases.lease(job.holder, timeout=job.lease_timeout))
+                    address, keep = lease.address, lease.keep
+                    leased.callback(self.close)  # before another holder gets the address
+                    leased.enter_context(lease.of_server(self._environment(address, setup).client))
+                env = self._environment(address, setup)
+                rng = np.random.default_rng([job.seed, 1])
+                observation, info = env.reset(seed=job.seed)
+                setting_up = time.perf_counter() - clock
+                observations, actions, rewards = [observation], list[Any](), list[float]()
+                terminated = truncated = False
+                while not (terminated or truncated):
+                    if keep is not None:
+                        keep()
+                    # A copy, because a policy may reuse its array.
+                    action = mapped(lambda values: np.array(values, dtype=np.float32), policy(observation, rng))
+                    observation, reward, terminated, truncated, info = env.step(action)
+                    observations.append(observation)
+                    actions.append(action)
+                    rewards.append(reward)
         except BaseException as error:
             if not refused_for_good(error):
                 self.close()  # the next attempt starts from scratch
             raise
-
-    def close(self) -> None:
-        """Stop the simulated server. Idempotent."""
-        env, self._env = self._env, None
-        if env is not None:
-            env.close()
-
-    def _run(self, policy: Policy, setup: Setup, job: Job, lease: Lease | None) -> Episode:
-        started, clock = time.time(), time.perf_counter()
-        address = job.scene if lease is None else lease.address
-        env = self._environment(address, setup)
-        rng = np.random.default_rng([job.seed, 1])
-        observation, info = env.reset(seed=job.seed)
-        setting_up = time.perf_counter() - clock
-        observations, actions, rewards = [observation], list[Any](), list[float]()
-        terminated = truncated = False
-        while not (terminated or truncated):
-            if lease is not None:
-                lease.keep()
-            action = _float32(policy(observation, rng))
-            observation, reward, terminated, truncated, info = env.step(action)
-            observations.append(observation)
-            actions.append(action)
-            rewards.append(float(reward))
         return Episode(
             id=job.id,
             seed=job.seed,
@@ -176,30 +162,28 @@ class Worker:
             observations=_stacked(observations),
             actions=_stacked(actions),
             rewards=np.array(rewards),
-            terminated=bool(terminated),
-            truncated=bool(truncated),
+            terminated=terminated,
+            truncated=truncated,
             success=info.get("success"),
-            sim_time=float(info["sim_time"]),
+            sim_time=info["sim_time"],
             started=started,
             setup=setting_up,
             duration=time.perf_counter() - clock,
         )
 
-    def _environment(self, address: str, setup: Setup) -> URLabEnv:
-        wanted = (address, setup.key)
-        if self._env is not None and self._made_for == wanted:
-            return self._env
-        self.close()
-        self._env = URLabEnv.connect(address, client_options=setup.client_options, **setup.env_options)
-        self._made_for = wanted
+    def close(self) -> None:
+        """Stop the simulated server. Idempotent."""
+        env, self._env = self._env, None
+        if env is not None:
+            env.close()
+
+    def _environment(self, address: str, setup: bytes) -> URLabEnv:
+        if self._env is None or self._made_for != (address, setup):
+            self.close()
+            env_options, client_options = _ray.cloudpickle.loads(setup)
+            self._env = URLabEnv.connect(address, client_options=client_options, **env_options)
+            self._made_for = address, setup
         return self._env
-
-
-def _float32(action: Any) -> Any:
-    if isinstance(action, Mapping):
-        given = cast("Mapping[str, Any]", action)
-        return {key: _float32(value) for key, value in given.items()}
-    return np.array(action, dtype=np.float32)  # a copy, because a policy may reuse its array
 
 
 def _stacked(rows: Sequence[Any]) -> Any:
@@ -240,10 +224,9 @@ def run_episode(
     Raises:
         URLabError: The server failed.
     """
-    setup = Setup.of({**env_options, "max_episode_steps": max_episode_steps}, client_options, lease_timeout=0.0)
     worker = Worker()
-    job = Job(id=episode, seed=seed_of(seed, episode), scene=scene, attempt=1, holder="", leases=None)
+    setup = setup_of({**env_options, "max_episode_steps": max_episode_steps}, client_options)
     try:
-        return worker.run(policy, setup, job)
+        return worker.run(policy, setup, Job(id=episode, seed=seed_of(seed, episode), scene=scene))
     finally:
         worker.close()

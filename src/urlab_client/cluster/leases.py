@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,6 +13,7 @@ from urlab_client.sync.client import URLabClient
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 _REPLY_S: Final = 10.0
+_POLL_S: Final = 0.1  # how often whoever waits for a free address asks
 _SERVER_LEASE_S: Final = 30.0  # without a request
 
 
@@ -22,74 +22,40 @@ class LeaseLost(URLabError):
 
 
 class Book:
-    """The leases and their holders. Runs as an asynchronous actor, so its methods never run in parallel."""
+    """The leases, by address, and their holders. Runs as an actor."""
 
     def __init__(self, addresses: Sequence[str], ttl: float) -> None:
         self._ttl = ttl
-        self._holders: dict[str, tuple[str, float] | None] = dict.fromkeys(addresses)
-        self._waiting: set[str] = set()
+        self._leases: dict[str, tuple[str, float] | None] = dict.fromkeys(addresses)
         self._server_leases: dict[str, str] = {}
-        self._changed = asyncio.Condition()
 
-    async def take(self, holder: str, timeout: float) -> str | None:
-        """Lease a free address, waiting for one; None after `timeout` seconds or if the holder was released."""
-        deadline = time.monotonic() + timeout
-        self._waiting.add(holder)
-        try:
-            async with self._changed:
-                while holder in self._waiting:
-                    self._expire()
-                    for address, lease in self._holders.items():
-                        if lease is None:
-                            self._holders[address] = (holder, time.monotonic() + self._ttl)
-                            return address
-                    ends = min([deadline, *(lease[1] for lease in self._holders.values() if lease)])
-                    if time.monotonic() >= deadline:
-                        return None
-                    try:
-                        await asyncio.wait_for(self._changed.wait(), max(ends - time.monotonic(), 0.0))
-                    except TimeoutError:
-                        continue  # a lease expired, or the timeout did
-                return None
-        finally:
-            self._waiting.discard(holder)
+    def take(self, holder: str) -> str | None:
+        """Lease a free address; None if there is none."""
+        address = next((each for each, by in self.holders().items() if by is None), None)
+        if address is not None:
+            self._leases[address] = (holder, time.monotonic() + self._ttl)
+        return address
 
-    async def renew(self, holder: str) -> bool:
+    def renew(self, holder: str) -> bool:
         """Renew a lease; False if it has expired."""
-        self._expire()
-        for address, lease in self._holders.items():
-            if lease is not None and lease[0] == holder:
-                self._holders[address] = (holder, time.monotonic() + self._ttl)
-                return True
-        return False
+        held = [address for address, by in self.holders().items() if by == holder]
+        self._leases.update(dict.fromkeys(held, (holder, time.monotonic() + self._ttl)))
+        return bool(held)
 
-    async def give_back(self, holder: str) -> None:
-        """Release the lease of a holder and end its wait; no effect if it has none."""
-        async with self._changed:
-            self._waiting.discard(holder)
-            for address, lease in self._holders.items():
-                if lease is not None and lease[0] == holder:
-                    self._holders[address] = None
-            self._changed.notify_all()
+    def give_back(self, holder: str) -> None:
+        """Release the lease of a holder; no effect if it has none."""
+        self._leases.update({address: None for address, by in self.holders().items() if by == holder})
 
-    async def note_server_lease(self, address: str, lease_id: str) -> None:
-        """Store the lease that a holder acquired from the server itself."""
-        self._server_leases[address] = lease_id
-
-    async def server_lease(self, address: str) -> str | None:
-        """Return the latest lease that a holder acquired from the server itself."""
+    def server_lease(self, address: str, acquired: str | None = None) -> str | None:
+        """Return the latest lease that a holder acquired from the server itself, after noting a new one."""
+        if acquired is not None:
+            self._server_leases[address] = acquired
         return self._server_leases.get(address)
 
-    async def holders(self) -> dict[str, str | None]:
+    def holders(self) -> dict[str, str | None]:
         """Return the holder of each address; None if it is free."""
-        self._expire()
-        return {address: lease and lease[0] for address, lease in self._holders.items()}
-
-    def _expire(self) -> None:
         now = time.monotonic()
-        for address, lease in self._holders.items():
-            if lease is not None and lease[1] <= now:
-                self._holders[address] = None
+        return {address: lease[0] if lease and lease[1] > now else None for address, lease in self._leases.items()}
 
 
 class Lease:
@@ -115,7 +81,7 @@ class Lease:
         now = time.monotonic()
         if now - self._renewed < self._ttl / 3:
             return
-        if not _ask(self._book.renew.remote(self._holder), _REPLY_S):
+        if not _ask(self._book.renew.remote(self._holder)):
             raise LeaseLost(f"The lease of {self.address} expired.", hint="Give the pool a longer ttl.")
         self._renewed = now
 
@@ -135,14 +101,14 @@ class Lease:
         try:
             lease_id = client.farm.acquire_lease(self._holder, ttl_s=_SERVER_LEASE_S)
         except LeaseBusy as busy:
-            if not busy.lease_id or busy.lease_id != _ask(self._book.server_lease.remote(self.address), _REPLY_S):
+            if not busy.lease_id or busy.lease_id != _ask(self._book.server_lease.remote(self.address)):
                 raise
             client.farm.release_lease(busy.lease_id)
             lease_id = client.farm.acquire_lease(self._holder, ttl_s=_SERVER_LEASE_S)
             for articulation in client.articulations.values():
                 articulation.claim(force=True)
         try:
-            _ask(self._book.note_server_lease.remote(self.address, lease_id), _REPLY_S)
+            _ask(self._book.server_lease.remote(self.address, lease_id))
             yield
         finally:
             with suppress(URLabError):  # if the server is gone, or after a long pause, so is the lease
@@ -196,15 +162,17 @@ class LeasePool:
         Raises:
             LeaseLost: No address was free in time, or the pool is gone.
         """
-        address = _ask(self._book.take.remote(holder, timeout), timeout + _REPLY_S)
-        if address is None:
-            raise LeaseLost(f"No address of {self.name!r} was free within {timeout:g} s.")
+        deadline = time.monotonic() + timeout
+        while (address := _ask(self._book.take.remote(holder))) is None:
+            if time.monotonic() >= deadline:
+                raise LeaseLost(f"No address of {self.name!r} was free within {timeout:g} s.")
+            time.sleep(min(_POLL_S, timeout))
         try:
             yield Lease(self._book, holder, address, self._ttl)
         finally:
             with suppress(LeaseLost):  # if the pool is gone, so is the lease
                 # Waits, because a process that exits immediately would not send it.
-                _ask(self._book.give_back.remote(holder), _REPLY_S)
+                _ask(self._book.give_back.remote(holder))
 
     def give_back(self, holder: str) -> None:
         """Release the lease of a holder, without waiting for it."""
@@ -216,15 +184,15 @@ class LeasePool:
         Raises:
             LeaseLost: The pool is gone.
         """
-        return _ask(self._book.holders.remote(), _REPLY_S)
+        return _ask(self._book.holders.remote())
 
     def close(self) -> None:
         """Stop the actor; leases can no longer be renewed."""
         _ray.kill(self._book)
 
 
-def _ask(reply: Any, timeout: float) -> Any:
+def _ask(reply: Any) -> Any:
     try:
-        return _ray.get(reply, timeout=timeout)
+        return _ray.get(reply, timeout=_REPLY_S)
     except _ray.exceptions.RayError as error:
         raise LeaseLost(f"The lease pool does not answer: {type(error).__name__}.") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import uuid
 import weakref
@@ -10,12 +11,12 @@ from collections import deque
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, Final, Self
 
 import anyio.to_thread
 
-from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Setup, Worker, seed_of
+from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Worker, seed_of, setup_of
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.errors import URLabError, refused_for_good
 
@@ -60,9 +61,7 @@ class WorkerPool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     @property
@@ -70,51 +69,41 @@ class WorkerPool:
         """Number of idle workers."""
         return len(self._waiting)
 
-    def lend(self, run: object) -> list[Any]:
-        """Lend all workers to a run, which returns the remaining ones; used by `rollouts`."""
+    def lend(self, run: object) -> None:
+        """Serve a run alone, until it gives the workers back; used by `rollouts`."""
         if self._closed:
             raise URLabError("The worker pool is closed.", hint="Create a new one.")
-        if self._run is not None and self._run() is not None:
+        if self._run is not None and self._run() not in (None, run):
             raise URLabError("Another run is using the worker pool.", hint="Finish or close that run first.")
         self._run = weakref.ref(run)
-        lent, self._waiting = self._waiting, []
-        return lent
 
-    def start(self) -> Any:
-        """Start a worker for the run; used by `rollouts`."""
-        return self._actor.remote()
+    def start(self) -> tuple[Any, bool]:
+        """Return a worker for the run, and whether it comes from an earlier run; used by `rollouts`."""
+        return (self._waiting.pop(), True) if self._waiting else (self._actor.remote(), False)
 
-    def give_back(self, workers: Sequence[Any]) -> None:
+    def give_back(self, workers: Iterable[Any]) -> None:
         """Take back the workers of a finished run; used by `rollouts`."""
         self._run = None
+        self._waiting.extend(workers)
         if self._closed:
-            _end(workers)
-        else:
-            self._waiting.extend(workers)
+            self.close()
 
     def close(self) -> None:
         """End the workers and their servers; those of a current run end with it. Idempotent; does not wait."""
         self._closed = True
-        _end(self._waiting)
+        for worker in self._waiting:
+            _ray.kill(worker)
         self._waiting.clear()
 
 
-def _end(workers: Sequence[Any]) -> None:
-    for worker in workers:
-        _ray.kill(worker)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Running:
-    worker: Any
-    job: Job
-    deadline: float
+class _Busy:
+    """A worker that runs a job, or that starts."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Starting:
     worker: Any
-    kept: bool
+    job: Job | None = None
+    deadline: float = math.inf
+    kept: bool = False
     """Whether it comes from an earlier run; if it has died since, that is not a failure of this run."""
 
 
@@ -130,7 +119,7 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
     def __init__(
         self,
         policy: Policy,
-        setup: Setup,
+        setup: bytes,
         jobs: Sequence[Job],
         *,
         workers: WorkerPool,
@@ -149,18 +138,14 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         self._start_timeout = start_timeout
         self._workers = workers
         self._owns_workers = owns_workers
-        self._kept: list[Any] | None = None  # none borrowed yet
-        self._starting: dict[Any, _Starting] = {}
+        self._borrowed = False
+        self._busy: dict[Any, _Busy] = {}  # by the reply that ends it
         self._idle: list[Any] = []
-        self._running: dict[Any, _Running] = {}
         self._finished: deque[Episode] = deque()
         self._failed_starts = 0
         self._working_since = time.monotonic()
         self._reading = False
         self._closed = False
-
-    def __iter__(self) -> Self:
-        return self
 
     def __next__(self) -> Episode:
         while not self._finished:
@@ -168,9 +153,6 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
                 raise StopIteration
             self._turn()
         return self._finished.popleft()
-
-    def __aiter__(self) -> Self:
-        return self
 
     async def __anext__(self) -> Episode:
         while not self._finished:
@@ -183,17 +165,13 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -202,22 +180,23 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
             return
         self._closed = True
         self._todo.clear()
-        for running in self._running.values():
-            self._end(running.worker, running.job)
-        if self._kept is not None:
-            left = [*self._kept, *(each.worker for each in self._starting.values()), *self._idle]
-            self._workers.give_back(left)
-            self._kept = None
+        for busy in self._busy.values():
+            if busy.job is not None:
+                self._end(busy)
+        if self._borrowed:
+            self._workers.give_back([*self._idle, *(busy.worker for busy in self._busy.values() if busy.job is None)])
         if self._owns_workers:
             self._workers.close()
-        self._running.clear()
-        self._starting.clear()
+        self._busy.clear()
         self._idle.clear()
 
     def _over(self) -> bool:
-        if not self._closed and not self._todo and not self._running:
+        if not self._closed and not self._todo and not self._running():
             self.close()
         return self._closed
+
+    def _running(self) -> int:
+        return sum(busy.job is not None for busy in self._busy.values())
 
     def _turn(self) -> None:
         """Assign work, wait briefly for results, and handle failures."""
@@ -226,15 +205,12 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
         self._reading = True
         try:
             self._hand_out()
-            refs = [*self._running, *self._starting]
+            refs = [*self._busy]
             ready, _ = _ray.wait(refs, num_returns=len(refs), timeout=0)
             if not ready:
                 ready, _ = _ray.wait(refs, num_returns=1, timeout=_SLICE_S)
             for ref in ready:
-                if ref in self._starting:
-                    self._take_worker(ref)
-                else:
-                    self._take_result(ref)
+                self._take(ref, self._busy.pop(ref))
             self._look_at_clock()
         except BaseException:
             self.close()
@@ -243,62 +219,60 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
             self._reading = False
 
     def _hand_out(self) -> None:
-        if self._kept is None:
-            self._kept = self._workers.lend(self)
+        if not self._borrowed:
+            self._workers.lend(self)
+            self._borrowed = True
         while self._idle and self._todo:
             worker, job = self._idle.pop(), self._todo.popleft()
             ref = worker.run.remote(self._policy, self._setup, job)
-            self._running[ref] = _Running(worker, job, time.monotonic() + self._episode_timeout)
-        while self._todo and len(self._running) + len(self._starting) < min(
-            self._n_workers, len(self._running) + len(self._todo)
-        ):
-            kept = bool(self._kept)
-            worker = self._kept.pop() if kept else self._workers.start()
-            self._starting[worker.node_id.remote()] = _Starting(worker, kept)
+            self._busy[ref] = _Busy(worker, job, time.monotonic() + self._episode_timeout)
+        while self._todo and len(self._busy) < min(self._n_workers, self._running() + len(self._todo)):
+            worker, kept = self._workers.start()
+            self._busy[worker.node_id.remote()] = _Busy(worker, kept=kept)
 
-    def _take_worker(self, ref: Any) -> None:
-        starting = self._starting.pop(ref)
+    def _take(self, ref: Any, busy: _Busy) -> None:
+        """Take a result, or a worker that has started."""
         try:
-            _ray.get(ref, timeout=_FETCH_S)
+            found = _ray.get(ref, timeout=_FETCH_S)
         except _ray.exceptions.RayError as error:
-            self._end(starting.worker)
-            if starting.kept:
-                log.info("a worker ended since the last run: %s", error)
+            if busy.job is None:
+                self._end(busy)
+                self._failed_to_start(busy, error)
                 return
-            self._failed_starts += 1
-            log.warning("a worker did not start: %s", error)
-            if self._failed_starts > self._retries:
-                raise RolloutError(f"{self._failed_starts} workers in a row did not start.") from error
+            cause = error
+            if isinstance(error, _ray.exceptions.RayTaskError):
+                cause = error.cause if isinstance(error.cause, Exception) else error
+                self._idle.append(busy.worker)
+                if not isinstance(cause, URLabError) or refused_for_good(cause):
+                    # A policy that raises would raise again, and what was refused would be refused again.
+                    raise RolloutError(f"Episode {busy.job.id} raised {type(cause).__name__}: {cause}") from error
+            else:  # the worker, its node or the result is lost
+                self._end(busy)
+            self._again(busy.job, cause)
         else:
-            self._failed_starts = 0
-            self._idle.append(starting.worker)
+            self._idle.append(busy.worker)
+            if busy.job is None:
+                self._failed_starts = 0
+            else:
+                self._finished.append(found)
 
-    def _take_result(self, ref: Any) -> None:
-        running = self._running.pop(ref)
-        try:
-            episode: Episode = _ray.get(ref, timeout=_FETCH_S)
-        except _ray.exceptions.RayTaskError as error:
-            cause = error.cause if isinstance(error.cause, Exception) else error
-            self._idle.append(running.worker)
-            if not isinstance(cause, URLabError) or refused_for_good(cause):
-                # A policy that raises would raise again, and what was refused would be refused again.
-                raise RolloutError(f"Episode {running.job.id} raised {type(cause).__name__}: {cause}") from error
-            self._again(running.job, cause)
-        except _ray.exceptions.RayError as error:  # the worker, its node or the result is lost
-            self._end(running.worker, running.job)
-            self._again(running.job, error)
-        else:
-            self._idle.append(running.worker)
-            self._finished.append(episode)
+    def _failed_to_start(self, busy: _Busy, error: Exception) -> None:
+        if busy.kept:
+            log.info("a worker ended since the last run: %s", error)
+            return
+        self._failed_starts += 1
+        log.warning("a worker did not start: %s", error)
+        if self._failed_starts > self._retries:
+            raise RolloutError(f"{self._failed_starts} workers in a row did not start.") from error
 
     def _look_at_clock(self) -> None:
         now = time.monotonic()
-        for ref, running in list(self._running.items()):
-            if now > running.deadline:
-                del self._running[ref]
-                self._end(running.worker, running.job)
-                self._again(running.job, TimeoutError(f"not finished within {self._episode_timeout:g} s"))
-        if self._running or self._idle or not self._starting:
+        for ref, busy in list(self._busy.items()):
+            if busy.job is not None and now > busy.deadline:
+                del self._busy[ref]
+                self._end(busy)
+                self._again(busy.job, TimeoutError(f"not finished within {self._episode_timeout:g} s"))
+        if self._running() or self._idle or not self._busy:
             self._working_since = now
         elif now - self._working_since > self._start_timeout:
             raise RolloutError(
@@ -312,13 +286,12 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
                 f"Episode {job.id} failed {job.attempt} times, the last time with {type(error).__name__}: {error}"
             ) from error
         log.warning("episode %d, attempt %d: %s; it is run again", job.id, job.attempt, error)
-        holder = f"{job.holder.rpartition('/')[0]}/{job.attempt + 1}"
-        self._todo.appendleft(replace(job, attempt=job.attempt + 1, holder=holder))
+        self._todo.appendleft(replace(job, attempt=job.attempt + 1))
 
-    def _end(self, worker: Any, job: Job | None = None) -> None:
-        _ray.kill(worker)
-        if job is not None and job.leases is not None:
-            job.leases.give_back(job.holder)
+    def _end(self, busy: _Busy) -> None:
+        _ray.kill(busy.worker)
+        if busy.job is not None and busy.job.leases is not None:
+            busy.job.leases.give_back(busy.job.holder)
 
 
 def rollouts(
@@ -393,17 +366,16 @@ def rollouts(
             id=i,
             seed=seed_of(seed, i),
             scene=names[i * len(names) // n],
-            attempt=1,
-            holder=f"{run}/{i}/1",
+            run=run,
             leases=leases,
+            lease_timeout=lease_timeout,
         )
         for i in chosen
     ]
     most = pool.n_workers or (leases.size if leases else int(_ray.cluster_resources().get("CPU", 1)))
-    options = {**env_options, "max_episode_steps": max_episode_steps}
     return Rollouts(
         policy,
-        Setup.of(options, client_options, lease_timeout),
+        setup_of({**env_options, "max_episode_steps": max_episode_steps}, client_options),
         jobs,
         workers=pool,
         owns_workers=workers is None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,14 +38,6 @@ def wire_variation(client: URLabClient) -> WireVariation | None:
     return next((found for found in client.observers if isinstance(found, WireVariation)), None)
 
 
-@dataclass(frozen=True, eq=False)
-class _Controlled:
-    controller: URLabPDController
-    actuators: NDArray[np.intp]
-    gains: dict[str, dict[str, float]]
-    """Unvaried gains, by gain and actuator, in the order of `actuators`."""
-
-
 class WireVariation(ClientObserver):
     """Variation by ops around the reset that starts an episode, for a server that varies nothing itself.
 
@@ -56,7 +47,6 @@ class WireVariation(ClientObserver):
         declaration: What varies.
         draws: The values drawn for the current episode; None before the first.
         variation: The variation; it draws the same numbers as a server that varies its own scene.
-        controlled: Controllers whose gains vary, by articulation.
     """
 
     def __init__(
@@ -67,86 +57,73 @@ class WireVariation(ClientObserver):
         declared: Randomisation,
         earlier: WireVariation | None = None,
     ) -> None:
-        """Look up what varies.
+        """Look up what varies, and refuse what no op changes.
 
         `earlier` is the variation of an earlier session with the server, which may have left gravity and gains varied;
         if None, the current gravity and gains count as unvaried.
-
-        Raises:
-            UnsupportedRandomisation: No op changes one of the quantities.
-            ValueError: A name matches no element.
         """
+        from urlab_client.randomise.quantities import START, elements_of
         from urlab_client.randomise.variation import Variation, field_of
 
         self.declaration = declared
         self.draws: EpisodeDraws | None = None
-        controlled = controlled_actuators(client, layouts)
-        _check(client, model, declared, controlled)
+        controlled, prefixes = controlled_actuators(client, layouts), compiled_prefixes(client)
+
+        def settable(vary: Vary) -> bool:
+            if vary.what in ("kp", "kv"):
+                return controlled.issuperset(elements_of(vary, model, controlled, prefixes).ids.tolist())
+            return vary.what in START or vary.what == "gravity"
+
+        refused = [vary.what for vary in declared.vary if not settable(vary)]
+        if refused:
+            raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
         self.variation: Variation = (
-            Variation(declared, model, controlled, compiled_prefixes(client)) if earlier is None else earlier.variation
+            Variation(declared, model, controlled, prefixes) if earlier is None else earlier.variation
         )
         self._client = client
         if (before := wire_variation(client)) is not None:
             client.remove_observer(before)
         client.add_observer(self)
-        self._model_fields: dict[str, NDArray[Any]] = {
+        self._fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields
         }
-        self.controlled: dict[str, _Controlled] = {}
+        self._controllers: dict[str, tuple[URLabPDController, NDArray[np.intp]]] = {}
+        self._gains: dict[str, dict[str, dict[str, float]]] = {}  # unvaried, by articulation, gain and actuator
         for key, articulation in client.articulations.items() if self.variation.varied_gains else ():
             controller = articulation.controller
             if isinstance(controller, URLabPDController):
-                gains = {name: dict[str, float](controller.params[name]) for name in self.variation.varied_gains}
-                if earlier is not None and key in earlier.controlled:
-                    gains = earlier.controlled[key].gains
                 actuators = [layouts[key].actuators[name] for name in controller.kp]
-                self.controlled[key] = _Controlled(controller, np.array(actuators, dtype=np.intp), gains)
+                self._controllers[key] = controller, np.array(actuators, dtype=np.intp)
+                self._gains[key] = {name: dict(controller.params[name]) for name in self.variation.varied_gains}
+        if earlier is not None:
+            self._gains |= earlier._gains  # noqa: SLF001  # its own class
 
     async def apply(self, draws: EpisodeDraws) -> None:
         """Set the quantities that a reset does not change: gravity, and the gains of controllers."""
         self.draws = draws
-        if self._model_fields:
-            self.variation.write(draws, self._model_fields.__getitem__)
-            await self._set_gravity()
-        for each in self.controlled.values():
-            factors = self.variation.gain_factors(draws, each.actuators)
-            scaled = {
-                name: dict(zip(by, (np.array([*by.values()]) * factors[name]).tolist(), strict=True))
-                for name, by in each.gains.items()
-            }
-            await each.controller.set_gains(scaled.get("kp"), scaled.get("kv"))
+        self.variation.write(draws, self._fields.__getitem__)
+        await self._set(draws)
 
     async def undo(self) -> None:
         """Restore gravity and gains if an episode has varied them."""
         self._client.remove_observer(self)
-        if self.draws is None:
-            return
-        self.draws = None
-        if self._model_fields:
-            self.variation.restore(self._model_fields.__getitem__)
-            await self._set_gravity()
-        for each in self.controlled.values():
-            await each.controller.set_gains(each.gains.get("kp"), each.gains.get("kv"))
+        if self.draws is not None:
+            self.draws = None
+            self.variation.restore(self._fields.__getitem__)
+            await self._set(None)
 
-    async def _set_gravity(self) -> None:
-        gravity = self._model_fields.get("opt.gravity")
-        if gravity is not None:
-            await self._client.runtime.set_sim_options(gravity=gravity)
-
-
-def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
-    from urlab_client.randomise.quantities import START, elements_of
-
-    prefixes = compiled_prefixes(client)
-
-    def settable(vary: Vary) -> bool:
-        if vary.what in ("kp", "kv"):
-            return controlled.issuperset(elements_of(vary, model, controlled, prefixes).ids.tolist())
-        return vary.what in START or vary.what == "gravity"
-
-    refused = [vary.what for vary in declared.vary if not settable(vary)]
-    if refused:
-        raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))
+    async def _set(self, draws: EpisodeDraws | None) -> None:
+        if "opt.gravity" in self._fields:
+            await self._client.runtime.set_sim_options(gravity=self._fields["opt.gravity"])
+        for key, (controller, actuators) in self._controllers.items():
+            gains = self._gains[key]
+            if draws is not None:
+                factors = self.variation.gain_factors(draws, actuators)
+                gains = {
+                    name: dict(zip(by, (np.array([*by.values()]) * factors[name]).tolist(), strict=True))
+                    for name, by in gains.items()
+                }
+            await controller.set_gains(gains.get("kp"), gains.get("kv"))
 
 
 def controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:

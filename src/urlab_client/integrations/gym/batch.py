@@ -13,21 +13,18 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import batch_class
-from urlab_client.aio.launch import with_model_options
+from urlab_client._mujoco import batch_class, spans
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import ControllerKind
-from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
-from urlab_client.integrations.gym.episode import rendered_camera, space_mapping
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.pictures import BatchPictures, PictureScene
-from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
-from urlab_client.integrations.gym.spaces import Field, Observation, with_cameras
-from urlab_client.integrations.gym.task import States, add_observed, with_task
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
+from urlab_client.integrations.gym.spaces import Field, Observation
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
-from urlab_client.randomise.variation import EpisodeDraws, Variation, declared_in
+from urlab_client.randomise.variation import EpisodeDraws, Variation
 from urlab_client.simulation.controller_config import ControllerConfig
 from urlab_client.simulation.controllers import Actuated, Controller, PDController, attach_controller
 from urlab_client.simulation.painting import VISIBLE, Visible
@@ -94,37 +91,22 @@ class URLabBatchEnv(Vectorized):
             raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
             raise ValueError(f"engine_options of {engine!r} must not contain {', '.join(sorted(unknown))}")
-        settings = EpisodeSettings.of(**options)
-        address = with_model_options(address)
-        with URLabClient(address, **client_defaults(client_options)) as client:
+        settings = EpisodeSettings(**options)
+        with URLabClient(served_address(address, None), **client_defaults(client_options)) as client:
             client.discover()
-            model = client.model
-            if model is None or not client.articulations:
-                raise URLabError(f"The server at {address} has no articulation.", hint="Start play first.")
-            self._rendered = rendered_camera(aio_of(client), settings)
+            first = EnvEpisode(aio_of(client), settings=settings)
+            model, mapping, self._rendered = first.model, first.mapping, first.rendered_camera
             drawn = [*settings.cameras, *([self._rendered] if self._rendered else [])]
             self._scene = PictureScene.of(aio_of(client), model, drawn)
-            mapping = space_mapping(aio_of(client), model, settings)
             self._controllers = {
                 key: _controller(model, mapping.layout(key), str(found.kind), found.params)
                 for key, articulation in client.articulations.items()
                 if (found := articulation.controller)
             }
             self._target_type = np.float64 if client.server.features.exact_controls else np.float32
-        declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
-        super().__init__(
-            num_envs=num_envs,
-            settings=settings,
-            mapping=mapping,
-            observation_space=with_task(
-                with_cameras(mapping, {name: self._scene.space(name) for name in settings.cameras}), settings.task
-            ),
-            autoreset_mode=autoreset_mode,
-            randomise=declared,
-        )
-        self.model = model
-        self._memory = settings.memory(model, mapping, range(num_envs))
-        self._recent: tuple[Indices, States] | None = None
+        declared = first.randomise if randomise is None else Randomisation.of(randomise)
+        super().__init__(first, num_envs, autoreset_mode, declared)
+        self.model: mujoco.MjModel = model
         self._pictures = BatchPictures(
             self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
         )
@@ -136,7 +118,8 @@ class URLabBatchEnv(Vectorized):
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
-        self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
+        sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
+        self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}
         self._varied = None
         if declared is not None and declared.vary:
             self._varied = _CopyVariation(
@@ -145,7 +128,6 @@ class URLabBatchEnv(Vectorized):
         self._bodies = element_ids(model_names(model, "body"), mapping.prefixes, "body")
         for push in () if declared is None else declared.push:
             self._body(push.body)
-        self._step_count = np.zeros(num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of the current state of each copy, shape (H, W, 3), RGB; None without a render mode.
@@ -166,7 +148,7 @@ class URLabBatchEnv(Vectorized):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the drawing context, and let the task serve another environment."""
-        self._settings.release()
+        super().close_extras(**kwargs)
         self._pictures.close()
 
     def _copies(self, indices: Indices) -> list[Visible]:
@@ -182,15 +164,12 @@ class URLabBatchEnv(Vectorized):
     def _advance(
         self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
     ) -> Mapping[int, Exception]:
-        self._recent = None
         if len(fresh):
             self._start(fresh, keyframe)
         if len(acting):
             self._act(acting, applied)
-            if self._memory is not None:
-                self._recent = acting, self._memory.updated(acting, applied.actions[acting], *self._state(acting))
         moved = np.sort(np.concatenate([fresh, acting]))
-        put(self._observations, moved, self._observe(moved))
+        put(self._fields, moved, self._observe(moved))
         return {}
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
@@ -199,46 +178,37 @@ class URLabBatchEnv(Vectorized):
         if self._varied is not None:
             self._varied.begin(indices, seeds)
         self._batch.reset(indices, key)
-        if self._varied is not None:
-            for i in map(int, indices):
+        noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
+        for i in map(int, indices):
+            if self._varied is not None:
                 self._varied.start(i, qpos[i])
-            self._batch.forward(indices)
-        if noise:
-            noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
-            for i in map(int, indices):
-                for joints in noisy:
-                    noise.add(self._rngs[i], self.model, joints, qpos[i])
-            self._batch.forward(indices)
-        if self._memory is not None:
-            for i in map(int, indices):
-                qpos[i] = self._memory.begin(i, self._rngs[i], qpos[i])
-            self._batch.forward(indices)
+            for joints in noisy if noise else ():
+                noise.add(self.rngs[i], self.model, joints, qpos[i])
+            if self._memory is not None:
+                qpos[i] = self._memory.begin(i, self.rngs[i], qpos[i])
+        self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
             for i, visible in zip(indices.tolist(), self._copies(indices), strict=True):
                 self._pictures.begin(i, int(seeds[i]), visible)
 
     def _act(self, indices: Indices, applied: Applied) -> None:
-        forces, pushes, n_substeps = self._forces(indices), self._arrays["xfrc_applied"], self._settings.n_substeps
-        for i, pushed in forces.items():
+        pushes, n_substeps = self._arrays["xfrc_applied"], self._settings.n_substeps
+        for i, pushed in applied.forces.items():
             for body, force in pushed.items():
                 pushes[i, self._body(body), :3] = force
         late = applied.late[indices]
         for begin, end in itertools.pairwise(np.unique([0, *late, n_substeps]).tolist()):
             waiting = (late > begin)[:, None]
-            now = {
-                key: np.where(waiting, applied.before[key][indices], values[indices])
-                for key, values in applied.set_points.items()
-            }
-            self._step(indices, now, end - begin)
-        pushes[list(forces)] = 0.0
+            self._step(indices, np.where(waiting, applied.before[indices], applied.set_points[indices]), end - begin)
+        pushes[list(applied.forces)] = 0.0
         self._step_count[indices] += n_substeps
 
-    def _step(self, indices: Indices, set_points: Mapping[str, Floats], n_steps: int) -> None:
-        """Step some copies with these set-points, shape (n, n_ctrl) for each articulation."""
+    def _step(self, indices: Indices, set_points: Floats, n_steps: int) -> None:
+        """Step some copies with these set-points, shape (n, n_actions)."""
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
-        for key, exact in set_points.items():
+        for key, exact in self.mapping.split(set_points).items():
             values, controller = exact.astype(self._target_type), self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values
@@ -260,32 +230,18 @@ class URLabBatchEnv(Vectorized):
             self._controllers[key].write(values, qpos, qvel, ctrl)
         self._arrays["ctrl"][indices] = ctrl
 
-    def _clocks(self) -> dict[str, NDArray[Any]]:
-        return {"sim_time": self._arrays["time"].copy(), "step_count": self._step_count.copy()}
-
     def _observe(self, indices: Indices) -> Observation:
         def read(key: str, field: Field) -> Floats:
             return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
 
         observation = self.mapping.observe(read)
-        if self.task is not None:
-            observation = add_observed(observation, self.task, self.task.observe(self._states(indices)))
         if self._settings.cameras:
             times = self._arrays["time"][indices].tolist()
             observation["cameras"] = self._pictures.observe(indices.tolist(), times, self._copies(indices))
         return observation
 
-    def _states(self, indices: Indices) -> States:
-        if self._memory is None:
-            raise URLabError("This environment has no task.")
-        if self._recent is None or not np.array_equal(self._recent[0], indices):
-            self._recent = indices, self._memory.states(indices, *self._state(indices))
-        return self._recent[1]
-
-    def _state(self, indices: Indices) -> tuple[Floats, Floats, Floats]:
-        """Return positions, velocities and times of some copies."""
-        qpos, qvel, time = (self._arrays[name][indices] for name in ("qpos", "qvel", "time"))
-        return qpos, qvel, time
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        return self._arrays["qpos"], self._arrays["qvel"], self._arrays["time"]
 
     def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
         match field:
@@ -370,8 +326,3 @@ def _controller(
     controller = attach_controller(model, actuated, config)
     controller.configure(params)
     return controller
-
-
-def _sensor_addresses(model: mujoco.MjModel, layout: ArticulationLayout) -> Indices:
-    ranges = [np.arange(model.sensor_dim[i], dtype=np.intp) + model.sensor_adr[i] for i in layout.sensors.values()]
-    return np.concatenate(ranges) if ranges else np.zeros(0, dtype=np.intp)

@@ -7,13 +7,14 @@ numbers in all of them.
 from __future__ import annotations
 
 import fnmatch
+import itertools
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Any, Final, cast
 
 import numpy as np
 
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
 from urlab_client.randomise.variation import (
@@ -44,35 +45,35 @@ class Disturbances:
     """
 
     def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int, n_substeps: int) -> None:
-        self.seed = -1
+        self.seed: int = -1
         self.late_steps: int = 0
         self._n_substeps = n_substeps
         self._declaration = declaration
         self._mapping = mapping
         self._n_task = n_task
         self._targets = [self._noisy(noise) for noise in declaration.noise]
-        self._pushes: list[_PushSchedule] = []
+        self._pushes: list[tuple[str, Iterator[Floats | None]]] = []
         self._noises: list[tuple[np.random.Generator, list[Floats]]] = []
         self._drops = stream(0, DROP_STREAM)
         self._samples: deque[Observation] = deque(maxlen=1)
         self._shown: Observation = None
-        self._chosen: deque[Mapping[str, Floats]] = deque()
+        self._chosen: deque[Floats] = deque()
 
-    def begin(self, rng: np.random.Generator, keyframe: str | None) -> int:
-        """Draw the disturbances of an episode and return its seed, which the environment's generator draws.
+    def begin(self, rng: np.random.Generator, keyframe: str | None) -> None:
+        """Draw the disturbances of an episode, and first its seed, by the environment's generator.
 
         The set-points of the keyframe are in force until the first delayed action is.
         """
-        self.seed: int = int(rng.integers(_SEED_END))
-        seed = self.seed
-        declared = self._declaration
-        self._pushes = [_PushSchedule(push, stream(seed, PUSH_STREAM, i)) for i, push in enumerate(declared.push)]
+        seed = self.seed = int(rng.integers(_SEED_END))
+        declared, delay = self._declaration, self._declaration.delay
+        self._pushes = [
+            (push.body, _forces(push, stream(seed, PUSH_STREAM, i))) for i, push in enumerate(declared.push)
+        ]
         self._noises = []
-        for i, (noise, widths) in enumerate(zip(declared.noise, self._widths, strict=True)):
+        for i, (noise, targets) in enumerate(zip(declared.noise, self._targets, strict=True)):
             generator = stream(seed, NOISE_STREAM, i)
-            self._noises.append((generator, [generator.uniform(-noise.bias, noise.bias, n) for n in widths]))
+            self._noises.append((generator, [generator.uniform(-noise.bias, noise.bias, n) for *_, n in targets]))
         late = stream(seed, DELAY_STREAM)
-        delay = declared.delay
         observation, action, substeps = (
             int(late.integers(low, high, endpoint=True))
             for low, high in map(steps_range, (delay.observation, delay.action, delay.action_substeps))
@@ -82,22 +83,22 @@ class Disturbances:
         if declared.delays_actions:
             more, self.late_steps = divmod(substeps, self._n_substeps)
             length = action + more + 2
-            self._chosen = deque([self._mapping.held(keyframe)] * length, maxlen=length)
+            held = np.concatenate([np.zeros(0), *self._mapping.held(keyframe).values()])
+            self._chosen = deque([held] * length, maxlen=length)
         self._drops = stream(seed, DROP_STREAM)
-        return seed
 
-    def delayed(self, set_points: Mapping[str, Floats]) -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+    def delayed(self, set_points: Floats) -> tuple[Floats, Floats]:
         """Return the set-points in force during the first `late_steps` physics steps, and those after them."""
-        self._chosen.append({key: values.copy() for key, values in set_points.items()})
+        self._chosen.append(set_points.copy())
         return self._chosen[0], self._chosen[1]
 
     def forces(self) -> dict[str, Floats]:
         """Return the forces on bodies during the next action, N, world frame, shape (3,), and advance the schedules."""
         found: dict[str, Floats] = {}
-        for schedule in self._pushes:
-            force = schedule.advance()
+        for body, schedule in self._pushes:
+            force = next(schedule)
             if force is not None:
-                found[schedule.push.body] = found.get(schedule.push.body, 0.0) + force
+                found[body] = found.get(body, 0.0) + force
         return found
 
     def seen(self, truth: Observation) -> Observation:
@@ -105,11 +106,11 @@ class Disturbances:
 
         `truth`, the next observation of the episode, is not modified.
         """
-        sample = _copied(truth)
+        sample = _without_pictures(truth)
         for noise, targets, (generator, biases) in zip(
             self._declaration.noise, self._targets, self._noises, strict=True
         ):
-            for (key, field), bias in zip(targets, biases, strict=True):
+            for (key, field, _), bias in zip(targets, biases, strict=True):
                 values = self._values(sample, key, field)
                 values += bias
                 if noise.std:
@@ -120,33 +121,26 @@ class Disturbances:
         lost = self._declaration.delay.drop and self._drops.random() < self._declaration.delay.drop
         if self._shown is None or not lost:
             self._shown = self._samples[0]
-        shown = _copied(self._shown)
         if isinstance(truth, dict) and "cameras" in truth:
-            shown["cameras"] = truth["cameras"]
-        return shown
+            pictures = {"cameras": cast("dict[str, Any]", truth)["cameras"]}
+            return {**cast("dict[str, Any]", self._shown), **pictures}
+        return self._shown
 
-    def _noisy(self, noise: Noise) -> list[tuple[str, Field]]:
-        """Return the articulations and fields to which noise is added."""
+    def _noisy(self, noise: Noise) -> list[tuple[str, Field, int]]:
+        """Return the articulations, fields and their lengths to which noise is added."""
         mapping = self._mapping
         if noise.field == "task":
             if not self._n_task:
                 raise ValueError("noise on task: the environment's task adds nothing to the observation")
-            return [("", "task")]
+            return [("", "task", self._n_task)]
         if noise.field not in mapping.fields:
             raise ValueError(
                 f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(mapping.fields)}"
             )
-        keys = [key for key in mapping.observed if fnmatch.fnmatchcase(key, noise.articulation)]
+        keys = fnmatch.filter(mapping.observed, noise.articulation)
         if not keys:
             raise ValueError(f"noise on {noise.field}: no observed articulation is called {noise.articulation!r}")
-        return [(key, noise.field) for key in keys]
-
-    @property
-    def _widths(self) -> list[list[int]]:
-        return [
-            [self._n_task if field == "task" else self._mapping.width(key, field) for key, field in targets]
-            for targets in self._targets
-        ]
+        return [(key, noise.field, mapping.width(key, noise.field)) for key in keys]
 
     def _values(self, sample: Observation, key: str, field: Field) -> Floats:
         """Return the view of a target in a sample."""
@@ -155,37 +149,17 @@ class Disturbances:
         return sample["task"] if self._mapping.mode == "dict" else sample[-self._n_task :]
 
 
-class _PushSchedule:
-    """Times and forces of one kind of push."""
-
-    def __init__(self, push: Push, rng: np.random.Generator) -> None:
-        self.push = push
-        self._rng = rng
-        self._wait = self._drawn_wait()
-        self._left = 0
-        self._force: Floats = np.zeros(3)
-
-    def advance(self) -> Floats | None:
-        """Return the force during the next action, or None without a push."""
-        if self._left == 0:
-            if self._wait > 0:
-                self._wait -= 1
-                return None
-            self._force = draw_range(self._rng, self.push.force, (3,))
-            self._left = self.push.lasts
-        self._left -= 1
-        if self._left == 0:
-            self._wait = self._drawn_wait()
-        return self._force
-
-    def _drawn_wait(self) -> int:
-        low, high = self.push.every
-        return int(self._rng.integers(low, high, endpoint=True))
+def _forces(push: Push, rng: np.random.Generator) -> Iterator[Floats | None]:
+    """Yield the force of one kind of push during each action; None without a push."""
+    while True:
+        low, high = push.every
+        yield from itertools.repeat(None, int(rng.integers(low, high, endpoint=True)))
+        yield from itertools.repeat(draw_range(rng, push.force, (3,)), push.lasts)
 
 
-def _copied(tree: Any) -> Any:
-    """Copy arrays in dictionaries, without pictures, which are never modified."""
-    if isinstance(tree, Mapping):
-        entries = cast("Mapping[str, Any]", tree)
-        return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}
-    return np.array(tree)
+def _without_pictures(observation: Observation) -> Observation:
+    """Copy an observation except for pictures, which are never modified."""
+    if isinstance(observation, dict):
+        entries = cast("dict[str, Any]", observation)
+        observation = {key: entry for key, entry in entries.items() if key != "cameras"}
+    return mapped(np.array, observation)

@@ -6,16 +6,15 @@ import contextlib
 import os
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final, Self, Unpack
+from typing import Any, Self, Unpack
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client.aio.articulation import URLabEntity
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.errors import URLabError
-from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import (
     EpisodeOptions,
@@ -23,18 +22,43 @@ from urlab_client.integrations.gym.settings import (
     RewardFn,
     TerminationFn,
     client_defaults,
-    keyframe_option,
+    served_address,
 )
-from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
-from urlab_client.integrations.gym.task import EpisodeEnd, Task, judged, succeeded
-from urlab_client.protocol.base import Floats
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, mapped
+from urlab_client.integrations.gym.task import Task
+from urlab_client.integrations.gym.vector import OverWire
+from urlab_client.integrations.gym.vectorized import Applied, Indices, info_of, of_one
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
+from urlab_client.sync._portal import Portal
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
 from urlab_client.values.names import NameMap
 
-_FALLBACK_FPS: Final = 50.0
+
+class _Alone(OverWire):
+    """A vector environment of one, over a client that it is given."""
+
+    def __init__(self, episode: EnvEpisode, portal: Portal) -> None:
+        super().__init__(episode, 1, AutoresetMode.DISABLED)
+        self.episode = episode
+        self._portal = portal
+        reward_fn, termination_fn = self.reward_fn, self.termination_fn
+        if reward_fn is not None:
+            self.reward_fn = lambda before, action, after, infos: [
+                reward_fn(of_one(before), of_one(action), of_one(after), info_of(infos))
+            ]
+        if termination_fn is not None:
+            self.termination_fn = lambda after, infos: [termination_fn(of_one(after), info_of(infos))]
+
+    async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
+        return self.episode
+
+    def _advance(
+        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
+    ) -> Mapping[int, Exception]:
+        self._portal.call(self._move_one, 0, keyframe, applied if len(acting) else None)
+        return {}
 
 
 class URLabEnv(gymnasium.Env[Observation, Any]):
@@ -61,7 +85,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         termination_fn: The termination function. If None, episodes never terminate.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FALLBACK_FPS}  # noqa: RUF012 - Gymnasium's
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50.0}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
@@ -90,33 +114,23 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             ValueError: An option is out of range, the scene has no camera to render, the task serves another
                 environment, or one of its hooks or attributes is misspelt.
         """
-        settings = self._settings = EpisodeSettings.of(**options)
+        settings = EpisodeSettings(**options)
+        declared = None if randomise is None else Randomisation.of(randomise)
+        episode = EnvEpisode(aio_of(client), settings=settings, randomise=declared)
+        self._alone = _Alone(episode, portal_of(client))
         self.client = client
-        self.render_mode = settings.render_mode
-        self._episode = EnvEpisode(
-            aio_of(client), settings=settings, randomise=None if randomise is None else Randomisation.of(randomise)
-        )
-        self.randomise: Randomisation | None = self._episode.randomise
         self.task: Task | None = settings.task
-        task = settings.task
-        n_task = 0 if task is None else task.n_observed
-        self._disturbances = None
-        if self.randomise is not None:
-            self._disturbances = Disturbances(self.randomise, self.mapping, n_task, settings.n_substeps)
-        self.action_space: gymnasium.Space[Any] = self.mapping.action_space
-        self.observation_space: gymnasium.Space[Any] = self._episode.observation_space
-        model = client.model
-        self.metadata = {
-            **self.metadata,
-            "render_fps": 1.0 / (model.opt.timestep * settings.n_substeps) if model else _FALLBACK_FPS,
-        }
+        self.randomise: Randomisation | None = episode.randomise
         self.reward_fn: RewardFn | None = settings.reward_fn
         self.termination_fn: TerminationFn | None = settings.termination_fn
-        self._max_episode_steps = settings.max_episode_steps
+        self.render_mode: str | None = settings.render_mode
+        self.action_space: gymnasium.Space[Any] = self._alone.single_action_space
+        self.observation_space: gymnasium.Space[Any] = self._alone.single_observation_space
+        self.metadata = {
+            **self.metadata,
+            "render_fps": 1.0 / (episode.model.opt.timestep * settings.n_substeps),
+        }
         self._owns_client = owns_client
-        self._observation: Observation = None
-        self._elapsed = 0
-        self._total = 0.0
 
     @classmethod
     def connect(cls, address: str, *, client_options: Mapping[str, Any] = MappingProxyType({}), **options: Any) -> Self:
@@ -131,10 +145,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             URLabError: The server cannot be reached or has no articulation.
         """
-        if address.startswith(SCHEME) and options.get("randomise") is not None:
-            declared = options["randomise"] = Randomisation.of(options["randomise"])
-            address = with_option(address, "randomise", declared.to_json())
-        client = URLabClient(with_model_options(address), **client_defaults(client_options))
+        if (declared := options.get("randomise")) is not None:
+            declared = options["randomise"] = Randomisation.of(declared)
+        client = URLabClient(served_address(address, declared), **client_defaults(client_options))
         try:
             client.discover()
             return cls(client, owns_client=True, **options)
@@ -145,7 +158,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     @property
     def mapping(self) -> SpaceMapping:
         """The client's articulations as spaces."""
-        return self._episode.mapping
+        return self._alone.mapping
 
     @property
     def articulations(self) -> NameMap[URLabArticulation]:
@@ -171,18 +184,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             UnknownKeyframe: No keyframe, or more than one, has this name.
         """
         super().reset(seed=seed)
-        keyframe = keyframe_option(options)
-        disturbances = self._disturbances
-        episode_seed = None
-        if disturbances is not None:
-            episode_seed = disturbances.begin(self.np_random, keyframe or self._settings.keyframe)
-        self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe, episode_seed)
-        self._elapsed, self._total = 0, 0.0
-        info = self._info()
-        success = None if self.task is None else succeeded(self.task, self._episode.states())
-        if success is not None:
-            info["success"] = bool(success[0])
-        return self._seen(), info
+        self._alone.rngs = [self.np_random]
+        observations, infos = self._alone.reset(options=options)
+        return of_one(observations), info_of(infos)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply an action for `n_substeps` physics steps.
@@ -191,34 +195,17 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             gymnasium.error.ResetNeeded: `reset` has not been called yet.
             ValueError: The action has the wrong shape or is not finite. Nothing was sent.
         """
-        if self._observation is None:
-            raise gymnasium.error.ResetNeeded("call reset() before step()")
-        before = self._observation
-        set_points = before_late = self.mapping.set_points(action)  # validates before anything is drawn
-        forces: dict[str, Floats] = {}
-        disturbances, late_steps = self._disturbances, 0
-        if disturbances is not None:
-            forces, late_steps = disturbances.forces(), disturbances.late_steps
-            if self.randomise is not None and self.randomise.delays_actions:
-                before_late, set_points = disturbances.delayed(set_points)
-        after = self._observation = portal_of(self.client).call(
-            self._episode.step, set_points, forces, self.mapping.flat(action), before_late, late_steps
+        observations, rewards, terminated, truncated, infos = self._alone.step(
+            mapped(lambda values: np.asarray(values)[None], action)
         )
-        self._elapsed += 1
-        info = self._info()
-        if self.task is not None:
-            return self._judged(self.task, action, info)
-        reward = 0.0 if self.reward_fn is None else float(self.reward_fn(before, action, after, info))
-        terminated = self.termination_fn is not None and bool(self.termination_fn(after, info))
-        truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        return self._seen(), reward, terminated, truncated, info
+        return of_one(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info_of(infos)
 
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as plain data: `seed`, and under `varied` the draws by quantity.
 
         None if nothing varies, and before the first reset.
         """
-        return self._episode.draws()
+        return self._alone.episode.draws()
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]  # Gymnasium's base names frames of all kinds
         """Return the frame of the last reset or step, shape (H, W, 3), RGB; None without a render mode.
@@ -229,7 +216,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
             return None
-        picture = self._episode.rendered()
+        picture = self._alone.episode.rendered()
         if picture is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         return picture
@@ -239,37 +226,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
         The task may then serve another environment.
         """
-        self._settings.release()
+        self._alone.close()
         with contextlib.suppress(URLabError):  # the client may be closed already
-            portal_of(self.client).call(self._episode.close)
+            portal_of(self.client).call(self._alone.episode.close)
         if self._owns_client:
             self.client.close()
         super().close()
-
-    def _judged(
-        self, task: Task, action: Any, info: dict[str, Any]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        states = self._episode.states()
-        actions: Any = np.asarray(action)[None]
-        if self.mapping.mode == "dict":
-            actions = {key: np.asarray(action[key])[None] for key in action}
-        rewards, ends, success = judged(task, states, actions)
-        reward, terminated = float(rewards[0]), bool(ends[0])
-        truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        self._total += reward
-        if success is not None:
-            info["success"] = bool(success[0])
-        if terminated or truncated:
-            done = info.get("success", False)
-            task.ended(EpisodeEnd(0, done, terminated, self._elapsed, self._total, states.goal_of(0)))
-        return self._seen(), reward, terminated, truncated, info
-
-    def _info(self) -> dict[str, Any]:
-        client = self.client
-        info: dict[str, Any] = {"step_count": client.step_count, "sim_time": client.sim_time}
-        if self._disturbances is not None:
-            info["episode_seed"] = self._disturbances.seed
-        return info
-
-    def _seen(self) -> Observation:
-        return self._observation if self._disturbances is None else self._disturbances.seen(self._observation)

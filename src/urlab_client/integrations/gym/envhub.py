@@ -10,10 +10,12 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from urlab_client.integrations.gym.env import URLabEnv
 from urlab_client.integrations.gym.spaces import Space, dict_space
+from urlab_client.integrations.gym.vectorized import of_one
 
 __all__ = ["ForLeRobot", "vector_env"]
 
@@ -51,7 +53,7 @@ class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any
         self._widths = {key: space.shape[0] for key, space in actions.items()}
         low, high = (np.concatenate([getattr(space, bound) for space in actions.values()]) for bound in ("low", "high"))
         self.action_space = spaces.Box(low, high, dtype=np.float32)
-        empty = self._renamed(_zeros(env.observation_space))
+        empty = self._renamed(of_one(create_empty_array(env.observation_space)))
         self.observation_space = dict_space({key: _space_of(value) for key, value in empty.items()})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
@@ -117,13 +119,6 @@ def _make(env_id: str, description: str, options: Mapping[str, Any]) -> gymnasiu
     except BaseException:
         env.close()
         raise
-
-
-def _zeros(space: Space) -> Any:
-    if isinstance(space, spaces.Dict):
-        by_name = cast("Mapping[str, Space]", space)
-        return {key: _zeros(inner) for key, inner in by_name.items()}
-    return np.zeros(space.shape or (), dtype=space.dtype)
 
 
 def _space_of(value: Any) -> Space:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -34,22 +33,23 @@ from urlab_client.integrations.gym.spaces import (
     camera_space,
     with_cameras,
 )
-from urlab_client.integrations.gym.task import States, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelay
-from urlab_client.protocol.messages.session import StepOk
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
-
-_ROW: Final = np.zeros(1, dtype=np.intp)
 
 
 class EnvEpisode:
     """One client that is reset and stepped as an environment.
 
     Attributes:
-        frames: The last frame of each requested camera.
+        client: The client.
+        model: Its model.
+        settings: Settings of the episodes.
+        mapping: Its articulations as spaces.
+        observation_space: The space of the observed fields and pictures.
+        rendered_camera: The camera that `render` shows, or None.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
     """
@@ -61,25 +61,10 @@ class EnvEpisode:
         settings: EpisodeSettings,
         randomise: Randomisation | None = None,
         earlier: EnvEpisode | None = None,
-        index: int = 0,
     ) -> None:
-        """Set up the episodes of a client, and the task unless it already is.
-
-        Args:
-            client: The client, discovered and in `direct` or `puppet` mode.
-            settings: Settings of the episodes.
-            randomise: What varies from episode to episode. If None, the server's own declaration applies.
-            earlier: Episodes of the earlier client that this client replaces.
-            index: Index of the environment in a vector environment.
-
-        Raises:
-            URLabError: The client cannot serve an environment, or its server varies the scene differently.
-            UnsupportedRandomisation: The server varies nothing itself, and no op does.
-            KeyError: A camera is unknown.
-            ValueError: An option is out of range, or the scene has no camera to render.
-        """
-        model = client.model
-        if model is None or not client.articulations:
+        """Set up the episodes of a client, which may replace that of `earlier` episodes; see `URLabEnv` for errors."""
+        model, data = client.model, client.data
+        if model is None or data is None or not client.articulations:
             raise URLabError(
                 "The client has discovered no articulation to act on.",
                 hint="Start play, then call discover() with local_model=True.",
@@ -90,23 +75,23 @@ class EnvEpisode:
                 hint="Make the client with step_mode='direct'.",
             )
         self.client = client
-        self.frames: dict[str, Pixels] = {}
-        self._model = model
-        self._settings = settings
-        self.mapping: SpaceMapping = space_mapping(client, model, settings)
-        self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
+        self.model: mujoco.MjModel = model
+        self.settings = settings
+        self.mapping: SpaceMapping = _space_mapping(client, model, settings)
+        layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
+        self._sensors = {key: [*layout.sensors] for key, layout in layouts.items()}
         minimal = set(settings.fields) <= set(LEVELS["minimal"])
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
-        self._rendered = rendered_camera(client, settings)
+        self.rendered_camera: str | None = _rendered_camera(client, settings)
         self._cameras = {
-            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self._rendered))
+            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self.rendered_camera))
         }
+        self._frames: dict[str, Pixels] = {}
         images = {
             name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
         }
         self.observation_space: Space = with_cameras(self.mapping, images)
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
-        layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._variation = server_variation(client, model, layouts)
         self.over_wire: WireVariation | None = None
         if self._variation is None and self.randomise is not None and self.randomise.vary:
@@ -117,35 +102,31 @@ class EnvEpisode:
         self._draws: EpisodeDraws | None = None
         for push in () if self.randomise is None else self.randomise.push:
             self._pushed(push.body)
-        self._memory = settings.memory(model, self.mapping, [index])
-        self.observation_space = with_task(self.observation_space, settings.task)
 
-    def states(self) -> States:
-        """Return the current state in the form passed to tasks, with n = 1."""
-        if self._memory is None:
-            raise URLabError("This environment has no task.")
-        return self._memory.states(_ROW, *self._state())
-
-    def _state(self) -> tuple[Floats, Floats, Floats]:
-        """Return positions, velocities and time, each with a leading axis of 1."""
+    def state(self) -> tuple[Floats, Floats, float]:
+        """Return the positions and velocities of the whole scene, and the simulation time."""
         data = self.client.data
         if data is None:
             raise URLabError("The client has no model.", hint="Call discover() with local_model=True.")
-        return np.array(data.qpos)[None], np.array(data.qvel)[None], np.array([data.time])
+        return data.qpos, data.qvel, data.time
 
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""
         return None if self._draws is None else self._draws.to_dict()
 
     async def reset(
-        self, rng: np.random.Generator, keyframe: str | None = None, seed: int | None = None
+        self,
+        rng: np.random.Generator,
+        keyframe: str | None = None,
+        seed: int | None = None,
+        begin: Callable[[np.random.Generator, Floats], Floats] | None = None,
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        `keyframe` replaces the one in the settings. `seed` determines what varies; None if nothing varies.
+        `seed` determines what varies; `begin` lets a task choose the start, by positions of the shape (nq,).
         """
         client = self.client
-        keyframe = self._settings.keyframe if keyframe is None else keyframe
+        keyframe = self.settings.keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
         if self._variation is not None and seed is not None:
@@ -153,20 +134,18 @@ class EnvEpisode:
             if self.over_wire is not None:
                 await self.over_wire.apply(self._draws)
         await client.reset(keyframe, seed)
-        placed = await self._start_over_wire()
-        overrides: dict[str, dict[str, float]] | None = None
-        if self._settings.reset_noise and client.data is not None:
-            qpos = np.array(client.data.qpos)
-            overrides = self._add_noise(rng, qpos)
-            if self.over_wire is None:
-                await client.reset(keyframe, seed, overrides)
-            else:  # another reset would undo the start
-                placed |= await self._place_changed(qpos)
-                overrides = None
-        placed |= await self._start_task(rng)
+        qpos = np.array(self.state()[0])
+        if self.over_wire is not None and self._draws is not None:
+            self.over_wire.variation.start(self._draws, qpos)
+        if self.settings.reset_noise:
+            for key in self.mapping.keys:
+                self.settings.reset_noise.add(rng, self.model, self.mapping.scalar_joints(key, self.model), qpos)
+        if begin is not None:
+            qpos = begin(rng, qpos)
+        await self._place(qpos)
         if self._cameras:
             await self._delay_cameras(seed)
-            await self._look(keyframe, seed, overrides, placed)
+            await self._look(keyframe, seed, qpos)
         return self._observe()
 
     async def close(self) -> None:
@@ -176,87 +155,37 @@ class EnvEpisode:
                 await self.over_wire.undo()
 
     async def step(
-        self,
-        set_points: Mapping[str, Floats],
-        forces: Mapping[str, Floats],
-        action: Floats,
-        before: Mapping[str, Floats] = MappingProxyType({}),
-        late_steps: int = 0,
+        self, set_points: Floats, forces: Mapping[str, Floats], before: Floats, late_steps: int
     ) -> Observation:
-        """Apply set-points for `n_substeps` and return the observation after them.
-
-        Args:
-            set_points: Set-points of each articulation, shape (n_ctrl,).
-            forces: Forces on bodies meanwhile, N, world frame, shape (3,).
-            action: The action for the task, shape (n_actions,).
-            before: Set-points that are in force during the first `late_steps` physics steps.
-            late_steps: Number of these steps, less than `n_substeps`.
-        """
+        """Apply set-points for `n_substeps` and return the observation after them; see `Applied`."""
         if late_steps:
-            await self._apply(before, forces, late_steps)
+            await self._apply(before, forces, late_steps, {})
         cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
-        reply = await self._apply(set_points, forces, self._settings.n_substeps - late_steps, cameras)
+        await self._apply(set_points, forces, self.settings.n_substeps - late_steps, cameras)
         self._take_frames()
-        if self._memory is not None:
-            self._memory.updated(_ROW, action[None], *self._state())
-        return self._observe(reply)
+        return self._observe()
 
     async def _apply(
-        self,
-        set_points: Mapping[str, Floats],
-        forces: Mapping[str, Floats],
-        n_steps: int,
-        cameras: Mapping[str, str] = MappingProxyType({}),
-    ) -> StepOk:
-        for key, values in set_points.items():
+        self, set_points: Floats, forces: Mapping[str, Floats], n_steps: int, cameras: dict[str, str]
+    ) -> None:
+        for key, values in self.mapping.split(set_points).items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)
             articulation.apply_xfrc(name, force=force.tolist())
-        return await self.client.step(n_steps, include_cameras=dict(cameras) or False, observations=self._level)
+        await self.client.step(n_steps, include_cameras=cameras or False, observations=self._level)
 
-    def _add_noise(self, rng: np.random.Generator, qpos: Floats) -> dict[str, dict[str, float]]:
-        """Add noise to the positions of joints in place; return the new positions by articulation."""
-        noisy: dict[str, dict[str, float]] = {}
-        for key in self.mapping.keys:
-            joints = self.mapping.scalar_joints(key, self._model)
-            self._settings.reset_noise.add(rng, self._model, joints, qpos)
-            positions = qpos[self._model.jnt_qposadr[joints]].tolist()
-            noisy[key] = dict(zip(self.mapping.joint_names(key, self._model), positions, strict=True))
-        return noisy
-
-    async def _start_task(self, rng: np.random.Generator) -> dict[str, Floats]:
-        """Let the task choose the start; return the positions of each articulation that it moved."""
-        data = self.client.data
-        if self._memory is None or data is None:
-            return {}
-        return await self._place_changed(self._memory.begin(0, rng, np.array(data.qpos)))
-
-    async def _start_over_wire(self) -> dict[str, Floats]:
-        """Vary the start if the server does not; return the positions of each articulation that moved."""
-        data = self.client.data
-        if self.over_wire is None or self._draws is None or data is None:
-            return {}
-        qpos = np.array(data.qpos)
-        self.over_wire.variation.start(self._draws, qpos)
-        return await self._place_changed(qpos)
-
-    async def _place_changed(self, qpos: Floats) -> dict[str, Floats]:
-        """Place the articulations whose positions in `qpos` differ from the scene's; return their positions."""
-        data = self.client.data
-        placed: dict[str, Floats] = {}
-        for key in self.mapping.keys:
-            address = self.mapping.layout(key).qpos_adr
-            if data is not None and not np.array_equal(qpos[address], data.qpos[address]):
-                placed[key] = qpos[address]
-        await self._place(placed)
-        return placed
-
-    async def _place(self, placed: Mapping[str, Floats]) -> None:
-        runtime = self.client.runtime
-        for key, positions in placed.items():
-            await runtime.set_qpos(key, positions, by_name=True)
-        if placed:
+    async def _place(self, qpos: Floats) -> None:
+        """Place the articulations whose positions in `qpos` differ from the scene's."""
+        runtime, now = self.client.runtime, np.array(self.state()[0])
+        moved = [
+            (key, address)
+            for key in self.mapping.keys
+            if not np.array_equal(qpos[address := self.mapping.layout(key).qpos_adr], now[address])
+        ]
+        for key, address in moved:
+            await runtime.set_qpos(key, qpos[address], by_name=True)
+        if moved:
             await runtime.forward()
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
@@ -274,13 +203,7 @@ class EnvEpisode:
             }
             await self.client.runtime.set_camera_delay(delays)
 
-    async def _look(
-        self,
-        keyframe: str | None,
-        seed: int | None,
-        overrides: Mapping[str, Mapping[str, float]] | None,
-        placed: Mapping[str, Floats],
-    ) -> None:
+    async def _look(self, keyframe: str | None, seed: int | None, qpos: Floats) -> None:
         """Take the frames of the current state. Only a puppet step draws without integrating.
 
         A puppet step changes the solver's warm start. The reset is therefore repeated, so that rollouts with and
@@ -293,46 +216,38 @@ class EnvEpisode:
         self._take_frames()
         if mode is not StepMode.PUPPET:
             await client.runtime.set_mode(mode)
-            await client.reset(keyframe, seed, overrides)
-            await self._place(placed)
+            await client.reset(keyframe, seed)
+            await self._place(qpos)
 
     def _take_frames(self) -> None:
         for name, view in self._cameras.items():
             frame = view.latest_frame
-            if name in self._latencies and not view.delivered and name in self.frames:
+            if name in self._latencies and not view.delivered and name in self._frames:
                 continue  # no frame is old enough yet: keep the last one
             if frame is None or not view.delivered:
                 raise URLabError(
                     f"The server sent no frame of camera {name!r}.",
                     hint="Run `urlab doctor` to check whether the server can draw.",
                 )
-            self.frames[name] = frame
+            self._frames[name] = frame
 
-    def _observe(self, reply: StepOk | None = None) -> Observation:
-        """Return the current observation. Values in the reply of a step take precedence."""
-        states = {} if reply is None else reply.per_articulation
-
-        def read(key: str, field: Field) -> Floats:
-            state = states.get(key)
-            value: Any = None if state is None else getattr(state, field)
-            if value is None:
-                return self._read(key, field)
-            return np.array([n for name in self._sensors[key] for n in value[name]]) if field == "sensors" else value
-
-        observation = self.mapping.observe(read)
-        task, cameras = self._settings.task, self._settings.cameras
-        if task is not None:
-            observation = add_observed(observation, task, task.observe(self.states())[0])
-        if cameras:
+    def _observe(self) -> Observation:
+        """Return the current observation, without what a task adds."""
+        observation = self.mapping.observe(self._read)
+        if self.settings.cameras:
             observation["cameras"] = {
-                name: observed_pixels(self.frames[name], self._cameras[name].mode) for name in cameras
+                name: observed_pixels(self._frames[name], self._cameras[name].mode) for name in self.settings.cameras
             }
         return observation
 
     def rendered(self) -> NDArray[np.uint8] | None:
         """Return the last picture for `render`, shape (H, W, 3), RGB; None if there is none yet."""
-        frame = self.frames.get(self._rendered or "")
-        return None if frame is None or self._rendered is None else to_rgb(frame, self._cameras[self._rendered].mode)
+        frame = self._frames.get(self.rendered_camera or "")
+        return (
+            None
+            if frame is None or self.rendered_camera is None
+            else to_rgb(frame, self._cameras[self.rendered_camera].mode)
+        )
 
     def _read(self, key: str, field: Field) -> Floats:
         articulation = self.client.articulations[key]
@@ -364,7 +279,7 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
     return randomise
 
 
-def space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
+def _space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
     """Return the articulations of a discovered client as the spaces of an environment."""
     prefixes = compiled_prefixes(client)
     controlled = {
@@ -391,17 +306,14 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     return client.global_cameras[name]
 
 
-def rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
+def _rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:
     """Return the camera that `render` shows, by default the first colour camera; None without a render mode."""
     if settings.render_mode is None:
         return None
     if settings.render_camera:
         return settings.render_camera
-    for key, articulation in client.articulations.items():
-        for name, view in articulation.cameras.items():
-            if view.mode == CameraMode.REAL:
-                return f"{key}/{name}"
-    for name, view in client.global_cameras.items():
+    views = {f"{key}/{name}": view for key, it in client.articulations.items() for name, view in it.cameras.items()}
+    for name, view in (*views.items(), *client.global_cameras.items()):
         if view.mode == CameraMode.REAL:
             return name
     raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")

@@ -15,7 +15,6 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym.episode import client_camera
-from urlab_client.integrations.gym.spaces import Space, camera_space
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.randomise.declaration import CameraLatency
@@ -60,10 +59,6 @@ class PictureScene:
     def mode(self, camera: str) -> CameraMode:
         """Return the mode of a camera."""
         return CameraMode(self.cameras[camera].mode)
-
-    def space(self, camera: str) -> Space:
-        """Return the space of a camera's pictures."""
-        return camera_space(self.mode(camera), self.cameras[camera].resolution)
 
     def stage(self, model: mujoco.MjModel, backend: Backend) -> Stage:
         """Return what draws a model of the scene, in the thread that draws."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client.integrations.gym.spaces import Observation
+from urlab_client.integrations.gym.vectorized import info_of
 
 need("stable_baselines3", extra="sb3")
 
@@ -63,7 +64,7 @@ class Sb3VecEnv(_VecEnv):
         observations, infos = self.env.reset(seed=list(self._seeds))
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [_info(infos, i) for i in range(self.env.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [info_of(infos, i) for i in range(self.env.num_envs)]
         return observations
 
     def step_async(self, actions: Any) -> None:
@@ -78,11 +79,11 @@ class Sb3VecEnv(_VecEnv):
         for i in range(self.env.num_envs):
             if ended[i]:
                 # Wrappers put the statistics of the ended episode beside the infos of the next one.
-                info = _info(infos, i) | _info(infos["final_info"], i)
+                info = info_of(infos, i) | info_of(infos["final_info"], i)
                 info["terminal_observation"] = infos["final_obs"][i]
                 info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             else:
-                info = _info(infos, i)
+                info = info_of(infos, i)
             each.append(info)
         return observations, rewards.astype(np.float32), ended, each
 
@@ -125,20 +126,3 @@ class Sb3VecEnv(_VecEnv):
         if indices is None:
             return range(self.env.num_envs)
         return [indices] if isinstance(indices, int) else indices
-
-
-def _info(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return the infos of one environment of a vector environment."""
-    entries = {name: values for name, values in infos.items() if not name.startswith("_") and name not in _FINAL}
-    return {name: _at(values, i) for name, values in entries.items() if infos[f"_{name}"][i]}
-
-
-def _at(values: Any, i: int) -> Any:
-    """Return the entry of one environment; wrappers nest dictionaries."""
-    if not isinstance(values, dict):
-        return values[i]
-    entries = cast("dict[str, Any]", values)
-    return {name: _at(inner, i) for name, inner in entries.items() if not name.startswith("_")}
-
-
-_FINAL = {"final_obs", "final_info"}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Literal, TypedDict, Unpack
 from weakref import WeakValueDictionary
 
 import mujoco
 
 from urlab_client.aio.arguments import collection, integer, require, text
+from urlab_client.aio.launch import SCHEME, with_model_options, with_option
 from urlab_client.integrations.gym.spaces import Actions, Field, Observation, SpaceMapping, SpaceMode, fields_of
 from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_spelling
+from urlab_client.randomise.declaration import Randomisation
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""
@@ -65,38 +66,16 @@ _SERVING: Final[WeakValueDictionary[int, EpisodeSettings]] = WeakValueDictionary
 """The settings of each open environment with a task, by the id of the task, which the settings keep alive."""
 
 
-@dataclass(slots=True, kw_only=True, weakref_slot=True, eq=False)
 class EpisodeSettings:
-    """Settings of an environment's episodes: its arguments, else the values of its task, else the defaults."""
+    """Settings of an environment's episodes: its arguments, else the values of its task, else the defaults.
 
-    task: Task | None
-    reward_fn: RewardFn | None
-    termination_fn: TerminationFn | None
-    fields: tuple[Field, ...]
-    actions: Actions | Mapping[str, Actions] | None
-    n_substeps: int
-    max_episode_steps: int | None
-    keyframe: str | None
-    reset_noise: ResetNoise
-    space_mode: SpaceMode
-    cameras: tuple[str, ...]
-    articulations: Sequence[str] | None
-    render_mode: str | None
-    render_camera: str | None
-    scene: TaskScene | None = None
+    Raises:
+        ValueError: An option is out of range or contradicts another, a hook or attribute of the task is misspelt, or
+            the task already serves another environment.
+    """
 
-    @classmethod
-    def of(cls, **options: Unpack[EpisodeOptions]) -> EpisodeSettings:
-        """Return the effective settings.
-
-        Raises:
-            ValueError: An option is out of range or contradicts another, a hook or attribute of the task is misspelt,
-                or the task already serves another environment.
-        """
+    def __init__(self, **options: Unpack[EpisodeOptions]) -> None:
         get, task = options.get, options.get("task")
-        render_mode = get("render_mode")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if task is not None:
             if given := [name for name in ("reward_fn", "termination_fn") if get(name)]:
                 raise ValueError(
@@ -109,54 +88,54 @@ class EpisodeSettings:
                     f"this {type(task).__name__} already serves another environment: make one for each environment, "
                     "or close() the other one first"
                 )
-        if (observed := get("observations")) is not None and not isinstance(observed, str):
-            collection("observations", observed)
         defaults = _NoTask if task is None else task
 
         def chosen(name: str) -> Any:
             given = get(name)
             return getattr(defaults, name) if given is None else given
 
-        most, noise, keyframe = chosen("max_episode_steps"), chosen("reset_noise"), get("keyframe")
-        settings = cls(
-            task=task,
-            reward_fn=get("reward_fn"),
-            termination_fn=get("termination_fn"),
-            fields=fields_of(chosen("observations")),
-            actions=chosen("actions"),
-            n_substeps=integer("n_substeps", chosen("n_substeps")),
-            max_episode_steps=None if most is None else integer("max_episode_steps", most),
-            keyframe=defaults.keyframe if keyframe is None else text("keyframe", keyframe),
-            reset_noise=noise if isinstance(noise, ResetNoise) else ResetNoise(hinge=noise),
-            space_mode=chosen("space_mode"),
-            cameras=tuple(collection("cameras", chosen("cameras"))),
-            articulations=defaults.articulations,
-            render_mode=render_mode,
-            render_camera=get("render_camera"),
-        )
-        if settings.n_substeps < 1:
-            raise ValueError(f"n_substeps must be at least 1, not {settings.n_substeps}")
-        if settings.max_episode_steps is not None and settings.max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1 or None, not {settings.max_episode_steps}")
-        return settings
+        noise, keyframe = chosen("reset_noise"), chosen("keyframe")
+        self.task = task
+        self.reward_fn: RewardFn | None = get("reward_fn")
+        self.termination_fn: TerminationFn | None = get("termination_fn")
+        self.fields: tuple[Field, ...] = fields_of(chosen("observations"))
+        self.actions: Actions | Mapping[str, Actions] | None = chosen("actions")
+        self.n_substeps: int = _at_least_1("n_substeps", chosen("n_substeps"))
+        most = chosen("max_episode_steps")
+        self.max_episode_steps: int | None = None if most is None else _at_least_1("max_episode_steps", most)
+        self.keyframe: str | None = None if keyframe is None else text("keyframe", keyframe)
+        self.reset_noise: ResetNoise = noise if isinstance(noise, ResetNoise) else ResetNoise(hinge=noise)
+        self.space_mode: SpaceMode = chosen("space_mode")
+        self.cameras: tuple[str, ...] = tuple(collection("cameras", chosen("cameras")))
+        self.articulations: Sequence[str] | None = defaults.articulations
+        self.render_mode: str | None = get("render_mode")
+        self.render_camera: str | None = get("render_camera")
+        if self.render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', not {self.render_mode!r}")
 
-    def memory(self, model: mujoco.MjModel, mapping: SpaceMapping, index: Sequence[int]) -> Memory | None:
-        """Return what the task keeps of these environments, None without a task; set the task up the first time.
+    def memory(self, model: mujoco.MjModel, mapping: SpaceMapping, n: int) -> Memory | None:
+        """Set the task up and return what it keeps of `n` environments; None without a task.
 
-        From then on it serves no other environment, until `release`.
+        From then on the task serves no other environment, until `release`.
         """
         if self.task is None:
             return None
-        if self.scene is None:
-            _SERVING[id(self.task)] = self
-            self.scene = TaskScene(model, mapping)
-            self.task.setup(self.scene)
-        return Memory(self.task, self.scene, index)
+        _SERVING[id(self.task)] = self
+        scene = TaskScene(model, mapping)
+        self.task.setup(scene)
+        return Memory(self.task, scene, n)
 
     def release(self) -> None:
         """Let the task serve another environment."""
         if self.task is not None and _SERVING.get(id(self.task)) is self:
             del _SERVING[id(self.task)]
+
+
+def _at_least_1(name: str, value: Any) -> int:
+    found = integer(name, value)
+    if found < 1:
+        raise ValueError(f"{name} must be at least 1, not {found}")
+    return found
 
 
 class _NoTask(Task):
@@ -174,6 +153,13 @@ def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
     warns about it.
     """
     return {"step_mode": "direct", "mujoco_version_check": False, **options}
+
+
+def served_address(address: str, randomise: Randomisation | None) -> str:
+    """Return an address whose server, if it is started for it, varies its scene and honours the model's `<option>`."""
+    if randomise is not None and address.startswith(SCHEME):
+        address = with_option(address, "randomise", randomise.to_json())
+    return with_model_options(address)
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:

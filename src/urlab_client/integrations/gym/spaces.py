@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import control_counts
+from urlab_client.aio.arguments import collection
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, driven_joint
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import CameraMode
@@ -61,21 +62,10 @@ class Actions:
                 raise ValueError(f"actions: {name} contains NaN or infinity")
 
 
-@dataclass(frozen=True)
-class _Articulation:
-    layout: ArticulationLayout
-    low: Floats
-    high: Floats
-    widths: Mapping[Field, int]
-    scale: Floats
-    offset: Floats
-    clip: tuple[float, float] | None
-
-
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
     """Return the fields of an observation level, or the given field names."""
     if not isinstance(observations, str):
-        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping rejects unknown names
+        return tuple(collection("observations", observations))  # type: ignore[return-value]  # SpaceMapping rejects others
     if observations not in LEVELS:
         raise ValueError(
             f"observations must be {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
@@ -101,6 +91,7 @@ class SpaceMapping:
         prefixes: Prefix of the compiled element names of each articulation, by key.
         action_space: `Box(n,)`, or `Dict` of one `Box` per articulation.
         observation_space: `Box(n,)`, or `Dict` of one `Dict` of fields per articulation.
+        n_actions: Number of actuator inputs: the length of `flat`.
     """
 
     def __init__(
@@ -146,29 +137,45 @@ class SpaceMapping:
         self._model = model
         self.prefixes: dict[str, str] = dict(prefixes)
         self._targets = targets
-        self._parts = {key: _part(model, each, targets) for key, each in articulation_layouts(model, prefixes).items()}
-        self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
-        if actions is not None:
-            declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else actions
-            if wrong := declared.keys() - self._parts.keys():
-                raise ValueError(
-                    f"actions of {', '.join(sorted(wrong))}; the articulations are: {', '.join(self.keys)}"
-                )
-            self._parts |= {key: self._scaled(key, each) for key, each in declared.items()}
-        self._where = self._slices()
-        ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
-        self._n_actions = ends[-1]
-        self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
+        self._layouts = articulation_layouts(model, prefixes)
+        ends = list(itertools.accumulate(len(layout.ctrl_adr) for layout in self._layouts.values()))
+        self._inputs = {key: slice(a, b) for key, a, b in zip(prefixes, [0, *ends], ends, strict=False) if b > a}
+        self.n_actions: int = ends[-1]
+        # Of all articulations in their order, shape (n_actions,).
+        self._low, self._high = np.full((2, self.n_actions), np.inf) * [[-1.0], [1.0]]
+        self._scale, self._offset = np.ones(self.n_actions), np.zeros(self.n_actions)
+        self._clip = self._low.copy(), self._high.copy()
+        for key, where in self._inputs.items():
+            self._low[where], self._high[where] = self._bounds(key)
+        declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else dict(actions or {})
+        if wrong := declared.keys() - prefixes.keys():
+            raise ValueError(f"actions of {', '.join(sorted(wrong))}; the articulations are: {', '.join(self.keys)}")
+        for key, each in declared.items():
+            self._declare(key, each)
         self.action_space: Space = self._make_action_space()
+        widths = [(key, field, self.width(key, field)) for key in self.observed for field in self.fields]
+        ends = list(itertools.accumulate(width for *_, width in widths))
+        self._where = {
+            (key, field): slice(end - width, end) for (key, field, width), end in zip(widths, ends, strict=True)
+        }
         self.observation_space: Space = self._make_observation_space()
 
     def layout(self, key: str) -> ArticulationLayout:
         """Return the layout of an articulation's values in the compiled model."""
-        return self._parts[key].layout
+        return self._layouts[key]
 
     def width(self, key: str, field: Field) -> int:
         """Return the length of a field of an articulation."""
-        return self._parts[key].widths[field]
+        layout = self._layouts[key]
+        match field:
+            case "qpos":
+                return len(layout.qpos_adr)
+            case "qvel":
+                return len(layout.qvel_adr)
+            case "ctrl" | "act":
+                return len(layout.ctrl_adr)
+            case "sensors":
+                return sum(layout.sensor_dims.values())
 
     def keyframe_id(self, name: str) -> int:
         """Return the id of a keyframe, by its own name or that of the compiled scene.
@@ -195,36 +202,49 @@ class SpaceMapping:
         model, key = self._model, -1 if keyframe is None else self.keyframe_id(keyframe)
         ctrl, qpos = (np.zeros(model.nu), model.qpos0) if key < 0 else (model.key_ctrl[key], model.key_qpos[key])
         found: dict[str, Floats] = {}
-        for name in self._driven:
+        for name in self._inputs:
             found[name] = np.array(ctrl[self.layout(name).ctrl_adr], dtype=np.float64)
-            for place, joint in _driven_joints(model, self.layout(name), self._targets):
+            for place, joint in self._driven_joints(name):
                 found[name][place] = qpos[model.jnt_qposadr[joint]]
         return found
 
     def flat(self, action: Any) -> Floats:
-        """Return actions as one array, shape (…, n_actions): the articulations with actuators in their order."""
-        if self.mode == "dict":
-            return np.concatenate([np.asarray(action[key], dtype=np.float64) for key in self._driven], axis=-1)
-        return np.asarray(action, dtype=np.float64)
+        """Return actions as one array, shape (…, n_actions): the articulations with actuators in their order.
 
-    @property
-    def n_actions(self) -> int:
-        """Number of actuator inputs: the length of `flat`."""
-        return self._n_actions
+        Raises:
+            ValueError: The action has the wrong shape, or contains NaN or infinity.
+        """
+        if self.mode == "flat":
+            whole = np.asarray(action, dtype=np.float64)
+            _check_width("the action", whole, self.n_actions)
+        else:
+            if set(action) != set(self._inputs):
+                raise ValueError(
+                    f"the action needs one entry for each of {', '.join(self._inputs)}, not {sorted(action)}"
+                )
+            parts = {key: np.asarray(action[key], dtype=np.float64) for key in self._inputs}
+            for key, where in self._inputs.items():
+                _check_width(f"the action of {key}", parts[key], where.stop - where.start)
+            whole = np.concatenate([*parts.values()], axis=-1)
+        if not np.isfinite(whole).all():
+            raise ValueError(f"the action contains NaN or infinity: {whole}")
+        return whole
 
     def actions(self, key: str) -> Actions:
         """Return how the actions of an articulation become set-points, with one number per actuator input."""
-        part = self._parts[key]
-        clip = (-np.inf, np.inf) if part.clip is None else part.clip
-        return Actions(scale=part.scale.tolist(), offset=part.offset.tolist(), clip=clip)
+        where = self._inputs.get(key, slice(0))
+        low, high = (
+            float(next(iter(bound[where]), end)) for bound, end in zip(self._clip, (-np.inf, np.inf), strict=True)
+        )
+        return Actions(scale=self._scale[where].tolist(), offset=self._offset[where].tolist(), clip=(low, high))
 
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
         """Return the names of the hinge and slide joints of an articulation: joints with a scalar position."""
-        return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
+        return [name for name, i in self.layout(key).joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
 
     def scalar_joints(self, key: str, model: mujoco.MjModel) -> NDArray[np.intp]:
         """Return the ids of the joints in `joint_names`."""
-        joints = self._parts[key].layout.joints
+        joints = self.layout(key).joints
         return np.array([joints[name] for name in self.joint_names(key, model)], dtype=np.intp)
 
     def set_points(self, action: Any) -> dict[str, Floats]:
@@ -233,41 +253,31 @@ class SpaceMapping:
         Raises:
             ValueError: The action has the wrong shape, or contains NaN or infinity.
         """
-        if self.mode == "dict":
-            if set(action) != set(self._driven):
-                wanted = ", ".join(self._driven)
-                raise ValueError(f"the action needs one entry for each of {wanted}, not {sorted(action)}")
-            found = {key: np.asarray(action[key], dtype=np.float64) for key in self._driven}
-        else:
-            whole = np.asarray(action, dtype=np.float64)
-            if whole.ndim == 0 or whole.shape[-1] != self._n_actions:
-                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {self._n_actions} long")
-            found = {key: whole[..., where] for key, where in self._actions.items() if key in self._driven}
-        for key, values in found.items():
-            n_ctrl = len(self._parts[key].low)
-            if values.ndim == 0 or values.shape[-1] != n_ctrl:
-                raise ValueError(f"the action of {key} has shape {values.shape}; its last axis must be {n_ctrl} long")
-            if not np.isfinite(values).all():
-                raise ValueError(f"the action of {key} contains NaN or infinity: {values}")
-            part = self._parts[key]
-            if part.clip is not None:
-                found[key] = part.offset + part.scale * np.clip(values, *part.clip)
-        return found
+        return self.split(self.scaled(self.flat(action)))
 
-    def _scaled(self, key: str, actions: Actions) -> _Articulation:
-        """Return an articulation whose actions become set-points as declared."""
-        part = self._parts[key]
-        offset = self.held(actions.offset)[key] if isinstance(actions.offset, str) else actions.offset
+    def scaled(self, flat: Floats) -> Floats:
+        """Return the set-points of all articulations, shape (…, n_actions), from actions likewise."""
+        return self._offset + self._scale * np.clip(flat, *self._clip)
+
+    def split(self, flat: Floats) -> dict[str, Floats]:
+        """Return the part of each articulation with actuators, as a view, shape (…, n_ctrl)."""
+        return {key: flat[..., where] for key, where in self._inputs.items()}
+
+    def _declare(self, key: str, actions: Actions) -> None:
+        """Let the actions of an articulation become set-points as declared."""
+        where = self._inputs.get(key, slice(0))
+        offset = actions.offset
+        if isinstance(offset, str):
+            offset = self.held(offset).get(key, np.zeros(0))
         try:
-            scale, offset = (
-                np.broadcast_to(np.asarray(v, np.float64), part.low.shape) for v in (actions.scale, offset)
-            )
+            self._scale[where], self._offset[where] = actions.scale, offset
         except ValueError:
             raise ValueError(
-                f"actions of {key}: scale and offset take one number, or one for each of the {len(part.low)} inputs"
+                f"actions of {key}: scale and offset take one number, or one for each of the "
+                f"{len(self._low[where])} inputs"
             ) from None
-        low, high = (np.full(part.low.shape, bound) for bound in actions.clip)
-        return replace(part, low=low, high=high, scale=scale, offset=offset, clip=actions.clip)
+        for bound, clip, value in zip((self._low, self._high), self._clip, actions.clip, strict=True):
+            bound[where] = clip[where] = value
 
     def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
         """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
@@ -293,69 +303,51 @@ class SpaceMapping:
             return observation[key][field]
         return observation[..., self._where[key, field]]
 
-    def _slices(self) -> dict[tuple[str, Field], slice]:
-        where: dict[tuple[str, Field], slice] = {}
-        at = 0
-        for key in self.observed:
-            part = self._parts[key]
-            for field in self.fields:
-                where[key, field] = slice(at, at + part.widths[field])
-                at += part.widths[field]
-        return where
-
     def _make_action_space(self) -> Space:
         if self.mode == "dict":
-            parts = {key: self._parts[key] for key in self._driven}
-            return dict_space({key: _bounded(part.low, part.high) for key, part in parts.items()})
-        parts = self._parts.values()
-        return _bounded(np.concatenate([part.low for part in parts]), np.concatenate([part.high for part in parts]))
+            return dict_space({key: _bounded(self._low[at], self._high[at]) for key, at in self._inputs.items()})
+        return _bounded(self._low, self._high)
 
     def _make_observation_space(self) -> Space:
-        seen = {key: self._parts[key] for key in self.observed}
         if self.mode == "flat":
-            return _unbounded(sum(part.widths[field] for part in seen.values() for field in self.fields))
+            return unbounded(sum(where.stop - where.start for where in self._where.values()))
         return dict_space(
             {
-                key: dict_space({field: _unbounded(part.widths[field]) for field in self.fields})
-                for key, part in seen.items()
+                key: dict_space({field: unbounded(self.width(key, field)) for field in self.fields})
+                for key in self.observed
             }
         )
 
+    def _bounds(self, key: str) -> tuple[Floats, Floats]:
+        """Return the lowest and highest set-points of an articulation."""
+        model, address = self._model, self.layout(key).ctrl_adr
+        limited = model.actuator_ctrllimited[address].astype(bool)
+        low, high = np.array(model.actuator_ctrlrange[address], dtype=np.float64).T
+        for place, joint in self._driven_joints(key):
+            limited[place], (low[place], high[place]) = model.jnt_limited[joint], model.jnt_range[joint]
+        return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
-def _driven_joints(
-    model: mujoco.MjModel, layout: ArticulationLayout, targets: frozenset[int]
-) -> Iterator[tuple[int, int]]:
-    """Yield the place among an articulation's controls and the joint of each actuator in `targets`."""
-    place, counts = 0, control_counts(model)
-    for actuator in layout.actuators.values():
-        joint = driven_joint(model, actuator) if actuator in targets else None
-        if joint is not None:
-            yield place, joint
-        place += int(counts[actuator])
+    def _driven_joints(self, key: str) -> Iterator[tuple[int, int]]:
+        """Yield the place among an articulation's controls and the joint of each actuator that a controller drives."""
+        place, counts = 0, control_counts(self._model)
+        for actuator in self.layout(key).actuators.values():
+            joint = driven_joint(self._model, actuator) if actuator in self._targets else None
+            if joint is not None:
+                yield place, joint
+            place += int(counts[actuator])
 
 
-def _part(model: mujoco.MjModel, layout: ArticulationLayout, targets: frozenset[int]) -> _Articulation:
-    address = layout.ctrl_adr
-    limited = model.actuator_ctrllimited[address].astype(bool)
-    low, high = np.array(model.actuator_ctrlrange[address], dtype=np.float64).T
-    for place, joint in _driven_joints(model, layout, targets):
-        limited[place], (low[place], high[place]) = model.jnt_limited[joint], model.jnt_range[joint]
-    widths: dict[Field, int] = {
-        "qpos": len(layout.qpos_adr),
-        "qvel": len(layout.qvel_adr),
-        "ctrl": len(address),
-        "act": len(address),
-        "sensors": int(sum(model.sensor_dim[i] for i in layout.sensors.values())),
-    }
-    low, high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
-    return _Articulation(layout, low, high, widths, np.ones(len(address)), np.zeros(len(address)), None)
+def _check_width(what: str, values: Floats, width: int) -> None:
+    if values.ndim == 0 or values.shape[-1] != width:
+        raise ValueError(f"{what} has shape {values.shape}; its last axis must be {width} long")
 
 
 def _bounded(low: Floats, high: Floats) -> Space:
     return spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
-def _unbounded(n: int) -> Space:
+def unbounded(n: int) -> Space:
+    """Return the space of `n` numbers without bounds."""
     return spaces.Box(-np.inf, np.inf, (n,), dtype=np.float64)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from urlab_client.aio.arguments import require
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.integrations.gym.spaces import Actions, Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.integrations.gym.spaces import Actions, Space, SpaceMapping, SpaceMode, dict_space, unbounded
 from urlab_client.protocol.base import Floats
 from urlab_client.values.names import NameMap, element_ids
 
@@ -294,35 +294,22 @@ class States:
 
 
 class Memory:
-    """What a task keeps of each of n environments: goal, actions, and the arrays of `Task.memory`, reset with it.
+    """What a task keeps of each of n environments: goal, actions, and the arrays of `Task.memory`, reset with it."""
 
-    Args:
-        task: The task, set up.
-        scene: Its scene.
-        index: Indices of the environments.
-    """
-
-    def __init__(self, task: Task, scene: TaskScene, index: Sequence[int]) -> None:
-        self.index: NDArray[np.intp] = np.array(index, dtype=np.intp)
-        n = len(index)
+    def __init__(self, task: Task, scene: TaskScene, n: int) -> None:
         self._task = task
         self._scene = scene
-        self._goals: list[dict[str, Floats]] = [{} for _ in index]
+        self._goals: list[dict[str, Floats]] = [{} for _ in range(n)]
         self._kept = {name: np.zeros((n, *shape)) for name, shape in task.memory.items()}
         self._actions = np.zeros((2, n, scene.mapping.n_actions))
 
-    def begin(self, row: int, rng: np.random.Generator, qpos: Floats) -> Floats:
+    def begin(self, i: int, rng: np.random.Generator, qpos: Floats) -> Floats:
         """Let the task choose the start of an episode; return its positions, shape (nq,)."""
         for values in (*self._kept.values(), *self._actions):
-            values[row] = 0.0
-        start = Start(
-            self._scene,
-            qpos.copy(),
-            int(self.index[row]),
-            {name: values[row, ...] for name, values in self._kept.items()},
-        )
+            values[i] = 0.0
+        start = Start(self._scene, qpos.copy(), i, {name: values[i, ...] for name, values in self._kept.items()})
         self._task.reset(rng, start)
-        self._goals[row] = start.goal
+        self._goals[i] = start.goal
         return start.qpos
 
     def updated(self, rows: NDArray[np.intp], actions: Floats, qpos: Floats, qvel: Floats, time: Floats) -> States:
@@ -347,8 +334,8 @@ class Memory:
             qpos,
             qvel,
             time,
-            [self._goals[int(row)] for row in rows],
-            index=self.index[rows],
+            [self._goals[int(i)] for i in rows],
+            index=rows,
             last_action=last,
             previous_action=previous,
             memory=memory,
@@ -381,53 +368,32 @@ class EpisodeEnd:
     goal: Mapping[str, Floats]
 
 
-def joined(parts: Sequence[States | None]) -> States:
-    """Return the states of environments 0 to n - 1 as one. A missing state (None) repeats the first known one."""
-    known = next((part for part in parts if part is not None), None)
-    if known is None:
-        raise ValueError("no environment has a state")
-    rows = [known if part is None else part for part in parts]
-
-    def column(name: str) -> Floats:
-        return np.concatenate([getattr(row, name) for row in rows])
-
-    return States(
-        known.scene,
-        column("qpos"),
-        column("qvel"),
-        column("time"),
-        [row.goal_of(0) for row in rows],
-        index=np.concatenate([row.index for row in rows]),
-        last_action=column("last_action"),
-        previous_action=column("previous_action"),
-        memory={name: np.concatenate([row.memory[name] for row in rows]) for name in known.memory},
-    )
-
-
-def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools, Bools | None]:
-    """Return the rewards, the terminations and the successes (None if the task defines none), checked.
-
-    Raises:
-        ValueError: A method of the task returned the wrong shape, or NaN or infinity.
-    """
-    rewards = _answer(task, "reward", task.reward(states, actions), len(states))
+def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools]:
+    """Return the rewards and the terminations; refuse wrong shapes, NaN and infinity."""
+    rewards = _answer(task, "reward", task.reward(states, actions), len(states)).astype(np.float64)
     if not np.isfinite(rewards).all():
         first = int(np.flatnonzero(~np.isfinite(rewards))[0])
         raise ValueError(
             f"{type(task).__name__}.reward() returned {rewards[first]} for environment {states.index[first]}"
         )
-    terminated = _answer(task, "terminated", task.terminated(states), len(states)).astype(bool)
-    return rewards.astype(np.float64), terminated, succeeded(task, states)
+    return rewards, _answer(task, "terminated", task.terminated(states), len(states)).astype(bool)
 
 
 def succeeded(task: Task, states: States) -> Bools | None:
-    """Return which states are a success, shape (n,), or None if the task defines none.
-
-    Raises:
-        ValueError: The task returned the wrong shape.
-    """
+    """Return which states are a success, shape (n,), or None if the task defines none."""
     success = task.success(states)
     return None if success is None else _answer(task, "success", success, len(states)).astype(bool)
+
+
+def observed(task: Task, states: States) -> Floats:
+    """Return what a task observes, shape (n, n_observed)."""
+    found = np.asarray(task.observe(states))
+    if found.shape[-1:] != (task.n_observed,):
+        raise ValueError(
+            f"{type(task).__name__}.observe() returned {found.shape[-1] if found.ndim else 0} numbers; "
+            f"n_observed is {task.n_observed}"
+        )
+    return found
 
 
 def _answer(task: Task, hook: str, answer: Any, n: int) -> NDArray[Any]:
@@ -441,11 +407,7 @@ def _answer(task: Task, hook: str, answer: Any, n: int) -> NDArray[Any]:
 
 
 def check_spelling(task: Task) -> None:
-    """Check that the hooks and attributes of a task are the ones that environments use.
-
-    Raises:
-        ValueError: A name is nearly that of a hook or attribute, or a hook takes other arguments.
-    """
+    """Refuse a name that is nearly that of a hook or attribute of `Task`, and a hook that takes other arguments."""
     kind = type(task)
     own = {name for one in kind.__mro__ if issubclass(one, Task) and one is not Task for name in vars(one)}
     for name in sorted(own | vars(task).keys()):
@@ -469,24 +431,9 @@ def with_task(space: Space, task: Task | None) -> Space:
     if task is None or not task.n_observed:
         return space
     if isinstance(space, spaces.Dict):
-        added = spaces.Box(-np.inf, np.inf, (task.n_observed,), dtype=np.float64)
-        return dict_space({**cast("Mapping[str, Space]", space), "task": added})
-    return spaces.Box(-np.inf, np.inf, (int(np.prod(space.shape or ())) + task.n_observed,), dtype=np.float64)
-
-
-def add_observed(observation: Observation, task: Task, observed: Floats) -> Observation:
-    """Add what a task observes, shape (…, n_observed), to an observation with the same leading axes."""
-    found = np.shape(observed)[-1:]
-    if found != (task.n_observed,):
-        raise ValueError(
-            f"{type(task).__name__}.observe() returned {found[0] if found else 0} numbers; "
-            f"n_observed is {task.n_observed}"
-        )
-    if not task.n_observed:
-        return observation
-    if isinstance(observation, dict):
-        return {**cast("dict[str, Observation]", observation), "task": observed}
-    return np.concatenate([observation, observed], axis=-1)
+        by_name = cast("Mapping[str, Space]", space)
+        return dict_space({**by_name, "task": unbounded(task.n_observed)})
+    return unbounded(int(np.prod(space.shape or ())) + task.n_observed)
 
 
 class Task:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Unpack
@@ -14,97 +16,95 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from urlab_client._platform.processors import processor_count
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option
+from urlab_client.aio.launch import SCHEME, with_option
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations.gym.episode import EnvEpisode
-from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults
-from urlab_client.integrations.gym.spaces import Observation
-from urlab_client.integrations.gym.task import States, joined
-from urlab_client.integrations.gym.vectorized import Applied, Indices, Vectorized, put
-from urlab_client.protocol.base import Floats
+from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
+from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
 
-def _processors() -> int:
-    """Return how many servers may start at the same time: each occupies a processor until it is up."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+class OverWire(Vectorized):
+    """Environments that are each over a client of their own."""
+
+    def __init__(self, first: EnvEpisode, num_envs: int, autoreset_mode: AutoresetMode) -> None:
+        super().__init__(first, num_envs, autoreset_mode, first.randomise)
+        self._qpos = np.tile(first.model.qpos0, (num_envs, 1))
+        self._qvel = np.zeros((num_envs, first.model.nv))
+        self._time = np.zeros(num_envs)
+
+    @abstractmethod
+    async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
+        """Return the episodes of an environment, for a reset (`starting`) or a step."""
+
+    async def _move_one(self, i: int, keyframe: str | None, applied: Applied | None) -> None:
+        """Reset an environment, or apply its part of what all do."""
+        episode = await self._episode(i, starting=applied is None)
+        if applied is None:
+            seed = self._disturbances[i].seed if self._disturbances else None
+            begin = None if self._memory is None else partial(self._memory.begin, i)
+            observation = await episode.reset(self.rngs[i], keyframe, seed, begin)
+        else:
+            now, before, late, forces = applied
+            observation = await episode.step(now[i], forces.get(i, {}), before[i], int(late[i]))
+        put(self._fields, i, observation)
+        self._qpos[i], self._qvel[i], self._time[i] = episode.state()
+        self._step_count[i] = episode.client.step_count
+
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        return self._qpos, self._qvel, self._time
 
 
+@dataclass(eq=False)
 class _Session:
-    """One environment: its client, and the arguments for starting it again."""
+    """The client of one environment, and how to start it again."""
 
-    def __init__(
-        self,
-        address: str,
-        starts: asyncio.Semaphore,
-        client_options: Mapping[str, Any],
-        *,
-        settings: EpisodeSettings,
-        randomise: Randomisation | None,
-        index: int,
-    ) -> None:
-        self.address = address
-        self._index = index
-        self.restarts = -1
-        self.episode: EnvEpisode | None = None
-        self._starts = starts
-        self._client_options = client_options
-        self._settings = settings
-        self._randomise = randomise
-        self._opening: asyncio.Task[None] | None = None
-        self._earlier: EnvEpisode | None = None
+    address: str
+    client_options: Mapping[str, Any]
+    settings: EpisodeSettings
+    randomise: Randomisation | None
+    starts: asyncio.Semaphore
+    restarts: int = -1
+    episode: EnvEpisode | None = None
+    opening: asyncio.Task[None] | None = None
+    earlier: EnvEpisode | None = None
 
-    async def reset(self, rng: np.random.Generator, keyframe: str | None, seed: int | None) -> Observation:
-        """Start an episode. Without a session, start one; cancelling this call does not stop that."""
+    async def ready(self) -> EnvEpisode:
+        """Return the episodes. Without a client, start one; cancelling this call does not stop that."""
         if self.episode is None:
-            opening = self._opening or self.reopen()
+            opening = self.opening or self.reopen()
             await asyncio.shield(opening)
         if self.episode is None:
             raise URLabError("The environment was closed.")
-        return await self.episode.reset(rng, keyframe, seed)
-
-    async def step(self, forces: Mapping[str, Floats], applied: Applied) -> Observation:
-        """Apply set-points and forces for one action."""
-        if self.episode is None:
-            raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
-        i = self._index
-        now, before = (
-            {key: values[i] for key, values in each.items()} for each in (applied.set_points, applied.before)
-        )
-        return await self.episode.step(now, forces, applied.actions[i], before, int(applied.late[i]))
+        return self.episode
 
     def reopen(self) -> asyncio.Task[None]:
         """Drop the session and begin to start a new one, which the next reset waits for."""
-        if self._opening is None:
-            self._opening = background_task("urlab-environment", self._reopen())
-            self._opening.add_done_callback(self._opened)
-        return self._opening
+        if self.opening is None:
+            self.opening = background_task("urlab-environment", self._reopen())
+        return self.opening
 
     async def close(self) -> None:
-        """Close the client, and let the task serve another environment."""
-        self._settings.release()
-        if self._opening is not None:
-            self._opening.cancel()
-            await asyncio.wait((self._opening,))
+        """Close the client."""
+        if self.opening is not None:
+            self.opening.cancel()
+            await asyncio.wait((self.opening,))
         if self.episode is not None:
             await self.episode.close()
         await self._close_client()
 
     async def open(self) -> None:
         """Start the session as soon as a start slot is free."""
-        async with self._starts:
-            client = URLabClient(with_model_options(self.address), **self._client_options)
+        async with self.starts:
+            client = URLabClient(self.address, **self.client_options)
             try:
                 await client.discover()
-                self.episode = self._earlier = EnvEpisode(
-                    client,
-                    settings=self._settings,
-                    randomise=self._randomise,
-                    earlier=self._earlier,
-                    index=self._index,
+                self.episode = self.earlier = EnvEpisode(
+                    client, settings=self.settings, randomise=self.randomise, earlier=self.earlier
                 )
             except BaseException:
                 await client.close()
@@ -112,19 +112,19 @@ class _Session:
         self.restarts += 1
 
     async def _reopen(self) -> None:
-        await self._close_client()
-        await self.open()
+        try:
+            await self._close_client()
+            await self.open()
+        finally:
+            self.opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
     async def _close_client(self) -> None:
         episode, self.episode = self.episode, None
         if episode is not None:
             await episode.client.close()
 
-    def _opened(self, task: asyncio.Task[None]) -> None:
-        self._opening = None  # a waiting reset raises its error; otherwise the next reset tries again
 
-
-class URLabVectorEnv(Vectorized):
+class URLabVectorEnv(OverWire):
     """Environments over several servers at once, in lockstep.
 
     Each environment has its own session and, with `sim://`, its own server process. One event loop in a background
@@ -178,44 +178,23 @@ class URLabVectorEnv(Vectorized):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
-        settings = EpisodeSettings.of(**options)
+        settings = EpisodeSettings(**options)
         declared = None if randomise is None else Randomisation.of(randomise)
-        if declared is not None:
-            text = declared.to_json()
-            addresses = [with_option(a, "randomise", text) for a in addresses]
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
         client_options = client_defaults(client_options)
-        starts = asyncio.Semaphore(_processors())
+        starts = asyncio.Semaphore(processor_count())
         self._sessions = [
-            _Session(
-                with_option(address, "start-timeout", f"{start_timeout:g}", default=True),
-                starts,
-                client_options,
-                settings=settings,
-                randomise=declared,
-                index=i,
-            )
-            for i, address in enumerate(addresses)
+            _Session(served_address(address, declared), client_options, settings, declared, starts)
+            for address in (with_option(a, "start-timeout", f"{start_timeout:g}", default=True) for a in addresses)
         ]
         self._portal = Portal()
         try:
-            first = self._portal.call(self._open_all)
+            super().__init__(self._portal.call(self._open_all), len(addresses), autoreset_mode)
         except BaseException:
-            self.close_extras()
+            self._portal.close(self._close_all)
             raise
-        super().__init__(
-            num_envs=len(addresses),
-            settings=settings,
-            mapping=first.mapping,
-            observation_space=first.observation_space,
-            autoreset_mode=autoreset_mode,
-            randomise=first.randomise,
-        )
-        self._seen: dict[int, States] = {}
         self._pictures: dict[int, NDArray[np.uint8]] = {}
-        self._sim_time = np.zeros(self.num_envs)
-        self._step_count = np.zeros(self.num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the picture of each environment after the last reset or step, shape (H, W, 3), RGB.
@@ -236,7 +215,8 @@ class URLabVectorEnv(Vectorized):
         return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the clients and the servers that they started."""
+        """Close the clients and the servers that they started, and let the task serve another environment."""
+        super().close_extras(**kwargs)
         self._portal.close(self._close_all)
 
     async def _open_all(self) -> EnvEpisode:
@@ -254,70 +234,53 @@ class URLabVectorEnv(Vectorized):
     async def _close_all(self) -> None:
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
-    def _advance(
-        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
-    ) -> Mapping[int, Exception]:
-        calls: dict[int, Callable[[], Coroutine[Any, Any, Observation]]] = {}
-        for i in map(int, fresh):
-            seed = self._disturbances[i].seed if self._disturbances else None
-            calls[i] = partial(self._sessions[i].reset, self._rngs[i], keyframe, seed)
-        forces = self._forces(acting)
-        for i in map(int, acting):
-            calls[i] = partial(self._sessions[i].step, forces.get(i, {}), applied)
-        errors: dict[int, Exception] = {}
-        for i, result in self._portal.call(self._all, calls).items():
-            if isinstance(result, Exception):
-                errors[i] = result
-            else:
-                put(self._observations, i, result)
-        return errors
-
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return the values drawn for the episode of an environment; see `URLabEnv.draws`."""
         episode = self._sessions[index].episode
         return None if episode is None else episode.draws()
 
-    def _states(self, indices: Indices) -> States:
-        for i in map(int, indices):
-            episode = self._sessions[i].episode
-            if episode is not None:
-                self._seen[i] = episode.states()
-        return joined([self._seen.get(i) for i in map(int, indices)])
-
     def _clocks(self) -> dict[str, NDArray[Any]]:
-        for i, session in enumerate(self._sessions):
-            if session.episode is not None:
-                client = session.episode.client
-                self._sim_time[i], self._step_count[i] = client.sim_time, client.step_count
         restarts = np.array([session.restarts for session in self._sessions], dtype=np.int64)
-        return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
+        return {**super()._clocks(), "restarts": restarts}
 
-    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, Observation]]]) -> dict[int, Any]:
-        """Return the observation or the failure of each environment; begin to replace those that were lost."""
-        tasks = {i: asyncio.create_task(call()) for i, call in calls.items()}
-        late: set[asyncio.Task[Observation]] = set()
+    async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
+        session = self._sessions[i]
+        if not starting and session.episode is None:
+            raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
+        return await session.ready()
+
+    def _advance(
+        self, fresh: Indices, keyframe: str | None, acting: Indices, applied: Applied
+    ) -> Mapping[int, Exception]:
+        return self._portal.call(self._move_all, fresh.tolist(), keyframe, acting.tolist(), applied)
+
+    async def _move_all(
+        self, fresh: list[int], keyframe: str | None, acting: list[int], applied: Applied
+    ) -> dict[int, Exception]:
+        """Reset and step environments; return the failures, and begin to replace the clients that were lost."""
+        tasks = {i: asyncio.create_task(self._move_one(i, keyframe, None)) for i in fresh}
+        tasks |= {i: asyncio.create_task(self._move_one(i, keyframe, applied)) for i in acting}
         try:
             # One deadline for all: a deadline per environment would cost a tenth of the client's work.
             await asyncio.wait(tasks.values(), timeout=self._step_timeout)
         finally:
-            for task in tasks.values():
-                if not task.done():
-                    late.add(task)
-                    task.cancel()
+            late = [task for task in tasks.values() if not task.done()]
+            for task in late:
+                task.cancel()
             if late:
                 await asyncio.wait(late)
-        results: dict[int, Any] = {}
+        errors: dict[int, Exception] = {}
         for i, task in tasks.items():
             if task in late and task.cancelled():
                 what = "did not answer" if self._sessions[i].episode else "is still starting"
-                results[i] = TimeoutError(f"environment {i} {what} within {self._step_timeout:g} s")
+                errors[i] = TimeoutError(f"environment {i} {what} within {self._step_timeout:g} s")
                 continue
             try:
-                results[i] = task.result()
+                task.result()
             except Exception as error:  # noqa: BLE001 - reported in `infos`
                 error.add_note(f"environment {i} at {self._addresses[i]}")
-                results[i] = error
-        for i, result in results.items():
-            if isinstance(result, Exception) and not refused_for_good(result):
+                errors[i] = error
+        for i, failure in errors.items():
+            if not refused_for_good(failure):
                 self._sessions[i].reopen()
-        return results
+        return errors

@@ -1,11 +1,10 @@
-"""Base of the vector environments: individually ending episodes, rewards in one call, and autoreset."""
+"""What all environments have in common, for n environments at once: disturbances, rewards, ends, autoreset, infos."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -15,9 +14,10 @@ from numpy.typing import NDArray
 
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations.gym.disturbances import Disturbances
-from urlab_client.integrations.gym.settings import EpisodeSettings, RewardFn, TerminationFn, keyframe_option
+from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
-from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, succeeded
+from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, observed, succeeded, with_task
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
@@ -26,24 +26,23 @@ Indices = NDArray[np.intp]
 _NONE = np.zeros(0, dtype=np.intp)
 
 
-@dataclass(frozen=True, slots=True)
-class Applied:
+class Applied(NamedTuple):
     """What all environments do during one action.
 
     Attributes:
-        actions: The actions, shape (environments, n_actions).
-        set_points: Set-points of each articulation, shape (environments, n_ctrl).
+        set_points: Set-points of all articulations, shape (environments, n_actions).
         before: Set-points that are in force during the first `late` physics steps of the action, likewise.
         late: Number of these physics steps, shape (environments,).
+        forces: Forces on bodies, N, world frame, shape (3,), by environment; those without a push are omitted.
     """
 
-    actions: Floats
-    set_points: Mapping[str, Floats]
-    before: Mapping[str, Floats]
+    set_points: Floats
+    before: Floats
     late: Indices
+    forces: dict[int, Mapping[str, Floats]]
 
 
-_NOTHING = Applied(np.zeros((0, 0)), {}, {}, _NONE)
+_NOTHING = Applied(np.zeros((0, 0)), np.zeros((0, 0)), _NONE, {})
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
@@ -62,6 +61,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         reward_fn: The reward function. If None, rewards are 0.
         termination_fn: The termination function. If None, episodes never terminate.
         autoreset_mode: When environments whose episode ended are reset.
+        rngs: The generator of each environment's episodes.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
@@ -72,16 +72,11 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     single_action_space: Space
 
     def __init__(
-        self,
-        *,
-        num_envs: int,
-        settings: EpisodeSettings,
-        mapping: SpaceMapping,
-        observation_space: Space,
-        autoreset_mode: AutoresetMode,
-        randomise: Randomisation | None,
+        self, first: EnvEpisode, num_envs: int, autoreset_mode: AutoresetMode, randomise: Randomisation | None
     ) -> None:
-        self.mapping = mapping
+        """Set up the task, and arrays for environments like that of `first`."""
+        settings = first.settings
+        mapping = self.mapping = first.mapping
         self.randomise = randomise
         self.task: Task | None = settings.task
         self.reward_fn: RewardFn | None = settings.reward_fn
@@ -98,20 +93,34 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.num_envs = num_envs
         self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space = observation_space
+        self.single_observation_space = with_task(first.observation_space, self.task)
         self.single_action_space = mapping.action_space
-        self.observation_space = batch_space(observation_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(mapping.action_space, num_envs)
-        self._observations: Observation = create_empty_array(observation_space, num_envs)
-        self._sensed: Observation = None
+        self._observations: Observation = create_empty_array(self.single_observation_space, num_envs)
+        # Views of the part that the simulations fill, and of the task's.
+        self._fields, self._of_task = self._observations, None
+        if n_task and mapping.mode == "dict":
+            self._fields = {key: values for key, values in self._observations.items() if key != "task"}
+            self._of_task = self._observations["task"]
+        elif n_task:
+            self._fields, self._of_task = self._observations[:, :-n_task], self._observations[:, -n_task:]
+        self._sensed: Observation = self._observations
         if self._observations_disturbed:
-            self._sensed = create_empty_array(observation_space, num_envs)
+            self._sensed = create_empty_array(self.single_observation_space, num_envs)
+        self._step_count = np.zeros(num_envs, dtype=np.int64)
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._totals = np.zeros(num_envs)
+        self._begun = np.zeros(num_envs, dtype=bool)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
         self._keyframe: str | None = None
-        self._rngs = [np.random.default_rng() for _ in range(num_envs)]
+        self._success: Bools | None = None
+        self._all = np.arange(num_envs)
+        self._all.flags.writeable = False
+        self.rngs: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
+        self._recent: States | None = None
+        self._memory = settings.memory(first.model, mapping, num_envs)
 
     @abstractmethod
     def _advance(
@@ -119,16 +128,15 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     ) -> Mapping[int, Exception]:
         """Reset some environments to a keyframe and step others; return the failures by index.
 
-        `put` the observations of the others into `_observations`.
+        `put` the observations of the others, without the task's part, into `_fields`.
         """
 
     @abstractmethod
-    def _states(self, indices: Indices) -> States:
-        """Return the states of some environments in the form passed to the task."""
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        """Return the positions, velocities and times of all environments, those of an action or episode ago included.
 
-    @abstractmethod
-    def _clocks(self) -> dict[str, NDArray[Any]]:
-        """Return the entries of `infos` that every environment has, by name."""
+        Their shapes are (environments, nq), (environments, nv) and (environments,).
+        """
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -159,16 +167,14 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         super().reset(seed=None)
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
-                self._rngs[i] = np.random.default_rng(seeds[i])
+                self.rngs[i] = np.random.default_rng(seeds[i])
         errors = self._move(np.flatnonzero(mask), keyframe)
         self._started = True
         refusal = next(filter(refused_for_good, errors.values()), None)
         if refusal is not None:
             raise refusal
         self._keyframe = keyframe
-        infos = self._infos(errors)
-        self._add_success(infos, np.flatnonzero(~self._ended))
-        return self._disturbed_observations(), infos
+        return self._shown(), self._infos(errors)
 
     def step(self, actions: Any) -> tuple[Observation, Floats, Bools, Bools, dict[str, Any]]:
         """Step all environments.
@@ -182,32 +188,32 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        set_points = self._set_points(actions)  # validates before anything moves
+        flat = self.mapping.flat(actions)  # validates before anything moves
+        if flat.ndim != 2 or len(flat) != self.num_envs:
+            raise ValueError(f"the actions have shape {flat.shape}; their first axis must be {self.num_envs} long")
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
-        fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
-        before = None if self.reward_fn is None else self._true_observations()
-        errors = self._move(fresh, self._keyframe, acting, self._applied(acting, actions, set_points))
+        fresh, acting = (
+            (np.flatnonzero(resetting), np.flatnonzero(~resetting)) if resetting.any() else (_NONE, self._all)
+        )
+        before = None if self.reward_fn is None else mapped(np.copy, self._observations)
+        errors = self._move(fresh, self._keyframe, acting, flat)
         infos = self._infos(errors)
         stepped = np.zeros(self.num_envs, dtype=bool)
         stepped[acting] = True
         stepped[list(errors)] = False
-        rewards, terminated, states = self._judge(before, actions, stepped, infos)
+        rewards, terminated = self._judged(before, actions, stepped, infos)
         truncated = np.zeros(self.num_envs, dtype=bool)
         if self.max_episode_steps is not None:
             truncated[acting] = self._elapsed[acting] >= self.max_episode_steps
         truncated[list(errors)] = True
         self._ended = terminated | truncated
         self._totals += rewards
-        if self.task is not None and states is not None:
-            successes = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
-            for i in np.flatnonzero(self._ended & stepped).tolist():
-                steps, total = int(self._elapsed[i]), float(self._totals[i])
-                end = EpisodeEnd(i, successes[i], bool(terminated[i]), steps, total, states.goal_of(i))
-                self.task.ended(end)
+        if self.task is not None and self._ended.any():
+            self._tell_ends(self.task, self._ended & stepped, terminated, infos)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._same_step_reset(infos)
-        return self._disturbed_observations(), rewards, terminated, truncated, infos
+        return self._shown(), rewards, terminated, truncated, infos
 
     @property
     def max_episode_steps(self) -> int | None:
@@ -220,129 +226,138 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         found[: len(self._disturbances)] = [disturbances.seed for disturbances in self._disturbances]
         return found
 
+    def close_extras(self, **kwargs: Any) -> None:
+        """Let the task serve another environment."""
+        self._settings.release()
+
     def _move(
         self,
         fresh: Indices,
         keyframe: str | None,
         acting: Indices = _NONE,
-        applied: Applied = _NOTHING,
+        actions: Floats | None = None,
     ) -> Mapping[int, Exception]:
         """Start episodes and continue others; return the failures by index."""
         keyframe = self._settings.keyframe if keyframe is None else keyframe
         for i, disturbances in self._disturbed(fresh):
-            disturbances.begin(self._rngs[i], keyframe)
+            disturbances.begin(self.rngs[i], keyframe)
+        applied = _NOTHING if actions is None else self._applied(acting, self.mapping.scaled(actions))
         errors = self._advance(fresh, keyframe, acting, applied)
-        for i, disturbances in self._disturbed(np.concatenate([fresh, acting])) if self._observations_disturbed else ():
-            put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
-        self._elapsed[fresh], self._totals[fresh] = 0, 0.0
+        moved = acting if not len(fresh) else np.sort(np.concatenate([fresh, acting]))
+        if errors:
+            moved, acted = (np.array([i for i in each if i not in errors], dtype=np.intp) for each in (moved, acting))
+        else:
+            moved, acted = self._all if len(moved) == self.num_envs else moved, acting
+        if self.task is not None and len(moved):
+            self._ask(self.task, moved, acted, actions)
+        if self._observations_disturbed:
+            for i, disturbances in self._disturbed(moved):
+                put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
+        if len(fresh):
+            self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
         self._elapsed[acting] += 1
-        self._ended[fresh] = False
+        self._begun[moved] = True
         self._ended[list(errors)] = True
         return errors
 
-    def _judge(
-        self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]
-    ) -> tuple[Floats, Bools, States | None]:
-        """Return rewards, terminations and, for a task, the states; add `success` to `infos`."""
+    def _ask(self, task: Task, moved: Indices, acted: Indices, actions: Floats | None) -> None:
+        """Let the task update what it keeps after actions; ask what it observes, and for success, after all moves."""
+        self._recent = None
+        if self._memory is not None and actions is not None and len(acted):
+            rows = (values[acted] for values in self._state())
+            self._recent = self._memory.updated(acted, actions[acted], *rows)
+        states = self._states(moved)
+        found, success = observed(task, states), succeeded(task, states)
+        if self._of_task is not None:
+            self._of_task[moved] = found
+        if success is not None:
+            if self._success is None:
+                self._success = np.zeros(self.num_envs, dtype=bool)
+            self._success[moved] = success
+
+    def _states(self, indices: Indices) -> States:
+        """Return the states of some environments in the form passed to the task."""
+        if self._memory is None:
+            raise ValueError("this environment has no task")
+        if self._recent is None or self._recent.index is not indices:
+            self._recent = self._memory.states(indices, *(values[indices] for values in self._state()))
+        return self._recent
+
+    def _judged(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
+        """Return the rewards and terminations."""
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        after = None if self.reward_fn is None and self.termination_fn is None else self._true_observations()
-        failed = infos.get("_error", np.zeros(self.num_envs, dtype=bool))
-        states: States | None = None
-        if self.task is not None and not failed.all():  # otherwise no state may exist
-            states = self._states(np.arange(self.num_envs))
-            rewards, terminated, success = judged(self.task, states, actions)
-            if success is not None:
-                infos["success"], infos["_success"] = success & ~failed, ~failed
+        after = None
+        if self.reward_fn is not None or self.termination_fn is not None:
+            after = mapped(np.copy, self._observations)
+        if self.task is not None and not infos.get("_error", terminated).all():  # otherwise there may be no goal
+            rewards, terminated = judged(self.task, self._states(self._all), actions)
         if self.reward_fn is not None:
             rewards[:] = self.reward_fn(before, actions, after, infos)
         if self.termination_fn is not None:
             terminated[:] = self.termination_fn(after, infos)
         rewards[~stepped] = 0.0
-        return rewards, terminated & stepped, states
+        return rewards, terminated & stepped
+
+    def _tell_ends(self, task: Task, ended: Bools, terminated: Bools, infos: dict[str, Any]) -> None:
+        states = self._states(self._all)
+        success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
+        for i in np.flatnonzero(ended).tolist():
+            steps, total = int(self._elapsed[i]), float(self._totals[i])
+            task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
 
     def _same_step_reset(self, infos: dict[str, Any]) -> dict[str, Any]:
         ended = self._ended.copy()
         final = np.full(self.num_envs, None, dtype=object)
+        shown = self._shown()
         for i in np.flatnonzero(ended):
-            final[i] = _pick(self._sensed if self._observations_disturbed else self._observations, int(i))
+            final[i] = of_one(shown, int(i))
         errors = self._move(np.flatnonzero(ended), self._keyframe)
-        after = self._infos({**_errors_in(infos), **errors})
-        if "success" in infos:
-            after["success"], after["_success"] = infos["success"].copy(), infos["_success"].copy()
-            self._add_success(after, np.flatnonzero(ended))
+        failed = np.flatnonzero(infos.get("_error", _NONE)).tolist()
+        after = self._infos({**{i: infos["error"][i] for i in failed}, **errors})
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
 
-    def _add_success(self, infos: dict[str, Any], fresh: Indices) -> None:
-        """Add the `success` of episodes that have just begun: a reset reports it as a step does."""
-        success = succeeded(self.task, self._states(fresh)) if self.task is not None and len(fresh) else None
-        if success is None:
-            return
-        for name in ("success", "_success"):
-            infos.setdefault(name, np.zeros(self.num_envs, dtype=bool))
-        known = ~infos.get("_error", np.zeros(self.num_envs, dtype=bool))[fresh]
-        infos["success"][fresh], infos["_success"][fresh] = success & known, known
-
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
-        everywhere = np.ones(self.num_envs, dtype=bool)
+        """Return what is known about each environment, and below `_NAME` of which ones it is."""
+        everywhere, failed = np.ones(self.num_envs, dtype=bool), np.zeros(self.num_envs, dtype=bool)
+        failed[list(errors)] = True
         infos: dict[str, Any] = {}
-        clocks = self._clocks()
-        if self._disturbances:
-            clocks["episode_seed"] = self.episode_seeds()
-        for name, values in clocks.items():
+        for name, values in self._clocks().items():
             infos[name], infos[f"_{name}"] = values, everywhere.copy()
+        known = self._begun & ~failed
+        if self._success is not None and known.any():
+            infos["success"], infos["_success"] = self._success & known, known
         if errors:
-            infos["error"] = np.full(self.num_envs, None, dtype=object)
-            infos["_error"] = np.zeros(self.num_envs, dtype=bool)
+            infos["error"], infos["_error"] = np.full(self.num_envs, None, dtype=object), failed
             for i, error in errors.items():
-                infos["error"][i], infos["_error"][i] = error, True
+                infos["error"][i] = error
         return infos
 
-    def _set_points(self, actions: Any) -> dict[str, Floats]:
-        """Return the set-points of each articulation, shape (environments, n_ctrl)."""
-        found = self.mapping.set_points(actions)
-        for key, values in found.items():
-            if values.ndim != 2 or len(values) != self.num_envs:
-                raise ValueError(
-                    f"the actions of {key} have shape {values.shape}; their first axis must be {self.num_envs} long"
-                )
-        return found
+    def _clocks(self) -> dict[str, NDArray[Any]]:
+        """Return the entries of `infos` that every environment has, by name."""
+        clocks: dict[str, NDArray[Any]] = {"sim_time": self._state()[2].copy(), "step_count": self._step_count.copy()}
+        return {**clocks, "episode_seed": self.episode_seeds()} if self._disturbances else clocks
 
-    def _true_observations(self) -> Observation:
-        """Return the true observations, from which rewards and terminations are computed."""
-        return mapped(np.copy, self._observations)
+    def _shown(self) -> Observation:
+        """Return the observations with all disturbances. Rewards and terminations are computed from the true ones."""
+        return mapped(np.copy, self._sensed)
 
-    def _disturbed_observations(self) -> Observation:
-        """Return the observations with all disturbances."""
-        return mapped(np.copy, self._sensed if self._observations_disturbed else self._observations)
-
-    def _applied(self, indices: Indices, actions: Any, set_points: dict[str, Floats]) -> Applied:
-        """Return what takes effect now in some environments, whose actions may be delayed."""
-        flat, late = self.mapping.flat(actions), np.zeros(self.num_envs, dtype=np.intp)
-        if self.randomise is None or not self.randomise.delays_actions:
-            return Applied(flat, set_points, set_points, late)
-        before, now = ({key: values.copy() for key, values in set_points.items()} for _ in range(2))
+    def _applied(self, indices: Indices, set_points: Floats) -> Applied:
+        """Return what takes effect now in some environments, which may be pushed, and whose actions may be delayed."""
+        delayed = self.randomise is not None and self.randomise.delays_actions
+        before = set_points.copy() if delayed else set_points
+        applied = Applied(set_points, before, np.zeros(self.num_envs, dtype=np.intp), {})
         for i, disturbances in self._disturbed(indices):
-            earlier, later = disturbances.delayed({key: values[i] for key, values in set_points.items()})
-            late[i] = disturbances.late_steps
-            for key in set_points:
-                before[key][i], now[key][i] = earlier[key], later[key]
-        return Applied(flat, now, before, late)
-
-    def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
-        """Return the pushes during the next action, by environment; environments without a push are omitted."""
-        if self.randomise is None or not self.randomise.push:
-            return {}
-        pushed = {i: disturbances.forces() for i, disturbances in self._disturbed(indices)}
-        return {i: forces for i, forces in pushed.items() if forces}
+            if pushes := disturbances.forces():
+                applied.forces[i] = pushes
+            if delayed:
+                applied.before[i], applied.set_points[i] = disturbances.delayed(set_points[i])
+                applied.late[i] = disturbances.late_steps
+        return applied
 
     def _disturbed(self, indices: Indices) -> list[tuple[int, Disturbances]]:
         """Return the disturbances of some environments."""
         return [(i, self._disturbances[i]) for i in indices.tolist()] if self._disturbances else []
-
-
-def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:
-    return {int(i): infos["error"][i] for i in np.flatnonzero(infos["_error"])} if "error" in infos else {}
 
 
 def put(observations: Observation, indices: Indices | int, found: Observation) -> None:
@@ -355,5 +370,20 @@ def put(observations: Observation, indices: Indices | int, found: Observation) -
         observations[indices] = found
 
 
-def _pick(observations: Observation, index: int) -> Observation:
-    return mapped(lambda array: array[index].copy(), observations)
+def of_one(observations: Observation, i: int = 0) -> Observation:
+    """Return the observation or action of one environment among those of all, as views."""
+    return mapped(lambda array: array[i], observations)
+
+
+def info_of(infos: Mapping[str, Any], i: int = 0) -> dict[str, Any]:
+    """Return the infos of one environment of a vector environment, with plain numbers."""
+    names = [name for name in infos if not name.startswith(("_", "final_")) and infos[f"_{name}"][i]]
+    return {name: _at(infos[name], i) for name in names}
+
+
+def _at(values: Any, i: int) -> Any:
+    """Return the entry of one environment; wrappers nest dictionaries."""
+    if isinstance(values, dict):
+        entries = cast("dict[str, Any]", values)
+        return {name: _at(inner, i) for name, inner in entries.items() if not name.startswith("_")}
+    return values[i].item() if isinstance(values[i], np.generic) else values[i]

@@ -6,6 +6,7 @@ import asyncio
 import inspect
 from collections.abc import Awaitable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from urlab_client.values.plain import Serializable
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Task
     from urlab_client.integrations.gym.episode import EnvEpisode
+    from urlab_client.integrations.gym.task import Memory
     from urlab_client.integrations.record import AsyncRecorder, Recorder
 
 Verdict = EpisodeOutcome | Literal["quit"]
@@ -177,13 +179,15 @@ class _Session:
         self._rng = np.random.default_rng(self.seed)
         self._n_steps = max(1, round(1.0 / (self.hz * timestep)))
         self._starts: EnvEpisode | None = None
+        self._memory: Memory | None = None
         if self.task is not None:
             from urlab_client.integrations.gym.episode import EnvEpisode
             from urlab_client.integrations.gym.settings import EpisodeSettings
 
-            settings = EpisodeSettings.of(task=self.task, cameras=())
+            settings = EpisodeSettings(task=self.task, cameras=())
             self._n_steps = settings.n_substeps
             self._starts = EnvEpisode(client, settings=settings)
+            self._memory = settings.memory(model, self._starts.mapping, 1)
         self._hand = HandControl(client) if self.hand is None else self.hand
         self._period = self._n_steps * timestep
         self._tally = TeleopTally()
@@ -250,12 +254,14 @@ class _Session:
             await self.client.reset()
         else:
             seed = None if self._starts.randomise is None else int(self._rng.integers(2**31))
-            await self._starts.reset(self._rng, seed=seed)
+            begin = None if self._memory is None else partial(self._memory.begin, 0)
+            await self._starts.reset(self._rng, seed=seed, begin=begin)
 
     def _goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         """Return the goal of the episode, and whether the current state is a success."""
-        if self._starts is None or self.task is None:
+        if self._starts is None or self._memory is None or self.task is None:
             return {}, None
-        states = self._starts.states()
+        qpos, qvel, time = self._starts.state()
+        states = self._memory.states(np.zeros(1, dtype=np.intp), qpos[None].copy(), qvel[None].copy(), np.array([time]))
         found = self.task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])
