@@ -12,8 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
-from types import MappingProxyType, TracebackType
-from typing import Any, Final, Self, TypeVar
+from types import MappingProxyType
+from typing import Any, Final, TypeVar
 
 import mujoco
 
@@ -50,7 +50,7 @@ INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
 
-class Engine:
+class Engine(PhysicsThread):
     """Owns the stepping of a compiled scene.
 
     One thread integrates in live mode and serves queued direct steps. A direct step that is short and meets neither a
@@ -96,26 +96,17 @@ class Engine:
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
         """
+        self._call = MujocoCall(step_timeout_s)
+        super().__init__(scene.model, DataLock(step_timeout_s, self._call), Health() if health is None else health)
         self.scene = scene
         self.dialect = dialect
-        self._call = MujocoCall(step_timeout_s)
-        self.lock: DataLock = DataLock(step_timeout_s, self._call)
         self.on_tick: list[Hook] = []
         self.step_wanted: Callable[[], bool] = lambda: True
         self.seed: int | None = None
-        self._model = scene.model
         self._data = scene.data
         self.articulations: Articulations = Articulations(scene, controllers, dialect)
         self.variation: SceneVariation | None = None
-        self._thread = PhysicsThread(
-            scene.model,
-            self.lock,
-            iterate=self._iterate,
-            fail=self._fail,
-            give_up=self._drop_queue,
-            health=Health() if health is None else health,
-        )
-        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._thread.stopping)
+        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._stopping)
         self.on_substep: list[Hook] = self._integrator.on_substep
         self._pacing = LivePacing(scene.model)
         self.pinned_mode: StepMode | None = None if pinned_mode is StepMode.AUTO else pinned_mode
@@ -131,30 +122,6 @@ class Engine:
         self._queue: deque[QueuedStep[Any]] = deque()
         self._tick_due = False
         self._last_tick = -math.inf
-        self._wake = self._thread.wake
-
-    def start(self) -> Self:
-        """Start the physics thread and return self."""
-        self._thread.start()
-        return self
-
-    def close(self, timeout: float = 1.0) -> bool:
-        """Stop the physics thread and release every waiting step with `shutting_down`.
-
-        A request under way ends between two sub-steps. Safe to call twice.
-
-        Returns:
-            False when physics was still busy after `timeout`, for example inside one very long `mj_step`.
-        """
-        return self._thread.stop(timeout)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def speed(self) -> float:
@@ -205,10 +172,10 @@ class Engine:
             return self._await(self._queued(request, observe), 0.0)
         try:
             mode = self.mode
-            if self._thread.stopping:
+            if self._stopping:
                 raise shutting_down()
-            if self._thread.death is not None:
-                raise Refusal("internal_error", self._thread.death)
+            if self._death is not None:
+                raise Refusal("internal_error", self._death)
             if mode is StepMode.PUPPET:
                 self._push(request)
                 return observe(mode)
@@ -422,7 +389,7 @@ class Engine:
 
     def _drop_queue(self, refusal: Refusal) -> None:
         while self._queue:
-            self._queue.popleft().fail(refusal)
+            self._queue.popleft().drop(refusal)
 
     def _tick_if_due(self) -> None:
         """Publish the last direct step before its state is overwritten."""
