@@ -7,7 +7,6 @@ import datetime as dt
 import logging
 import os
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -42,7 +41,7 @@ from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.commands import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
 from urlab_client.server.system.temporary_folder import TemporaryFolder
-from urlab_client.server.system.threads import Health, ended
+from urlab_client.server.system.threads import Health, ServedThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
@@ -51,33 +50,27 @@ from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
-class Registration:
+class Registration(ServedThread):
     """Keeps the file of one server in the registry for as long as the server is open."""
 
     def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
+        super().__init__(health.thread("urlab-registry", self._run))
         self._directory = directory
         self._describe = describe
         self._path: Path | None = None
-        self._stopping = threading.Event()
-        self._thread = health.thread("urlab-registry", self._run)
 
     def start(self) -> None:
         """Write the file, and renew it before it would be considered stale."""
         self._write()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stopping.set()
+        super().start()
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end and remove the file; return False if the thread is still busy."""
-        if self._thread.ident is not None:
-            ended(self._thread, timeout)
+        ended = super().join(timeout)
         if self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink()
-        return not self._thread.is_alive()
+        return ended
 
     def _run(self) -> None:
         while not self._stopping.wait(instances.REWRITE_S):

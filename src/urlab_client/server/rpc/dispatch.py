@@ -25,7 +25,7 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
-from urlab_client.server.system.threads import Health, ServingThread, ended
+from urlab_client.server.system.threads import Health, ServedThread, ServingThread
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -305,8 +305,8 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
     raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")
 
 
-class Watchdog:
-    """A thread that checks the physics of a server a few times a second.
+class Watchdog(ServedThread):
+    """Checks the physics of a server a few times a second.
 
     A short step runs on the thread that serves requests. If MuJoCo holds that thread for longer than the step timeout,
     the client gets an error, and another thread serves. Meanwhile the engine's lock refuses requests that need physics;
@@ -314,27 +314,9 @@ class Watchdog:
     """
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
+        super().__init__(health.thread("urlab-watchdog", self._run))
         self._core = core
         self._dispatcher = dispatcher
-        self._stopping = threading.Event()
-        self._thread = health.thread("urlab-watchdog", self._run)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stopping.set()
-
-    def join(self, timeout: float) -> bool:
-        """Wait for the thread to end after `stop`; return False if it takes longer."""
-        return self._thread.ident is None or ended(self._thread, timeout)
 
     def _run(self) -> None:
         told: object = None

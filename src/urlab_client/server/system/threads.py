@@ -102,6 +102,35 @@ def _tell(callback: Callable[[str], None], reason: str) -> None:
         logger.exception("%r failed when called with the failure of the server", callback)
 
 
+class ServedThread:
+    """A part of a server with a thread of its own, which ends once `_stopping` is set.
+
+    Attributes:
+        thread: The thread, made by `Health.thread`.
+    """
+
+    def __init__(self, thread: threading.Thread) -> None:
+        self.thread: threading.Thread = thread
+        self._stopping = threading.Event()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread is running."""
+        return self.thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread."""
+        self.thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end, without waiting."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread to end after `stop`; return False if it is still busy after `timeout` seconds."""
+        return self.thread.ident is None or ended(self.thread, timeout)
+
+
 class ServingThread:
     """A thread that serves requests one by one. It calls `begin` before a request and `finish` after it.
 
