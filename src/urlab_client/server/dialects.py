@@ -64,8 +64,9 @@ def _beta_shapes() -> Mapping[str, _Shape]:
     }
 
 
-def _no_shapes() -> Mapping[str, Callable[[Any], Struct]]:
-    return {}
+@cache
+def _alpha_shapes() -> Mapping[str, _Shape]:
+    return {"state_full": _Shape(StateSnapshot, *_CLOCKS, "per_articulation", "entities", "user")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +127,7 @@ class Dialect:
     robots_attached: bool = False
     instance: bool = False
     first_camera_port: int
-    shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
+    shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_alpha_shapes)
 
     @property
     def ops(self) -> Mapping[str, Op]:
