@@ -24,7 +24,7 @@ from urlab_client.server.core import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, open_server, take_snapshot
+from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, take_snapshot
 from urlab_client.server.physics.observe import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
@@ -224,7 +224,7 @@ class SimulatedServer:
         """
         with self._lock:
             if self._opened is None:
-                self._opened = open_server(self._config)
+                self._opened = OpenServer(self._config)
                 self._finalizer = weakref.finalize(self, self._opened.close)
         return self
 
