@@ -72,18 +72,15 @@ class Articulations:
         return self._folded.get(key.casefold()) if control is None else control
 
     def control(self, key: str) -> ArticulationControl:
-        """Return the articulation with this key, in any case."""
         control = self.find(key)
         if control is None:
             raise Refusal("unknown_articulation", key)
         return control
 
     def name(self, control: ArticulationControl) -> str:
-        """Return what an articulation is called in requests and replies."""
         return self._names[control]
 
     def set_source(self, source: ControlSource, key: str | None = None) -> None:
-        """Choose which set-points drive the articulation `key`, or all when None."""
         for control in self.controls.values() if key is None else [self.control(key)]:
             control.set_points.source = source
 
@@ -107,7 +104,6 @@ class Articulations:
         return controller.params()
 
     def stage_positional(self, commands: Mapping[str, ArticulationCommand]) -> None:
-        """Stage the `ctrl` of a step's commands."""
         with np.errstate(over="ignore"):  # as in `SetPoints.stage`: entered once, it costs the robots nothing
             for key, command in commands.items():
                 control = self.find(key)
@@ -146,7 +142,6 @@ class Articulations:
         return others
 
     def zero_set_points(self) -> None:
-        """Set all set-points to 0, whatever their source."""
         for control in self.controls.values():
             control.set_points.network[:] = 0.0
             control.set_points.ui[:] = 0.0
@@ -174,7 +169,6 @@ class Articulations:
         return bodies
 
     def clear_wrenches(self, bodies: list[int]) -> None:
-        """Take wrenches off again."""
         if bodies:
             self._xfrc[bodies] = 0.0
 

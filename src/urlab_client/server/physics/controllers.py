@@ -68,7 +68,6 @@ class SetPoints:
 
     @property
     def selected(self) -> Float32s | Float64s:
-        """The set-points of the source in force, shape (n controls,)."""
         return self.network if self.source is ControlSource.ZMQ else self.ui
 
     def stage(self, values: Sequence[float] | Float64s) -> None:

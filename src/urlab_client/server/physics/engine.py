@@ -130,12 +130,10 @@ class Engine(PhysicsThread):
 
     @property
     def time(self) -> float:
-        """`mjData.time`, seconds."""
         return float(self._data.time)
 
     @property
     def overdue(self) -> Overdue | None:
-        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
         return self._call.overdue
 
     def begin_replay(self, make: Callable[[], Player]) -> None:
@@ -147,7 +145,6 @@ class Engine(PhysicsThread):
             self._set_paused(False)
 
     def end_replay(self) -> None:
-        """Let steps integrate again; the state stays where the replay left it."""
         with self.lock:
             self.replay = None
 
@@ -261,7 +258,6 @@ class Engine(PhysicsThread):
             self.variation.start()
 
     def forward(self) -> None:
-        """Run `mj_forward`; time and step counter stay."""
         with self.lock:
             self._tick_if_due()
             try:
@@ -311,7 +307,6 @@ class Engine(PhysicsThread):
             self._kick()
 
     def reset_step_count(self) -> None:
-        """Set the step counter to 0, as a handshake does."""
         with self.lock.look():
             self.step_count = 0
 

@@ -54,12 +54,10 @@ class Snapshots:
     hooks: list[Hook] = field(default_factory=list[Hook])
 
     def take(self) -> None:
-        """Number a new snapshot and call the hooks."""
         self.number += 1
         call_hooks(self.hooks)
 
     def restart(self) -> None:
-        """Record a reset and call the hooks; the number stays."""
         self.episode += 1
         call_hooks(self.hooks)
 
@@ -115,7 +113,6 @@ class Integrator:
             n_steps -= count
 
     def advance_live(self) -> None:
-        """Integrate one step of live mode, with the controls as they are."""
         with self._call:
             mujoco.mj_step(self._model, self._data)
             call_hooks(self.on_substep)
@@ -130,6 +127,5 @@ class Integrator:
         self.forward()
 
     def forward(self) -> None:
-        """Compute what follows from the state."""
         with self._call:
             mujoco.mj_forward(self._model, self._data)

@@ -45,7 +45,6 @@ class ControlClaims:
         self._claims: dict[str, _Claim] = {}
 
     def owner(self, key: str) -> str:
-        """Return the owner of a robot, or `(unclaimed)`."""
         claim = self._claims.get(key)
         if claim is not None and 0 < claim.ttl_s < self._clock() - claim.touched:
             del self._claims[key]
@@ -53,7 +52,6 @@ class ControlClaims:
         return UNCLAIMED if claim is None else claim.owner
 
     def claim(self, key: str, owner: str, ttl_s: float, *, force: bool) -> None:
-        """Make `owner` the owner, unless another client is."""
         holder = self.owner(key)
         if holder not in (UNCLAIMED, owner) and not force:
             raise Refusal("control_claimed", f"'{key}' belongs to '{holder}'", owner=holder)
@@ -105,22 +103,18 @@ class Running:
 
     @cached_property
     def claims(self) -> ControlClaims:
-        """The owners of the robots."""
         return ControlClaims()
 
     @cached_property
     def step_replies(self) -> StepReplies:
-        """The encoder of the replies to `step`."""
         return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
 
     @cached_property
     def options(self) -> OptionOverrides:
-        """The options set by `set_sim_options`."""
         return OptionOverrides(self.scene.model, self.limits, self.engine.dialect)
 
     @cached_property
     def sessions(self) -> ReplaySessions:
-        """The recorded sessions."""
         return ReplaySessions(self.scene, self.recordings, self.limits)
 
     def delay_cameras(self, wanted: Mapping[str, tuple[CameraDelayInForce, int]]) -> None:
@@ -186,7 +180,6 @@ class Play:
 
     @property
     def compile_error(self) -> str:
-        """MuJoCo's message in state `COMPILE_FAILED`, otherwise empty."""
         attempt = self._attempt
         return "" if attempt is None or attempt.error is None else attempt.error
 
@@ -197,7 +190,6 @@ class Play:
 
     @property
     def current(self) -> Running | None:
-        """The running simulation, or None."""
         attempt = self._attempt
         return None if attempt is None else attempt.running
 

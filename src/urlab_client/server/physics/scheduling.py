@@ -145,12 +145,10 @@ class DataLock:
 
 
 def shutting_down() -> Refusal:
-    """Return the refusal of a step that the end of the simulation breaks off."""
     return Refusal("shutting_down", "the simulation is stopping")
 
 
 def busy() -> Refusal:
-    """Return the refusal for a caller that does not get the lock in time."""
     return Refusal("not_ready", "physics is busy with a step request that is still running; try again later")
 
 
@@ -175,7 +173,6 @@ class QueuedStep(Future[T]):
             self.set_exception(error)
 
     def drop(self, refusal: Refusal) -> None:
-        """Release the caller without running the step."""
         if self.set_running_or_notify_cancel():
             self.set_exception(refusal)
 
@@ -320,7 +317,6 @@ class LivePacing:
 
     @property
     def speed(self) -> float:
-        """Speed in force, percent of real time, 5 to 100, a float32."""
         return float32(min(max(self._speed, MIN_SPEED), MAX_SPEED))
 
     @speed.setter
@@ -328,7 +324,6 @@ class LivePacing:
         self._speed = float(percent)
 
     def restart(self) -> None:
-        """Make the next iteration due immediately."""
         self._slot = -math.inf
 
     def take_slot(self, *, idle: bool) -> float:

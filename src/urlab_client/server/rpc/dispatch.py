@@ -267,7 +267,6 @@ class Dispatcher:
         return op
 
     def _job(self, name: str, handler: Handler, request: Any) -> dict[str, Any]:
-        """Return the result of a job's handler as plain data with the numbers of the wire."""
         try:
             reply: Any = handler(self._core, request)
             frame = encode_reply(reply)

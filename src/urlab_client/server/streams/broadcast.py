@@ -47,7 +47,6 @@ _ROW_KINDS: Final = {
 
 
 def topic_frame(kind: TopicKind, owner: str, name: str = "") -> bytes | None:
-    """Return a topic frame; None for names that cannot be part of a topic."""
     try:
         return StreamTopic(kind, owner, name).encode()
     except ValueError as error:
@@ -236,7 +235,6 @@ class Broadcast:
             yield partial(self._actuators.info, control, endpoints)
 
     def command_topics(self) -> Iterator[bytes]:
-        """Yield the topics to which the articulations subscribe."""
         for control in self._controls:
             for kind in (TopicKind.CONTROL, TopicKind.SET_GAINS):
                 topic = topic_frame(kind, control.index.key)
@@ -321,6 +319,5 @@ def _arrays(scene: CompiledScene, data: mujoco.MjData) -> list[Floats]:
 
 
 def next_info(tick: int) -> int:
-    """Return the first live tick after `tick` with info messages."""
     every = INFO_EVERY if tick < INFO_START_TICKS else INFO_LATER_EVERY
     return (tick // every + 1) * every

@@ -53,7 +53,6 @@ class _Stream:
         self._filters: set[bytes] = set()
 
     def wanted(self) -> bool:
-        """Whether the camera has a subscriber."""
         read_subscriptions(self.socket, self._filters)
         return bool(self.key) and any(self.topic.startswith(prefix) for prefix in self._filters)
 

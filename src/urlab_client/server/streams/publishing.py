@@ -248,7 +248,6 @@ class StreamServer(Publisher):
         broadcast.want(self._subscribed[self._state], self._subscribed[self._info])
 
     def _leave(self) -> None:
-        """Stop publishing and listening."""
         broadcast, self._broadcast = self._broadcast, None
         if broadcast is not None:
             broadcast.leave()

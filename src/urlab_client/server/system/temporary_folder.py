@@ -167,7 +167,6 @@ def _name(what: str, folder: Path) -> str:
 
 
 def _is_free(what: str, folder: Path) -> bool:
-    """Whether this lock file for Windows is free."""
     lock = NamedLock(_name(what, folder))
     lock.close()
     return lock.held

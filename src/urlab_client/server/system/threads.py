@@ -115,15 +115,12 @@ class ServedThread:
 
     @property
     def alive(self) -> bool:
-        """Whether the thread is running."""
         return self.thread.is_alive()
 
     def start(self) -> None:
-        """Start the thread."""
         self.thread.start()
 
     def stop(self) -> None:
-        """Ask the thread to end, without waiting."""
         self._stopping.set()
 
     def join(self, timeout: float) -> bool:
@@ -154,26 +151,21 @@ class ServingThread:
         return self._health.thread(self._name, self._run, owed)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     @property
     def started(self) -> bool:
-        """Whether it was started."""
         return self._thread.ident is not None
 
     @property
     def alive(self) -> bool:
-        """Whether requests are served."""
         return self._thread.is_alive()
 
     @property
     def is_current(self) -> bool:
-        """Whether the calling thread is the one that serves."""
         return threading.current_thread() is self._thread
 
     def begin(self) -> None:
-        """Mark the calling thread as working on a request."""
         self._working = True
 
     def finish(self) -> bool:
