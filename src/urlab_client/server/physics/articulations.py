@@ -104,11 +104,11 @@ class Articulations:
         return controller.params()
 
     def stage_positional(self, commands: Mapping[str, ArticulationCommand]) -> None:
-        with np.errstate(over="ignore"):  # as in `SetPoints.stage`: entered once, it costs the robots nothing
+        with np.errstate(over="ignore"):  # infinite, as in C; entered once for all robots
             for key, command in commands.items():
                 control = self.find(key)
                 if control is not None and command.ctrl is not None:
-                    control.set_points.stage_quietly(command.ctrl)
+                    control.set_points.stage(command.ctrl)
 
     def stage_named(self, commands: Mapping[str, ArticulationCommand]) -> set[ArticulationControl]:
         """Stage `ctrl_map` and return the articulations whose controller the request bypasses."""

@@ -112,10 +112,7 @@ class HandlerTable:
 HANDLERS: Final = HandlerTable()
 """The handlers of this package; filled when `urlab_client.server.handlers` is imported."""
 
-
-def handles(request: type[Q]) -> Callable[[Callable[[ServerCore, Q], A]], Callable[[ServerCore, Q], A]]:
-    """Register the decorated function as the handler of a request, in the table of all handlers."""
-    return HANDLERS.handles(request)
+handles: Final = HANDLERS.handles
 
 
 class Dispatcher:
@@ -281,13 +278,7 @@ class Dispatcher:
 
 def _error(name: str, failure: Exception) -> ErrorReply:
     if isinstance(failure, Refusal):
-        return ErrorReply(
-            code=failure.code,
-            message=failure.message,
-            absolute_path=failure.absolute_path if failure.code == "path_not_writable" else None,
-            owner=failure.owner,
-            lease_id=failure.lease_id,
-        )
+        return ErrorReply(code=failure.code, message=failure.message, **failure.details)
     logger.error("%s failed", name, exc_info=failure)
     return ErrorReply(
         code="internal_error",

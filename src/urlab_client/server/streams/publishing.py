@@ -178,7 +178,7 @@ class StreamServer(Publisher):
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end; if it is still busy, it closes the sockets when it ends."""
-        if self.thread.ident is None:
+        if not self.started:
             self._release()
         return super().join(timeout)
 

@@ -13,6 +13,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Final, TypeVarTuple
 
 from urlab_client._platform.threads import daemon
@@ -117,6 +118,10 @@ class ServedThread:
     def alive(self) -> bool:
         return self.thread.is_alive()
 
+    @property
+    def started(self) -> bool:
+        return self.thread.ident is not None
+
     def start(self) -> None:
         self.thread.start()
 
@@ -125,10 +130,10 @@ class ServedThread:
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end after `stop`; return False if it is still busy after `timeout` seconds."""
-        return self.thread.ident is None or ended(self.thread, timeout)
+        return not self.started or ended(self.thread, timeout)
 
 
-class ServingThread:
+class ServingThread(ServedThread):
     """A thread that serves requests one by one. It calls `begin` before a request and `finish` after it.
 
     Inside a call of MuJoCo it cannot be interrupted, only abandoned: another thread then sends the reply and serves.
@@ -140,30 +145,14 @@ class ServingThread:
         Args:
             run: Body of the thread. Its argument is the reply to send first when it replaces another thread.
         """
-        self._name = name
-        self._run = run
-        self._health = health
+        self._make = partial(health.thread, name, run)
+        super().__init__(self._make(None))
         self._lock = threading.Lock()
         self._working = False
-        self._thread = self._made(None)
-
-    def _made(self, owed: bytes | None) -> threading.Thread:
-        return self._health.thread(self._name, self._run, owed)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    @property
-    def started(self) -> bool:
-        return self._thread.ident is not None
-
-    @property
-    def alive(self) -> bool:
-        return self._thread.is_alive()
 
     @property
     def is_current(self) -> bool:
-        return threading.current_thread() is self._thread
+        return threading.current_thread() is self.thread
 
     def begin(self) -> None:
         self._working = True
@@ -184,19 +173,17 @@ class ServingThread:
             release: Called before the new thread starts, to hand over what the old one holds.
         """
         with self._lock:
-            if thread is not self._thread or not self._working:
+            if thread is not self.thread or not self._working:
                 return False
             self._working = False
             release()
-            self._thread = self._made(owed)
-            self._thread.start()
+            self.thread = self._make(owed)
+            self.thread.start()
             return True
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end and return whether it has. Does not wait for replaced threads."""
-        if self.is_current:
-            return False
-        return ended(self._thread, timeout)
+        return not self.is_current and super().join(timeout)
 
 
 # Settings of glibc's allocator, without effect with other C libraries.
