@@ -76,14 +76,12 @@ class Dialect:
     Attributes:
         name: Its name.
         urlab_version: What the handshake says.
-        urlab_version_at_start: What the handshake inside the reply to `begin_pie` says.
         jobs: Ops that take long answer `op_started`.
         claims: Writes to a robot are refused unless the writer owns it.
         cameras_on: Cameras stream from the start of play.
         cameras_repeat: Cameras stream the same state over and over, else each state once.
         camera_headers: Streamed pictures begin with number, time and size.
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
-        draws_for_steps: Steps draw the pictures that they bring; else they bring what was drawn before them.
         qualified_cameras: Cameras are called `<robot>/<camera>`, on topics, too, and under no other name.
         public_names: Robots are called by their actor id where they have one, and `actor_name` tells the object's.
         frame_ids: Steps are numbered by `frame_id`.
@@ -104,14 +102,12 @@ class Dialect:
 
     name: DialectName
     urlab_version: str
-    urlab_version_at_start: str
     jobs: bool = False
     claims: bool = False
     cameras_on: bool = False
     cameras_repeat: bool = False
     camera_headers: bool = False
     camera_forms: bool = False
-    draws_for_steps: bool = False
     qualified_cameras: bool = False
     public_names: bool = False
     frame_ids: bool = False
@@ -159,10 +155,8 @@ class Dialect:
 ALPHA: Final = Dialect(
     name="alpha",
     urlab_version="urlab/0.1",
-    urlab_version_at_start="urlab/0.1",
     cameras_on=True,
     cameras_repeat=True,
-    draws_for_steps=True,
     steps_published=True,
     rows_published=True,
     late_steps=True,
@@ -177,12 +171,10 @@ ALPHA: Final = Dialect(
 BETA: Final = Dialect(
     name="beta",
     urlab_version="urlab/0.2",
-    urlab_version_at_start="urlab/0.1",
     jobs=True,
     claims=True,
     camera_headers=True,
     camera_forms=True,
-    draws_for_steps=True,
     qualified_cameras=True,
     public_names=True,
     frame_ids=True,

@@ -216,7 +216,8 @@ class OpenServer:
             busy=core.lease.held,
             urlab_version=core.dialect.urlab_version,
             capabilities=[
-                *(["render_sync", "render_async"] if core.dialect.draws_for_steps else []),
+                "render_sync",
+                "render_async",
                 *(["shm_rpc"] if self.memory is not None else []),
                 "model_upload",
                 "content_cache",
