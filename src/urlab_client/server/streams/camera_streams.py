@@ -11,7 +11,6 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Collection, Sequence
 from typing import Final, TypeAlias
 
 import zmq
@@ -183,61 +182,52 @@ class CameraStreams(Publisher):
     def _publish(self) -> None:
         with self._lock:
             running = self._running
-            wanted = [stream for stream in self._streams if stream.wanted()]
-            topics = {stream.key: stream.topic for stream in wanted if stream.key in self._zmq_on}
+            streams = {stream.key: stream for stream in self._streams if stream.wanted() and stream.key in self._zmq_on}
         if running is None:
             return
         if self._dialect.cameras_on and running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
-            topics = {}
+            streams = {}
         shared = [] if self._memory is None else self._memory.wanted_cameras()
-        if not (topics or shared):
+        if not (streams or shared):
             return
-        shots = running.cameras.stream_shots(dict.fromkeys([*topics, *shared]))
+        shots = running.cameras.stream_shots(dict.fromkeys([*streams, *shared]))
         try:
             with running.engine.lock:
                 film = running.cameras.capture(shots, running.engine.snapshots.number)
         except Refusal:  # physics is busy; retried next time
             return
-        places = (shared, self._shm_sent), (topics, self._zmq_sent)
-        for_memory, for_topics = self._payloads(running, shots, film, places)
-        if self._memory is not None:
-            with self._lock:
-                for key, payload in for_memory.items() if self._running is running else ():
-                    self._memory.publish_picture(key, payload)
-        images: dict[str, bytes] = {}
-        for key, payload in for_topics.items():
-            try:
-                image = self._filtered(topics[key], payload)
-            except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
-                self._omit(f"an image of '{key}' is", error)
-                continue
-            if image is not None:
-                images[key] = image
-        with self._lock:
-            if self._running is running:
-                for stream in self._streams:
-                    if stream.key in images:
-                        stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
-
-    def _payloads(
-        self, running: Running, shots: Sequence[Shot], film: Film, places: Sequence[tuple[Collection[str], _Sent]]
-    ) -> list[dict[str, bytes]]:
-        """Draw, and return the messages for each place, given by its cameras and the last pictures sent there."""
         frames = running.cameras.frames(shots, film) or {}
-        news: list[dict[str, bytes]] = [{} for _ in places]
-        with self._lock:
-            for shot in shots if self._running is running else ():
-                frame = frames.get(shot.key)
-                if frame is None:
-                    continue
-                number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
+        for shot in shots:
+            if shot.key in frames:
                 try:
-                    for (keys, sent), messages in zip(places, news, strict=True):
-                        if shot.key in keys and self._is_news(running, shot.key, number, sent):
-                            messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                    self._publish_picture(
+                        running, film, shot, frames[shot.key], streams.get(shot.key), shot.key in shared
+                    )
                 except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
                     self._omit(f"an image of '{shot.key}' is", error)
-        return news
+
+    def _publish_picture(
+        self, running: Running, film: Film, shot: Shot, frame: CameraFrame, *, stream: _Stream | None, shared: bool
+    ) -> None:
+        """Publish a picture where it is wanted, unless another simulation is shown by now."""
+        key, memory = shot.key, self._memory
+        number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
+        with self._lock:
+            if self._running is not running:
+                return
+            in_memory = shared and self._is_news(running, key, number, self._shm_sent)
+            on_socket = stream is not None and self._is_news(running, key, number, self._zmq_sent)
+            if not (in_memory or on_socket):
+                return
+            payload = self._headed(frame, film.capture_time(shot))
+            if in_memory and memory is not None:
+                memory.publish_picture(key, payload)
+        if stream is None or not on_socket:
+            return
+        image = self._filtered(stream.topic, payload)  # which may take its time
+        with self._lock:
+            if image is not None and self._running is running:
+                stream.socket.send_multipart([stream.topic, image], zmq.DONTWAIT)
 
     def _is_news(self, running: Running, key: str, number: int, sent: _Sent) -> bool:
         """Whether to send a picture of snapshot `number`, if the camera sends only changes."""
