@@ -198,11 +198,10 @@ class CameraStreams(Publisher):
             return
         frames = running.cameras.frames(shots, film) or {}
         for shot in shots:
-            if shot.key in frames:
+            frame, stream = frames.get(shot.key), streams.get(shot.key)
+            if frame is not None:
                 try:
-                    self._publish_picture(
-                        running, film, shot, frames[shot.key], streams.get(shot.key), shot.key in shared
-                    )
+                    self._publish_picture(running, film, shot, frame, stream=stream, shared=shot.key in shared)
                 except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
                     self._omit(f"an image of '{shot.key}' is", error)
 
