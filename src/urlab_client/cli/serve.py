@@ -146,9 +146,8 @@ def add_arguments(parser: Parser) -> None:
     content.add_argument(
         "--actor-names",
         choices=("model", "plugin"),
-        default="model",
-        help="keys of articulations: the MJCF model name, or names as the plugin assigns them, such as robot_C_0 "
-        "(default: model)",
+        help="keys of articulations: the MJCF model name (default of the alpha), or names as the plugin assigns them, "
+        "such as robot_C_0 (default of the beta)",
     )
     physics = parser.add_argument_group("physics")
     physics.add_argument("--play", action="store_true", help="start a play session immediately")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 from msgspec import Struct
@@ -96,6 +96,7 @@ class Dialect:
         options_merged: The `<option>` of every imported robot reaches the scene.
         robots_attached: The XML of the handshake attaches a document for each robot, else it is one flat model.
         instance: The handshake says which of several servers this is, and its own shared-memory regions.
+        actor_names: How robots are named unless the server is told: after their model, or as the plugin does.
         first_camera_port: Default port of the first camera.
         shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
     """
@@ -122,6 +123,7 @@ class Dialect:
     options_merged: bool = False
     robots_attached: bool = False
     instance: bool = False
+    actor_names: Literal["model", "plugin"] = "model"
     first_camera_port: int
     shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_alpha_shapes)
 
@@ -182,6 +184,7 @@ BETA: Final = Dialect(
     options_merged=True,
     robots_attached=True,
     instance=True,
+    actor_names="plugin",
     first_camera_port=5561,
     shapes=_beta_shapes,
 )
