@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -153,7 +152,6 @@ class DriverLease:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
         self._id = ""
         self._ttl_s = 0.0
         self._touched = 0.0
@@ -161,34 +159,26 @@ class DriverLease:
     @property
     def held(self) -> bool:
         """Whether it is held."""
-        with self._lock:
-            return self._holds()
+        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
 
     def acquire(self, ttl_s: float) -> str:
         """Take it and return its id."""
-        with self._lock:
-            if self._holds():
-                # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
-                raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
-            self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
-            return self._id
+        if self.held:
+            # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
+            raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
+        self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
+        return self._id
 
     def release(self, lease_id: str) -> None:
         """Give it back."""
-        with self._lock:
-            if not self._holds() or lease_id != self._id:
-                raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
-            self._id = ""
+        if not self.held or lease_id != self._id:
+            raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
+        self._id = ""
 
     def touch(self) -> None:
         """Renew the lease: the server is in use."""
-        if self._id:
-            with self._lock:
-                if self._holds():
-                    self._touched = self._clock()
-
-    def _holds(self) -> bool:
-        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
+        if self.held:
+            self._touched = self._clock()
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:

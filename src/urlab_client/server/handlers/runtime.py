@@ -93,7 +93,7 @@ def set_user_channels(server: ServerCore, request: runtime.SetUserChannels) -> r
     rejected: dict[str, str] = {}
     for name, values in [*(request.arts or {}).items(), (SCENE, request.scene or {})]:
         robot = running.engine.articulations.find(name)
-        owner = name if robot is None else running.engine.articulations.name(robot)
+        owner = name if robot is None else running.engine.articulations.names[robot.index.key]
         for channel, value in values.items():
             reason = running.channels.write(owner, channel, value)
             applied += reason is None

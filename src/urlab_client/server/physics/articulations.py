@@ -56,7 +56,6 @@ class Articulations:
         )
         self._steered = [control for control in self.controls.values() if control.controller is not None]
         self._folded = _folded(self.controls, dialect)
-        self._names = {control: name for name, control in self.controls.items()}
         self.names: Mapping[str, str] = {control.index.key: name for name, control in self.controls.items()}
 
     def _neutral_ctrl(self) -> NDArray[np.float64]:
@@ -76,9 +75,6 @@ class Articulations:
         if control is None:
             raise Refusal("unknown_articulation", key)
         return control
-
-    def name(self, control: ArticulationControl) -> str:
-        return self._names[control]
 
     def set_source(self, source: ControlSource, key: str | None = None) -> None:
         for control in self.controls.values() if key is None else [self.control(key)]:
