@@ -23,7 +23,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
+from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.physics.scheduling import (
     GIVE_WAY_S,
@@ -45,6 +45,12 @@ from urlab_client.simulation.controller_config import ControllerConfig
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")
+
+SLICE_S: Final = 0.05
+"""About how long a direct request integrates between two looks at the stop flag."""
+
+MAX_SLICE: Final = 1000
+"""Sub-steps in such a slice at most, for models that get slower while they run."""
 
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
@@ -106,8 +112,8 @@ class Engine(PhysicsThread):
         self._data = scene.data
         self.articulations: Articulations = Articulations(scene, controllers, dialect)
         self.variation: SceneVariation | None = None
-        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._stopping)
-        self.on_substep: list[Hook] = self._integrator.on_substep
+        self.on_substep: list[Hook] = []
+        self._substep_s = math.inf  # what a sub-step of the newest slice took
         self._pacing = LivePacing(scene.model)
         self.pinned_mode: StepMode | None = None if pinned_mode is StepMode.AUTO else pinned_mode
         self.mode: StepMode = self.pinned_mode or StepMode.LIVE
@@ -188,7 +194,7 @@ class Engine(PhysicsThread):
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
-            if not self.paused and not self._queue and n_steps * self._integrator.substep_s <= self._inline_budget_s:
+            if not self.paused and not self._queue and n_steps * self._substep_s <= self._inline_budget_s:
                 self._tick_if_due()
                 self._run_direct(request)
                 result = observe(mode)
@@ -238,7 +244,7 @@ class Engine(PhysicsThread):
             try:
                 self._reset_data(key, seed)
                 self.articulations.override_joints(per_articulation_qpos or {})
-                self._integrator.forward()
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
             self.step_count = 0
@@ -261,7 +267,7 @@ class Engine(PhysicsThread):
         with self.lock:
             self._tick_if_due()
             try:
-                self._integrator.forward()
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
 
@@ -348,7 +354,7 @@ class Engine(PhysicsThread):
             pushed = self.articulations.apply_wrenches(commands)
         n_steps = max(1, request.n_steps)
         try:
-            self._integrator.advance(n_steps, raw)
+            self._advance(n_steps, raw)
         except Refusal:
             raise
         except Exception as error:
@@ -356,6 +362,33 @@ class Engine(PhysicsThread):
         finally:
             self.articulations.clear_wrenches(pushed)
         self._count(n_steps)
+
+    def _advance(self, n_steps: int, raw: Collection[ArticulationControl]) -> None:
+        """Integrate a direct step, in slices short enough to stop between two of them."""
+        mj_step, model, data = mujoco.mj_step, self._model, self._data
+        apply_controls = self.articulations.apply_controls
+        every_substep = self.on_substep or self.articulations.any_controlled(raw)
+        if not every_substep:
+            apply_controls(raw)
+        while n_steps > 0:
+            if self._stopping:
+                raise shutting_down()
+            count = min(n_steps, MAX_SLICE, max(1, int(SLICE_S / self._substep_s)))
+            started = time.perf_counter()
+            with self._call:
+                if every_substep:
+                    for _ in range(count):
+                        apply_controls(raw)
+                        mj_step(model, data)
+                        call_hooks(self.on_substep)
+                else:
+                    mj_step(model, data, count)
+            self._substep_s = max((time.perf_counter() - started) / count, 1e-9)
+            n_steps -= count
+
+    def _forward(self) -> None:
+        with self._call:
+            mujoco.mj_forward(self._model, self._data)
 
     def _count(self, n_steps: int) -> None:
         self.step_count += n_steps
@@ -367,8 +400,13 @@ class Engine(PhysicsThread):
             self._play(self.replay, request.n_steps)
             return
         self._tick_if_due()
+        data = self._data
         try:
-            self._integrator.push(request)
+            for values, target in ((request.qpos, data.qpos), (request.qvel, data.qvel), (request.ctrl, data.ctrl)):
+                if values is not None and len(values) == len(target):
+                    target[:] = values
+            data.time = request.time or 0.0
+            self._forward()
         except Exception as error:
             raise self._fail(error) from error
         call_hooks(self.on_substep)
@@ -416,7 +454,9 @@ class Engine(PhysicsThread):
             return
         self.articulations.apply_controls()
         if not self.paused:
-            self._integrator.advance_live()
+            with self._call:
+                mujoco.mj_step(self._model, self._data)
+                call_hooks(self.on_substep)
             self.snapshots.take()
         self.articulations.clear_wrenches(self._live_pushed)
         self._live_pushed.clear()
