@@ -35,7 +35,7 @@ from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.observe import Observer, UserChannels
+from urlab_client.server.physics.observe import UserChannels
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.physics.variation import SceneVariation
@@ -315,21 +315,13 @@ class ServerCore:
             except ValueError as error:
                 raise CompileFailed(f"what is to vary: {error}") from None
             varied = engine.variation.visible_fields
-        channels = UserChannels(config.user_channels)
         modes = {
             (index.key, camera.name): config.camera_mode(index, camera.name)
             for index in scene.articulations
             for camera in index.cameras
         }
-        return Running(
-            scene,
-            engine.start(),
-            Observer(scene, engine.articulations.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.articulations.names, varied),
-            files,
-            self.limits,
-            channels,
-        )
+        cameras = self._camera_renderer(scene, actors, modes, engine.articulations.names, varied)
+        return Running(engine.start(), cameras, UserChannels(config.user_channels), files, self.limits)
 
     @property
     def _options(self) -> OptionPolicy:

@@ -12,15 +12,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from urlab_client.enums import PIEState
 from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
-from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer, UserChannels
@@ -83,41 +81,34 @@ class ControlClaims:
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MAX_WAIT_S: Final = 86400.0
-_DEFAULT_LIMITS: Final = Limits()
 
 
-@dataclass(frozen=True)
 class Running:
     """A simulation that is ready."""
 
-    scene: CompiledScene
-    engine: Engine
-    observer: Observer
-    cameras: CameraRenderer
-    recordings: Sequence[Path] = ()
-    limits: Limits = _DEFAULT_LIMITS
-    channels: UserChannels = field(default_factory=lambda: UserChannels({}))
+    def __init__(
+        self,
+        engine: Engine,
+        cameras: CameraRenderer,
+        channels: UserChannels,
+        files: Sequence[Path],
+        limits: Limits,
+    ) -> None:
+        self.engine = engine
+        self.cameras = cameras
+        self.channels = channels
+        self.scene = scene = engine.scene
+        controls, dialect = engine.articulations.controls, engine.dialect
+        self.observer = Observer(scene, controls, channels)
+        self.claims = ControlClaims()
+        self.step_replies = StepReplies(scene, controls, dialect)
+        self.options = OptionOverrides(scene.model, limits, dialect)
+        self.sessions = ReplaySessions(scene, files, limits)
 
     def mjb(self) -> bytes:
         """Return the model in MuJoCo's binary format, without variations. The caller holds the engine's lock."""
         variation = self.engine.variation
         return self.scene.mjb() if variation is None else variation.mjb()
-
-    @cached_property
-    def claims(self) -> ControlClaims:
-        return ControlClaims()
-
-    @cached_property
-    def step_replies(self) -> StepReplies:
-        return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
-
-    @cached_property
-    def options(self) -> OptionOverrides:
-        return OptionOverrides(self.scene.model, self.limits, self.engine.dialect)
-
-    @cached_property
-    def sessions(self) -> ReplaySessions:
-        return ReplaySessions(self.scene, self.recordings, self.limits)
 
     def delay_cameras(self, wanted: Mapping[str, tuple[CameraDelayInForce, int]]) -> None:
         """Set latencies of cameras, with the seeds of their jitter, by `ARTICULATION/CAMERA`."""

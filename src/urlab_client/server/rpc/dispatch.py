@@ -251,8 +251,9 @@ class Dispatcher:
             raise Refusal("missing_op", "the request has no field 'op' that reads as a string")
         if name not in _NO_SIGN_OF_USE:
             self._core.lease.touch()
-        if op is None or op.name not in _WITHOUT_SESSION:
-            self._check_session(incoming.session_id)
+        needs_session = op is None or op.name not in _WITHOUT_SESSION
+        if needs_session and not self._core.session.accepts(incoming.session_id):
+            raise Refusal("session_expired", f"session '{incoming.session_id}' is not the active one: send hello first")
         if op is None:
             raise Refusal("unknown_op", f"this server has no op '{name}'")
         if incoming.missing:
@@ -270,10 +271,6 @@ class Dispatcher:
         except Exception as failure:  # noqa: BLE001 - whoever asks for the job must hear of it
             frame = encode_reply(_error(name, failure))
         return msgspec.msgpack.decode(frame)
-
-    def _check_session(self, session_id: str) -> None:
-        if not self._core.session.accepts(session_id):
-            raise Refusal("session_expired", f"session '{session_id}' is not the active one: send hello first")
 
 
 def _error(name: str, failure: Exception) -> ErrorReply:

@@ -17,7 +17,6 @@ import math
 import re
 import types
 from collections.abc import Callable, Mapping
-from enum import Enum
 from functools import cache
 from typing import Any, Final, TypeAlias, TypeVar, Union, cast
 
@@ -57,11 +56,7 @@ _NUMBERS: Final = frozenset({float, int})
 T = TypeVar("T")
 
 
-class _Absent(Enum):
-    ABSENT = "absent"
-
-
-ABSENT: Any = _Absent.ABSENT
+ABSENT: Final[Any] = UNSET
 
 
 def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
