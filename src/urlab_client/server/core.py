@@ -9,7 +9,7 @@ import copy
 import logging
 import time
 import uuid
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -400,27 +400,15 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def _unmatched_names(scene: CompiledScene, config: ServerConfig) -> list[str]:
-    """Return messages for configured names that match nothing in a scene; most likely they are misspelt."""
-    actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
-    cameras = {
-        f"{name}/{camera.name}"
-        for index in scene.articulations
-        for name in (index.actor_id, index.key)
-        if name
-        for camera in index.cameras
-    }
-    return [
-        *(
-            f"a controller is configured for '{unknown}', but the articulations are {_listed(actors)}"
-            for unknown in sorted(config.controllers.keys() - actors - {"*"})
-        ),
-        *(
-            f"a camera mode is configured for '{unknown}', but the cameras are {_listed(cameras)}"
-            for unknown in sorted(config.camera_modes.keys() - cameras)
-        ),
-    ]
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)) or "none"
+def _unmatched_names(scene: CompiledScene, config: ServerConfig) -> Iterator[str]:
+    """Yield messages for configured names that match nothing in a scene; most likely they are misspelt."""
+    named = [(name, index) for index in scene.articulations for name in (index.actor_id, index.key) if name]
+    actors = {name for name, _ in named}
+    cameras = {f"{name}/{camera.name}" for name, index in named for camera in index.cameras}
+    for what, wanted, kind, known in (
+        ("controller", config.controllers.keys() - {"*"}, "articulations", actors),
+        ("camera mode", config.camera_modes.keys(), "cameras", cameras),
+    ):
+        for unknown in sorted(wanted - known):
+            listed = ", ".join(sorted(known)) or "none"
+            yield f"a {what} is configured for '{unknown}', but the {kind} are {listed}"

@@ -244,6 +244,42 @@ class OpenServer:
             core.stop_play()
             return True
 
+    def snapshot(self, size: tuple[int, int], *, frame_all: bool) -> NDArray[np.uint8]:
+        """Draw the viewport; see `SimulatedServer.snapshot`. Requests are not answered while the state is read."""
+        need_backend()
+        core = self.core
+        with self.dispatcher.standstill(IDLE_DEADLINE_S) as idle:
+            if not idle:
+                raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
+            view = look(core)
+            picture = ViewportPicture(
+                size=size,
+                view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
+                fit=frame_all,
+                mode=core.viewport.mode,
+                primitives=core.drawings.take_frame(in_play=core.world.pie_running),
+                overlay=core.drawings.overlay,
+                selected=core.world.actors.selected,
+            )
+            running = core.play.current
+            try:
+                if running is not None:
+                    with running.engine.lock:
+                        job = running.cameras.capture_viewport(picture)
+                    renderer = running.cameras
+                else:
+                    renderer = core.authored_renderer()
+                    job = renderer.capture_viewport(picture)
+            except Refusal as refusal:
+                raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
+            except CompileFailed as error:
+                raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
+        try:
+            return renderer.paint(job)
+        finally:
+            if running is None:
+                renderer.close()
+
     def close(self) -> None:
         """Release everything. Idempotent; does nothing in a forked child, which does not own the resources."""
         if os.getpid() == self._pid:
@@ -357,41 +393,3 @@ def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | 
     if bounds.extents == (0.0, 0.0, 0.0):
         return edge
     return bounds.max[1] if edge is None else max(edge, bounds.max[1])
-
-
-def take_snapshot(
-    server: ServerCore, dispatcher: Dispatcher, size: tuple[int, int], *, frame_all: bool
-) -> NDArray[np.uint8]:
-    """Draw the viewport; see `SimulatedServer.snapshot`. Requests are not answered while the state is read."""
-    need_backend()
-    with dispatcher.standstill(IDLE_DEADLINE_S) as idle:
-        if not idle:
-            raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
-        view = look(server)
-        picture = ViewportPicture(
-            size=size,
-            view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
-            fit=frame_all,
-            mode=server.viewport.mode,
-            primitives=server.drawings.take_frame(in_play=server.world.pie_running),
-            overlay=server.drawings.overlay,
-            selected=server.world.actors.selected,
-        )
-        running = server.play.current
-        try:
-            if running is not None:
-                with running.engine.lock:
-                    job = running.cameras.capture_viewport(picture)
-                renderer = running.cameras
-            else:
-                renderer = server.authored_renderer()
-                job = renderer.capture_viewport(picture)
-        except Refusal as refusal:
-            raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
-        except CompileFailed as error:
-            raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
-    try:
-        return renderer.paint(job)
-    finally:
-        if running is None:
-            renderer.close()

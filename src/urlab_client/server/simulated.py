@@ -24,7 +24,7 @@ from urlab_client.server.core import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, take_snapshot
+from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level
 from urlab_client.server.physics.observe import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
@@ -279,8 +279,7 @@ class SimulatedServer:
         """
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
             raise ValueError(f"size must be a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
-        opened = self._running
-        return take_snapshot(opened.core, opened.dispatcher, (int(size[0]), int(size[1])), frame_all=frame_all)
+        return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
 
     @property
     def failure(self) -> str | None:
