@@ -117,9 +117,10 @@ class OpenServer:
             UnprotectedServer: Other machines could use it without keys, and `insecure_no_auth` is not set.
             ModelError: A model or level cannot be used.
         """
-        self.config = config
-        self.host = host = numeric_host(config.host)
-        self.curve_keys = None if config.curve is None else CurveKeys(config.curve)
+        self.config: ServerConfig = config
+        self.host: str = numeric_host(config.host)
+        host = self.host
+        self.curve_keys: CurveKeys | None = None if config.curve is None else CurveKeys(config.curve)
         self._pid = os.getpid()
         if self.curve_keys is None and not config.insecure_no_auth and not is_loopback(host):
             raise UnprotectedServer(
@@ -145,11 +146,14 @@ class OpenServer:
         parts: list[Part] = []
         resources.callback(_end, parts)
         where: dict[str, Any] = {"host": self.host, "curve_keys": self.curve_keys, "health": health}
-        self.memory = memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, health)
+        memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, health)
+        self.memory: SharedMemoryServer | None = memory
         parts += [] if memory is None else [memory]
-        self.cameras = CameraStreams(**where, port=config.camera_port, memory=memory, dialect=config.dialect)
+        self.cameras: CameraStreams = CameraStreams(
+            **where, port=config.camera_port, memory=memory, dialect=config.dialect
+        )
         parts.append(self.cameras)
-        self.streams = StreamServer(
+        self.streams: StreamServer = StreamServer(
             partial(_camera_endpoints, self.cameras),
             **where,
             state_port=config.state_port,
@@ -158,7 +162,7 @@ class OpenServer:
             memory=memory,
         )
         parts.append(self.streams)
-        self.core = core = ServerCore(
+        self.core: ServerCore = ServerCore(
             world=EditorWorld(content, actor_names=config.actor_names),
             config=config,
             camera_endpoint=self.cameras.endpoint,
@@ -166,6 +170,7 @@ class OpenServer:
             shm_directory=None if memory is None else str(memory.directory),
             health=health,
         )
+        core = self.core
         core.play.listeners += [self.cameras.show, self.streams.show]  # the second announces the first's ports
         injector = None if config.faults is None else Injector(config.faults, core.refuse)
         if injector is not None:
@@ -173,9 +178,9 @@ class OpenServer:
         self.cameras.start()
         self.streams.start()
         # Bound before the models are read, which takes longer; requests wait in the socket until then.
-        self.dispatcher = Dispatcher(core, HANDLERS)
+        self.dispatcher: Dispatcher = Dispatcher(core, HANDLERS)
         make = RpcEndpoint if injector is None else partial(FaultyEndpoint, injector)
-        self.endpoint = make(
+        self.endpoint: RpcEndpoint = make(
             self.dispatcher.answer,
             **where,
             port=config.step_port,

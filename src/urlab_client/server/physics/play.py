@@ -19,6 +19,7 @@ from typing import Final
 from urlab_client.enums import PIEState
 from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
+from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer, UserChannels
@@ -94,16 +95,16 @@ class Running:
         files: Sequence[Path],
         limits: Limits,
     ) -> None:
-        self.engine = engine
-        self.cameras = cameras
-        self.channels = channels
-        self.scene = scene = engine.scene
+        self.engine: Engine = engine
+        self.cameras: CameraRenderer = cameras
+        self.channels: UserChannels = channels
+        self.scene: CompiledScene = engine.scene
         controls, dialect = engine.articulations.controls, engine.dialect
-        self.observer = Observer(scene, controls, channels)
-        self.claims = ControlClaims()
-        self.step_replies = StepReplies(scene, controls, dialect)
-        self.options = OptionOverrides(scene.model, limits, dialect)
-        self.sessions = ReplaySessions(scene, files, limits)
+        self.observer: Observer = Observer(self.scene, controls, channels)
+        self.claims: ControlClaims = ControlClaims()
+        self.step_replies: StepReplies = StepReplies(self.scene, controls, dialect)
+        self.options: OptionOverrides = OptionOverrides(self.scene.model, limits, dialect)
+        self.sessions: ReplaySessions = ReplaySessions(self.scene, files, limits)
 
     def mjb(self) -> bytes:
         """Return the model in MuJoCo's binary format, without variations. The caller holds the engine's lock."""

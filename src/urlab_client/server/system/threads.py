@@ -145,7 +145,7 @@ class ServingThread(ServedThread):
         Args:
             run: Body of the thread. Its argument is the reply to send first when it replaces another thread.
         """
-        self._make = partial(health.thread, name, run)
+        self._make: Callable[[bytes | None], threading.Thread] = partial(health.thread, name, run)
         super().__init__(self._make(None))
         self._lock = threading.Lock()
         self._working = False
@@ -177,7 +177,7 @@ class ServingThread(ServedThread):
                 return False
             self._working = False
             release()
-            self.thread = self._make(owed)
+            self.thread: threading.Thread = self._make(owed)
             self.thread.start()
             return True
 
