@@ -158,7 +158,7 @@ def actual(server: SimulatedServer, client: URLabClient) -> dict[str, Any]:
         return known | {"seed": client.reset_seed, "recording": False}
     running = core.play.current
     engine, sessions = running.engine, running.sessions
-    owner = running.claims.owner("arm")
+    owner = running.claims.owner(next(iter(engine.articulations.controls.values())).index.key)
     return known | {
         "seed": engine.seed,
         "mode": str(engine.mode),

@@ -43,7 +43,6 @@ SERVERS = {
     "cameras always on": between(*CAMERAS, cameras_on=True),
     "bare pixels": between(camera_headers=False),
     "no camera forms": between(camera_forms=False),
-    "no pictures drawn for steps": between(draws_for_steps=False),
     "names of objects": between(public_names=False),
     "no frame ids": between(frame_ids=False),
     "steps are published": between(steps_published=True),

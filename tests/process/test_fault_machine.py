@@ -22,6 +22,7 @@ from fault_proxy import Delay, Fault, FaultProxy, Garbage, Throttle, Truncate
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from urlab_client.server.physics.integrator import Integrator
 from waiting import eventually, in_time
 
 from urlab_client.aio import Stream, URLabClient
@@ -40,7 +41,6 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.server import SimulatedServer
-from urlab_client.server.physics.integrator import Integrator
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
 TIMEOUT_S = 0.3

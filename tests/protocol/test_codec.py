@@ -45,7 +45,6 @@ from urlab_client.protocol.messages.session import (
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.dialects import ALPHA, BETA
-from urlab_client.server.streams.broadcast import StateFull
 from urlab_client.values.plain import plain as plain_data
 
 OPS_BY_NAME = sorted(OPS)
@@ -116,7 +115,7 @@ ENCODERS: dict[str, Callable[[Any], object]] = {
     "plain data": lambda message: plain_data(message, "list"),
 }
 REPLIES = [op.reply for op in OPS.values()]
-PUBLISHED = [StateSnapshot, StateFull, InstanceInfo, *ClientEvent.__subclasses__()]
+PUBLISHED = [StateSnapshot, InstanceInfo, *ClientEvent.__subclasses__()]
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)

@@ -325,7 +325,7 @@ class InlineOrQueued:
         if self.way == "queued":
             sim.engine._inline_budget_s = -1.0
         else:
-            sim.engine._integrator.substep_s, sim.engine._inline_budget_s = 1e-6, float("inf")
+            sim.engine._substep_s, sim.engine._inline_budget_s = 1e-6, float("inf")
 
 
 WAYS = pytest.mark.parametrize("way", [InlineOrQueued("inline"), InlineOrQueued("queued")], ids=lambda w: w.way)

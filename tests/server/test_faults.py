@@ -249,20 +249,6 @@ def test_a_request_too_deep_to_read_meets_no_fault(server: SimulatedServer, faul
         assert b"bad_request" in socket.recv()
 
 
-class Clumsy(Drop):
-    def concerns_request(self, op: str) -> bool:
-        raise LookupError(op)
-
-
-def test_a_fault_of_a_users_own_that_fails_is_removed(
-    client: URLabClient, faults: Faults, caplog: pytest.LogCaptureFixture
-) -> None:
-    faults.add(Clumsy())
-    assert client.step().step == 1
-    assert faults.active == ()
-    assert "Clumsy" in caplog.text
-
-
 def test_shared_memory_gets_what_subscribers_do_not(models: Path, tmp_path: Path) -> None:
     faults = Faults(Drop(topic="state/full"), Corrupt(topic="bot/camera"))
     options: dict[str, Any] = {"play": True, "faults": faults, "shm_dir": tmp_path}

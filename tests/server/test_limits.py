@@ -136,7 +136,7 @@ def test_a_server_closes_in_the_middle_of_a_million_steps(models: Path, connect:
         core = server._running.core
         assert core is not None
         engine = core.play.running().engine
-        engine.on_substep.append(lambda: eventually(lambda: engine._thread.stopping))  # or it may have ended by then
+        engine.on_substep.append(lambda: eventually(lambda: engine._stopping))  # or it may have ended by then
         engine._step_timeout_s = 60.0
         wire._socket.send(pack({"op": "step", "session_id": wire.session_id, "n_steps": 1_000_000}))
         eventually(lambda: engine.time > 0.0, "it was not under way")

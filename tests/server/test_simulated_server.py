@@ -226,7 +226,7 @@ def test_close_during_a_long_step(models: Path, connect: Connect) -> None:
         wire.hello()
         wire.ask("set_mode", mode="direct")
         engine = server._opened.core.play.running().engine
-        engine.on_substep.append(lambda: eventually(lambda: engine._thread.stopping))  # or it may have ended by then
+        engine.on_substep.append(lambda: eventually(lambda: engine._stopping))  # or it may have ended by then
         engine._step_timeout_s = 60.0
         reply = ask_later(wire, "step", n_steps=Limits().n_steps)
         eventually(lambda: engine.time > 0.0)

@@ -217,9 +217,13 @@ def test_the_document_used_longest_ago_gives_way(small: Wire) -> None:
     assert [used(small, xml) for xml in (one, two, one, three, one, two)] == [True, True, False, True, False, True]
 
 
+def stored(root: Path) -> list[Path]:
+    return [file for file in root.rglob("Uploads/**/*") if file.is_file() and file.name != ".alive"]
+
+
 def test_what_is_under_way_is_bounded_too(small: Wire, tmp_path: Path) -> None:
     def held() -> list[int]:
-        return [file.stat().st_size for file in tmp_path.rglob("Uploads/**/*") if file.is_file()]
+        return [file.stat().st_size for file in stored(tmp_path)]
 
     assert used(small, XML)
     other = [XML.replace(b"sent", name) for name in (b"two_", b"more", b"last")]
@@ -239,7 +243,7 @@ def test_a_file_that_a_full_disk_cuts_short_does_not_stay_on_it(wire: Wire, tmp_
     wire.ask("upload_model_chunk", **chunk(upload, XML[:half], total=len(XML)))
     with files_of_at_most(half + 1):
         assert "File too large" in wire.refusal("upload_model_chunk", **chunk(upload, XML))[1]
-        assert not [file for file in tmp_path.rglob("Uploads/**/*") if file.is_file()]
+        assert not stored(tmp_path)
     assert wire.ask("upload_model_chunk", **chunk(upload, XML))["complete"]
 
 

@@ -151,7 +151,7 @@ def test_stop_pie_ends_it_and_play_begins_anew(bot: Callable[..., SimulatedServe
         assert count == ([0, 0, 0] if mode == "live" else [1, 2, 3])
 
         stuck.let_go.set()
-        eventually(lambda: not old._thread.alive)
+        eventually(lambda: not old._thread.is_alive())
         assert other.ask("forward")["step"] == count[-1]
 
 
@@ -180,7 +180,7 @@ def test_a_solver_that_would_go_on_for_days_gives_up(tmp_path: Path, stuck: Stuc
         eventually(lambda: engine.overdue is not None)
         assert wire.refused("step") == "not_ready"
         wire.ask("stop_pie")
-        eventually(lambda: not engine._thread.alive)
+        eventually(lambda: not engine._thread.is_alive())
 
 
 @pytest.mark.parametrize("transport", ["zmq", "shm"])

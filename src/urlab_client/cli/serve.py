@@ -76,8 +76,8 @@ network:
 content:
 --saved-dir DIR  folder for levels and imported models (default: a temporary folder)
 --model-root DIR...  folder below which clients may import MJCF files; repeatable (default: the models' folders)
---actor-names model|plugin=model  keys of articulations: the MJCF model name, or names as the plugin assigns them, such
-    as robot_C_0
+--actor-names model|plugin  keys of articulations: the MJCF model name (default of the alpha), or names as the plugin
+    assigns them, such as robot_C_0 (default of the beta)
 physics:
 --play  start a play session immediately
 --unpaused  let physics run from the start of play

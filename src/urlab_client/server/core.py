@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import copy
 import logging
-import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -36,7 +35,7 @@ from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.physics.observe import Observer, UserChannels
+from urlab_client.server.physics.observe import UserChannels
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.physics.variation import SceneVariation
@@ -153,7 +152,6 @@ class DriverLease:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
         self._id = ""
         self._ttl_s = 0.0
         self._touched = 0.0
@@ -161,34 +159,26 @@ class DriverLease:
     @property
     def held(self) -> bool:
         """Whether it is held."""
-        with self._lock:
-            return self._holds()
+        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
 
     def acquire(self, ttl_s: float) -> str:
         """Take it and return its id."""
-        with self._lock:
-            if self._holds():
-                # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
-                raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
-            self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
-            return self._id
+        if self.held:
+            # As the plugin does, although with the id anybody can release the lease. No message and no log has it.
+            raise Refusal("busy", "another client holds the driver lease", lease_id=self._id)
+        self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
+        return self._id
 
     def release(self, lease_id: str) -> None:
         """Give it back."""
-        with self._lock:
-            if not self._holds() or lease_id != self._id:
-                raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
-            self._id = ""
+        if not self.held or lease_id != self._id:
+            raise Refusal("bad_request", "lease_id is not the id of the lease that is held")
+        self._id = ""
 
     def touch(self) -> None:
         """Renew the lease: the server is in use."""
-        if self._id:
-            with self._lock:
-                if self._holds():
-                    self._touched = self._clock()
-
-    def _holds(self) -> bool:
-        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0
+        if self.held:
+            self._touched = self._clock()
 
 
 def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
@@ -325,21 +315,13 @@ class ServerCore:
             except ValueError as error:
                 raise CompileFailed(f"what is to vary: {error}") from None
             varied = engine.variation.visible_fields
-        channels = UserChannels(config.user_channels)
         modes = {
             (index.key, camera.name): config.camera_mode(index, camera.name)
             for index in scene.articulations
             for camera in index.cameras
         }
-        return Running(
-            scene,
-            engine.start(),
-            Observer(scene, engine.articulations.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.articulations.names, varied),
-            files,
-            self.limits,
-            channels,
-        )
+        cameras = self._camera_renderer(scene, actors, modes, engine.articulations.names, varied)
+        return Running(engine.start(), cameras, UserChannels(config.user_channels), files, self.limits)
 
     @property
     def _options(self) -> OptionPolicy:
@@ -418,27 +400,15 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def _unmatched_names(scene: CompiledScene, config: ServerConfig) -> list[str]:
-    """Return messages for configured names that match nothing in a scene; most likely they are misspelt."""
-    actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
-    cameras = {
-        f"{name}/{camera.name}"
-        for index in scene.articulations
-        for name in (index.actor_id, index.key)
-        if name
-        for camera in index.cameras
-    }
-    return [
-        *(
-            f"a controller is configured for '{unknown}', but the articulations are {_listed(actors)}"
-            for unknown in sorted(config.controllers.keys() - actors - {"*"})
-        ),
-        *(
-            f"a camera mode is configured for '{unknown}', but the cameras are {_listed(cameras)}"
-            for unknown in sorted(config.camera_modes.keys() - cameras)
-        ),
-    ]
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)) or "none"
+def _unmatched_names(scene: CompiledScene, config: ServerConfig) -> Iterator[str]:
+    """Yield messages for configured names that match nothing in a scene; most likely they are misspelt."""
+    named = [(name, index) for index in scene.articulations for name in (index.actor_id, index.key) if name]
+    actors = {name for name, _ in named}
+    cameras = {f"{name}/{camera.name}" for name, index in named for camera in index.cameras}
+    for what, wanted, kind, known in (
+        ("controller", config.controllers.keys() - {"*"}, "articulations", actors),
+        ("camera mode", config.camera_modes.keys(), "cameras", cameras),
+    ):
+        for unknown in sorted(wanted - known):
+            listed = ", ".join(sorted(known)) or "none"
+            yield f"a {what} is configured for '{unknown}', but the {kind} are {listed}"

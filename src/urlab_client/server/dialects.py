@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 from msgspec import Struct
@@ -64,8 +64,9 @@ def _beta_shapes() -> Mapping[str, _Shape]:
     }
 
 
-def _no_shapes() -> Mapping[str, Callable[[Any], Struct]]:
-    return {}
+@cache
+def _alpha_shapes() -> Mapping[str, _Shape]:
+    return {"state_full": _Shape(StateSnapshot, *_CLOCKS, "per_articulation", "entities", "user")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,14 +76,12 @@ class Dialect:
     Attributes:
         name: Its name.
         urlab_version: What the handshake says.
-        urlab_version_at_start: What the handshake inside the reply to `begin_pie` says.
         jobs: Ops that take long answer `op_started`.
         claims: Writes to a robot are refused unless the writer owns it.
         cameras_on: Cameras stream from the start of play.
         cameras_repeat: Cameras stream the same state over and over, else each state once.
         camera_headers: Streamed pictures begin with number, time and size.
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
-        draws_for_steps: Steps draw the pictures that they bring; else they bring what was drawn before them.
         qualified_cameras: Cameras are called `<robot>/<camera>`, on topics, too, and under no other name.
         public_names: Robots are called by their actor id where they have one, and `actor_name` tells the object's.
         frame_ids: Steps are numbered by `frame_id`.
@@ -97,20 +96,19 @@ class Dialect:
         options_merged: The `<option>` of every imported robot reaches the scene.
         robots_attached: The XML of the handshake attaches a document for each robot, else it is one flat model.
         instance: The handshake says which of several servers this is, and its own shared-memory regions.
+        actor_names: How robots are named unless the server is told: after their model, or as the plugin does.
         first_camera_port: Default port of the first camera.
         shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
     """
 
     name: DialectName
     urlab_version: str
-    urlab_version_at_start: str
     jobs: bool = False
     claims: bool = False
     cameras_on: bool = False
     cameras_repeat: bool = False
     camera_headers: bool = False
     camera_forms: bool = False
-    draws_for_steps: bool = False
     qualified_cameras: bool = False
     public_names: bool = False
     frame_ids: bool = False
@@ -125,8 +123,9 @@ class Dialect:
     options_merged: bool = False
     robots_attached: bool = False
     instance: bool = False
+    actor_names: Literal["model", "plugin"] = "model"
     first_camera_port: int
-    shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
+    shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_alpha_shapes)
 
     @property
     def ops(self) -> Mapping[str, Op]:
@@ -158,10 +157,8 @@ class Dialect:
 ALPHA: Final = Dialect(
     name="alpha",
     urlab_version="urlab/0.1",
-    urlab_version_at_start="urlab/0.1",
     cameras_on=True,
     cameras_repeat=True,
-    draws_for_steps=True,
     steps_published=True,
     rows_published=True,
     late_steps=True,
@@ -176,12 +173,10 @@ ALPHA: Final = Dialect(
 BETA: Final = Dialect(
     name="beta",
     urlab_version="urlab/0.2",
-    urlab_version_at_start="urlab/0.1",
     jobs=True,
     claims=True,
     camera_headers=True,
     camera_forms=True,
-    draws_for_steps=True,
     qualified_cameras=True,
     public_names=True,
     frame_ids=True,
@@ -189,6 +184,7 @@ BETA: Final = Dialect(
     options_merged=True,
     robots_attached=True,
     instance=True,
+    actor_names="plugin",
     first_camera_port=5561,
     shapes=_beta_shapes,
 )

@@ -6,14 +6,14 @@ Users' tests add and remove faults while the server runs. The server's transport
 
 from __future__ import annotations
 
-import enum
 import logging
 import math
 import random
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from types import TracebackType
 from typing import Any, ClassVar, Final, Self, get_type_hints
 
@@ -65,6 +65,8 @@ class Fault:
             raise ValueError(f"no op is called {self.op!r}")
         if self.topic is not None and self.op is not None:
             raise ValueError("a fault concerns the requests of an op or the messages of a topic, not both")
+        if self.topic is not None and isinstance(self, (Cut, Refuse)):
+            raise ValueError(f"{type(self).__name__} concerns requests; published messages are delayed or dropped")
         if self.after < 0 or (self.times is not None and self.times < 1):
             raise ValueError(f"after must be at least 0 and times at least 1, not {self.after} and {self.times}")
         if not 0.0 <= self.probability <= 1.0:
@@ -110,10 +112,6 @@ class Cut(Fault):
     Shared memory has no connection, so a reply over shared memory is lost as with `Drop`.
     """
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _refuse_topic(self)
-
 
 @dataclass(frozen=True)
 class Corrupt(Fault):
@@ -151,14 +149,8 @@ class Refuse(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _refuse_topic(self)
         if not self.code:
             raise ValueError("a refusal needs a code, for example 'internal_error'")
-
-
-def _refuse_topic(fault: Fault) -> None:
-    if fault.topic is not None:
-        raise ValueError(f"{type(fault).__name__} concerns requests; published messages are delayed or dropped")
 
 
 class ActiveFault:
@@ -296,23 +288,14 @@ class Faults:
         other: ActiveFault | None = None
         with self._changed:
             for active in self._active:
-                if not self._concerned(active, concerned):
+                if not concerned(active.fault):
                     continue
                 if isinstance(active.fault, Delay):
-                    if active.due():
-                        delays.append(active)
+                    delays += [active] if active.due() else []
                 elif other is None and active.due():
                     other = active
             self._changed.notify_all()
         return delays, other
-
-    def _concerned(self, active: ActiveFault, concerned: Callable[[Fault], bool]) -> bool:
-        try:
-            return concerned(active.fault)
-        except Exception:  # from a user-defined class
-            logger.exception("%r failed to match a message and is removed", active)
-            self.remove(active)
-            return False
 
     def wait_for(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Wait for a condition that depends on the faults; return whether it became true in time."""
@@ -323,13 +306,6 @@ class Faults:
         """Make waiting threads check their conditions again."""
         with self._changed:
             self._changed.notify_all()
-
-
-class Loss(enum.Enum):
-    """How a request is left unanswered."""
-
-    DROP = enum.auto()
-    CUT = enum.auto()
 
 
 class _Named(msgspec.Struct):
@@ -344,12 +320,7 @@ class Injector:
     """Applies faults to what a server receives and sends."""
 
     def __init__(self, faults: Faults, refuse: Callable[[str, str], bytes]) -> None:
-        """Put the injector between a server and its transports.
-
-        Args:
-            faults: The faults to apply.
-            refuse: Builds the frame of an error from its code and message.
-        """
+        """Put the injector between a server, whose `refuse` makes the frame of an error, and its transports."""
         self._faults = faults
         self._refuse = refuse
         self._closed = False
@@ -359,24 +330,15 @@ class Injector:
         self._closed = True
         self._faults.wake()
 
-    def answer(self, frame: bytes, answer: Callable[[bytes], bytes]) -> bytes | Loss:
-        """Answer a request, or return how its reply is lost.
-
-        Args:
-            frame: Frame of the request.
-            answer: Turns it into the frame of the reply.
-        """
+    def answer(self, frame: bytes, answer: Callable[[bytes], bytes]) -> bytes | Fault:
+        """Return the frame of the reply, which `answer` makes, or the fault by which it is lost."""
         if not self._faults.active:
             return answer(frame)
         op = _op_of(frame)
         delays, other = self._faults.take(lambda fault: fault.concerns_request(op))
-        for delay in delays:
-            if not delay.fault.executed:
-                self._sleep(delay)
+        self._sleep(delay for delay in delays if not delay.fault.executed)
         reply = b"" if other is not None and not other.fault.executed else answer(frame)
-        for delay in delays:
-            if delay.fault.executed:
-                self._sleep(delay)
+        self._sleep(delay for delay in delays if delay.fault.executed)
         if other is None:
             return reply
         logger.debug("%s: %r", op, other)
@@ -385,33 +347,34 @@ class Injector:
                 return self._refuse(code, message)
             case Corrupt(flips=flips):
                 return _corrupted(reply, flips, other.random)
-            case Cut():
-                return Loss.CUT
-            case _:
-                return Loss.DROP
+            case lost:
+                return lost
 
     def answer_in_memory(self, frame: bytes, answer: Callable[[bytes], bytes]) -> bytes:
         """Answer a request over shared memory; empty if the reply is lost in any way."""
         reply = self.answer(frame, answer)
-        return b"" if isinstance(reply, Loss) else reply
+        return reply if isinstance(reply, bytes) else b""
 
     def publish(self, topic: bytes, payload: bytes) -> bytes | None:
         """Return the payload of a published message, possibly delayed or changed; None if it is dropped."""
         if not self._faults.active:
             return payload
         delays, other = self._faults.take(lambda fault: fault.concerns_message(topic))
-        for delay in delays:
-            self._sleep(delay)
+        self._sleep(delays)
         if other is None:
             return payload
         if isinstance(other.fault, Corrupt):
             return _corrupted(payload, other.fault.flips, other.random)
         return None
 
-    def _sleep(self, delay: ActiveFault) -> None:
-        """Wait until the delay is over or removed, or the server closes."""
-        if isinstance(delay.fault, Delay):
-            self._faults.wait_for(lambda: self._closed or delay not in self._faults.active, delay.fault.seconds)
+    def _sleep(self, delays: Iterable[ActiveFault]) -> None:
+        """Wait until each delay is over or removed, or the server closes."""
+        for delay in delays:
+            if isinstance(delay.fault, Delay):
+                self._faults.wait_for(partial(self._over, delay), delay.fault.seconds)
+
+    def _over(self, delay: ActiveFault) -> bool:
+        return self._closed or delay not in self._faults.active
 
 
 class FaultyEndpoint(RpcEndpoint):
@@ -420,13 +383,6 @@ class FaultyEndpoint(RpcEndpoint):
     kind: ClassVar[int] = zmq.ROUTER
 
     def __init__(self, injector: Injector, answer: Callable[[bytes], bytes], **options: Any) -> None:
-        """Bind the socket.
-
-        Args:
-            injector: Selects the faults to apply.
-            answer: See `RpcEndpoint`.
-            options: See `RpcEndpoint`.
-        """
         super().__init__(answer, **options)
         self._injector = injector
         self._envelope: list[bytes] = []
@@ -445,9 +401,9 @@ class FaultyEndpoint(RpcEndpoint):
         reply = self._injector.answer(parts[end] if len(parts) == end + 1 else b"", self._answer)
         if not self.serving.finish():
             return False
-        if reply is Loss.CUT:
+        if isinstance(reply, Cut):
             _shut(int(frames[end - 1].get(zmq.SRCFD)))
-        elif reply is not Loss.DROP:
+        elif isinstance(reply, bytes):
             self._socket.send_multipart([*envelope, reply])
         self._envelope = []
         return True

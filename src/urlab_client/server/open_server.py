@@ -7,11 +7,10 @@ import datetime as dt
 import logging
 import os
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -42,7 +41,7 @@ from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.commands import CameraEndpoint
 from urlab_client.server.streams.publishing import StreamServer
 from urlab_client.server.system.temporary_folder import TemporaryFolder
-from urlab_client.server.system.threads import Health, ended
+from urlab_client.server.system.threads import Health, ServedThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, numeric_host, tcp
 from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
@@ -51,33 +50,27 @@ from urlab_client.simulation.opengl import RenderingUnavailable, need_backend
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
-class Registration:
+class Registration(ServedThread):
     """Keeps the file of one server in the registry for as long as the server is open."""
 
     def __init__(self, directory: Path, describe: Callable[[], InstanceInfo], health: Health) -> None:
+        super().__init__(health.thread("urlab-registry", self._run))
         self._directory = directory
         self._describe = describe
         self._path: Path | None = None
-        self._stopping = threading.Event()
-        self._thread = health.thread("urlab-registry", self._run)
 
     def start(self) -> None:
         """Write the file, and renew it before it would be considered stale."""
         self._write()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stopping.set()
+        super().start()
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end and remove the file; return False if the thread is still busy."""
-        if self._thread.ident is not None:
-            ended(self._thread, timeout)
+        ended = super().join(timeout)
         if self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink()
-        return not self._thread.is_alive()
+        return ended
 
     def _run(self) -> None:
         while not self._stopping.wait(instances.REWRITE_S):
@@ -99,8 +92,8 @@ CLOSE_S: Final = 1.0
 
 _NO_LIMIT: Final = float("inf")
 
-Served: TypeAlias = Watchdog | RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer
-"""A part of a server with a thread that must live."""
+Part: TypeAlias = ServedThread | RpcEndpoint | SharedMemoryServer | ServerCore
+"""A part of a server that is stopped, then joined."""
 
 GAP_M: Final = 1.0
 """Free space between the models placed side by side, metres."""
@@ -114,39 +107,137 @@ IDLE_DEADLINE_S: Final = 10.0
 _FRAMING_FOV: Final = 40.0
 
 
-@dataclass(frozen=True, kw_only=True)
 class OpenServer:
-    """The parts of an open server. Does not refer to its `SimulatedServer`, so that it can be collected.
+    """The parts of an open server. Does not refer to its `SimulatedServer`, so that it can be collected."""
 
-    Attributes:
-        served: All parts with a thread.
-        authored: Result of `_mark` after the start.
-        resources: Everything that `close` releases.
-    """
+    def __init__(self, config: ServerConfig) -> None:
+        """Open a server; release everything if that fails.
 
-    config: ServerConfig
-    host: str
-    curve_keys: CurveKeys | None
-    core: ServerCore
-    dispatcher: Dispatcher
-    endpoint: RpcEndpoint
-    streams: StreamServer
-    cameras: CameraStreams
-    memory: SharedMemoryServer | None
-    served: Sequence[Served]
-    authored: object
-    resources: ExitStack
-    pid: int
+        Raises:
+            UnprotectedServer: Other machines could use it without keys, and `insecure_no_auth` is not set.
+            ModelError: A model or level cannot be used.
+        """
+        self.config: ServerConfig = config
+        self.host: str = numeric_host(config.host)
+        host = self.host
+        self.curve_keys: CurveKeys | None = None if config.curve is None else CurveKeys(config.curve)
+        self._pid = os.getpid()
+        if self.curve_keys is None and not config.insecure_no_auth and not is_loopback(host):
+            raise UnprotectedServer(
+                f"{config.host} ({host}) can be reached from other machines, and a client can read and write "
+                "files of this one.",
+                hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
+                "or pass --insecure-no-auth (insecure_no_auth=True).",
+            )
+        with ExitStack() as resources:
+            self._open(config, resources)
+            self._resources = resources.pop_all()
+        if not is_available():
+            tell = logger.info if is_loopback(host) else logger.warning
+            tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")
+        if self.curve_keys is None and not is_loopback(host):
+            logger.warning("open to anyone who reaches %s, without authentication or encryption", host)
+        logger.info("serving at %s:%d", tcp(host), self.endpoint.port)
+
+    def _open(self, config: ServerConfig, resources: ExitStack) -> None:
+        """Make all parts and start them."""
+        health = Health()
+        content = _content(config, resources)
+        parts: list[Part] = []
+        resources.callback(_end, parts)
+        where: dict[str, Any] = {"host": self.host, "curve_keys": self.curve_keys, "health": health}
+        memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, health)
+        self.memory: SharedMemoryServer | None = memory
+        parts += [] if memory is None else [memory]
+        self.cameras: CameraStreams = CameraStreams(
+            **where, port=config.camera_port, memory=memory, dialect=config.dialect
+        )
+        parts.append(self.cameras)
+        self.streams: StreamServer = StreamServer(
+            partial(_camera_endpoints, self.cameras),
+            **where,
+            state_port=config.state_port,
+            ctrl_port=config.ctrl_port,
+            info_port=config.info_port,
+            memory=memory,
+        )
+        parts.append(self.streams)
+        self.core: ServerCore = ServerCore(
+            world=EditorWorld(content, actor_names=config.actor_names),
+            config=config,
+            camera_endpoint=self.cameras.endpoint,
+            switch_camera=self.cameras.switch,
+            shm_directory=None if memory is None else str(memory.directory),
+            health=health,
+        )
+        core = self.core
+        core.play.listeners += [self.cameras.show, self.streams.show]  # the second announces the first's ports
+        injector = None if config.faults is None else Injector(config.faults, core.refuse)
+        if injector is not None:
+            self.streams.filter = self.cameras.filter = injector.publish
+        self.cameras.start()
+        self.streams.start()
+        # Bound before the models are read, which takes longer; requests wait in the socket until then.
+        self.dispatcher: Dispatcher = Dispatcher(core, HANDLERS)
+        make = RpcEndpoint if injector is None else partial(FaultyEndpoint, injector)
+        self.endpoint: RpcEndpoint = make(
+            self.dispatcher.answer,
+            **where,
+            port=config.step_port,
+            refuse=core.refuse,
+            request_bytes=config.limits.request_bytes,
+        )
+        watchdog = Watchdog(core, self.dispatcher, health)
+        parts += [self.endpoint, watchdog]
+        self._served = [part for part in parts if not isinstance(part, ServerCore)]
+        parts.append(core)
+        if injector is not None:
+            resources.callback(injector.close)
+        core.instance = self._instance if config.dialect.instance else None
+        _begin(core)
+        self._authored = _mark(core)
+        self.dispatcher.served = [part.serving for part in (self.endpoint, memory) if part is not None]
+        watchdog.start()
+        self.endpoint.start()
+        if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
+            registration = Registration(instances.registry_directory(), self._instance, health)
+            parts.append(registration)
+            registration.start()
+        if memory is not None:
+            in_memory = partial(self.dispatcher.answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES)
+            memory.start(in_memory if injector is None else partial(injector.answer_in_memory, answer=in_memory))
+
+    def _instance(self) -> InstanceInfo:
+        core = self.core
+        return InstanceInfo(
+            instance_id=core.config.instance_id,
+            index=core.config.index,
+            pid=self._pid,
+            host=socket.gethostname(),
+            step_port=self.endpoint.port,
+            state_port=self.streams.state_port,
+            cam_base_port=self.cameras.port,
+            manager_present=core.play.manager_present,
+            busy=core.lease.held,
+            urlab_version=core.dialect.urlab_version,
+            capabilities=[
+                "render_sync",
+                "render_async",
+                *(["shm_rpc"] if self.memory is not None else []),
+                "model_upload",
+                "content_cache",
+            ],
+        )
 
     def restore(self) -> bool:
         """Restore the state after the start, or return False if that requires a restart."""
         core = self.core
         if self.config.faults is not None:
             self.config.faults.reset()
-        if core.health.failure is not None or not all(served.alive for served in self.served):
+        if core.health.failure is not None or not all(served.alive for served in self._served):
             return False
         with self.dispatcher.standstill(CLOSE_S) as idle:
-            if not idle or _mark(core) != self.authored:
+            if not idle or _mark(core) != self._authored:
                 return False
             core.lease = DriverLease()
             core.session = ServerSession()
@@ -158,114 +249,46 @@ class OpenServer:
             core.stop_play()
             return True
 
+    def snapshot(self, size: tuple[int, int], *, frame_all: bool) -> NDArray[np.uint8]:
+        """Draw the viewport; see `SimulatedServer.snapshot`. Requests are not answered while the state is read."""
+        need_backend()
+        core = self.core
+        with self.dispatcher.standstill(IDLE_DEADLINE_S) as idle:
+            if not idle:
+                raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
+            view = look(core)
+            picture = ViewportPicture(
+                size=size,
+                view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
+                fit=frame_all,
+                mode=core.viewport.mode,
+                primitives=core.drawings.take_frame(in_play=core.world.pie_running),
+                overlay=core.drawings.overlay,
+                selected=core.world.actors.selected,
+            )
+            running = core.play.current
+            try:
+                if running is not None:
+                    with running.engine.lock:
+                        visible = running.cameras.capture_viewport()
+                    renderer = running.cameras
+                else:
+                    renderer = core.authored_renderer()
+                    visible = renderer.capture_viewport()
+            except Refusal as refusal:
+                raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
+            except CompileFailed as error:
+                raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
+        try:
+            return renderer.paint(visible, picture)
+        finally:
+            if running is None:
+                renderer.close()
+
     def close(self) -> None:
         """Release everything. Idempotent; does nothing in a forked child, which does not own the resources."""
-        if os.getpid() == self.pid:
-            self.resources.close()
-
-
-def open_server(config: ServerConfig) -> OpenServer:
-    """Open a server; release everything if that fails.
-
-    Raises:
-        UnprotectedServer: Other machines could use it without keys, and `insecure_no_auth` is not set.
-        ModelError: A model or level cannot be used.
-    """
-    host = numeric_host(config.host)
-    curve_keys = None if config.curve is None else CurveKeys(config.curve)
-    if curve_keys is None and not config.insecure_no_auth and not is_loopback(host):
-        raise UnprotectedServer(
-            f"{config.host} ({host}) can be reached from other machines, and a client can read and write "
-            "files of this one.",
-            hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
-            "or pass --insecure-no-auth (insecure_no_auth=True).",
-        )
-    with ExitStack() as resources:
-        opened = _open(config, host, curve_keys, resources)
-        if not is_available():
-            tell = logger.info if is_loopback(host) else logger.warning
-            tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")
-        if curve_keys is None and not is_loopback(host):
-            logger.warning("open to anyone who reaches %s, without authentication or encryption", host)
-        logger.info("serving at %s:%d", tcp(host), opened.endpoint.port)
-        return opened
-
-
-def _open(config: ServerConfig, host: str, curve_keys: CurveKeys | None, resources: ExitStack) -> OpenServer:
-    """Make all parts and start them. `resources` holds them until all of them run."""
-    health = Health()
-    content = _content(config, resources)
-    parts: list[Served | ServerCore | Registration] = []
-    resources.callback(_end, parts)
-    where: dict[str, Any] = {"host": host, "curve_keys": curve_keys, "health": health}
-    memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, health)
-    parts += [] if memory is None else [memory]
-    cameras = CameraStreams(**where, port=config.camera_port, memory=memory, dialect=config.dialect)
-    parts.append(cameras)
-    streams = StreamServer(
-        partial(_camera_endpoints, cameras),
-        **where,
-        state_port=config.state_port,
-        ctrl_port=config.ctrl_port,
-        info_port=config.info_port,
-        memory=memory,
-    )
-    parts.append(streams)
-    core = ServerCore(
-        world=EditorWorld(content, actor_names=config.actor_names),
-        config=config,
-        camera_endpoint=cameras.endpoint,
-        switch_camera=cameras.switch,
-        shm_directory=None if memory is None else str(memory.directory),
-        health=health,
-    )
-    core.play.listeners += [cameras.show, streams.show]  # the second announces the first's ports
-    injector = None if config.faults is None else Injector(config.faults, core.refuse)
-    if injector is not None:
-        streams.filter = cameras.filter = injector.publish
-    cameras.start()
-    streams.start()
-    # Bound before the models are read, which takes longer; requests wait in the socket until then.
-    dispatcher = Dispatcher(core, HANDLERS)
-    make = RpcEndpoint if injector is None else partial(FaultyEndpoint, injector)
-    endpoint = make(
-        dispatcher.answer, **where, port=config.step_port, refuse=core.refuse, request_bytes=config.limits.request_bytes
-    )
-    watchdog = Watchdog(core, dispatcher, health)
-    parts += [endpoint, watchdog]
-    served = [part for part in parts if not isinstance(part, (ServerCore, Registration))]
-    parts.append(core)
-    if injector is not None:
-        resources.callback(injector.close)
-    describe = partial(_instance, core, endpoint, streams, cameras, shared_memory=memory is not None)
-    core.instance = describe if config.dialect.instance else None
-    _begin(core)
-    authored = _mark(core)
-    dispatcher.served = [part.serving for part in (endpoint, memory) if part is not None]
-    watchdog.start()
-    endpoint.start()
-    if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
-        registration = Registration(instances.registry_directory(), describe, health)
-        parts.append(registration)
-        registration.start()
-    if memory is not None:
-        in_memory = partial(dispatcher.answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES)
-        memory.start(in_memory if injector is None else partial(injector.answer_in_memory, answer=in_memory))
-    return OpenServer(
-        config=config,
-        host=host,
-        curve_keys=curve_keys,
-        core=core,
-        dispatcher=dispatcher,
-        endpoint=endpoint,
-        streams=streams,
-        cameras=cameras,
-        memory=memory,
-        served=served,
-        authored=authored,
-        resources=resources.pop_all(),
-        pid=os.getpid(),
-    )
+        if os.getpid() == self._pid:
+            self._resources.close()
 
 
 def _content(config: ServerConfig, resources: ExitStack) -> ContentRoot:
@@ -302,29 +325,6 @@ def _begin(core: ServerCore) -> None:
             raise ModelError(f"play cannot start: {core.play.compile_error}")
 
 
-def _instance(
-    core: ServerCore, endpoint: RpcEndpoint, streams: StreamServer, cameras: CameraStreams, *, shared_memory: bool
-) -> InstanceInfo:
-    return InstanceInfo(
-        instance_id=core.config.instance_id,
-        index=core.config.index,
-        pid=os.getpid(),
-        host=socket.gethostname(),
-        step_port=endpoint.port,
-        state_port=streams.state_port,
-        cam_base_port=cameras.port,
-        manager_present=core.play.manager_present,
-        busy=core.lease.held,
-        urlab_version=core.dialect.urlab_version,
-        capabilities=[
-            *(["render_sync", "render_async"] if core.dialect.draws_for_steps else []),
-            *(["shm_rpc"] if shared_memory else []),
-            "model_upload",
-            "content_cache",
-        ],
-    )
-
-
 def _mark(core: ServerCore) -> object:
     """Return a value that compares equal until something is authored, or written to the server's own folder."""
     files: set[tuple[Path, int, int]] = set()
@@ -335,7 +335,7 @@ def _mark(core: ServerCore) -> object:
     return core.world.authored(), files
 
 
-def _end(parts: Sequence[Served | ServerCore | Registration]) -> None:
+def _end(parts: Sequence[Part]) -> None:
     """Stop all parts, then wait for them, the last one first: the streams write to shared memory."""
     deadline = time.monotonic() + CLOSE_S
     for part in reversed(parts):
@@ -398,41 +398,3 @@ def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | 
     if bounds.extents == (0.0, 0.0, 0.0):
         return edge
     return bounds.max[1] if edge is None else max(edge, bounds.max[1])
-
-
-def take_snapshot(
-    server: ServerCore, dispatcher: Dispatcher, size: tuple[int, int], *, frame_all: bool
-) -> NDArray[np.uint8]:
-    """Draw the viewport; see `SimulatedServer.snapshot`. Requests are not answered while the state is read."""
-    need_backend()
-    with dispatcher.standstill(IDLE_DEADLINE_S) as idle:
-        if not idle:
-            raise RenderingUnavailable(f"a request has been in progress for more than {IDLE_DEADLINE_S:g} s")
-        view = look(server)
-        picture = ViewportPicture(
-            size=size,
-            view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
-            fit=frame_all,
-            mode=server.viewport.mode,
-            primitives=server.drawings.take_frame(in_play=server.world.pie_running),
-            overlay=server.drawings.overlay,
-            selected=server.world.actors.selected,
-        )
-        running = server.play.current
-        try:
-            if running is not None:
-                with running.engine.lock:
-                    visible = running.cameras.capture_viewport()
-                renderer = running.cameras
-            else:
-                renderer = server.authored_renderer()
-                visible = renderer.capture_viewport()
-        except Refusal as refusal:
-            raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
-        except CompileFailed as error:
-            raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
-    try:
-        return renderer.paint(visible, picture)
-    finally:
-        if running is None:
-            renderer.close()

@@ -9,32 +9,14 @@ class Refusal(Exception):
     Attributes:
         code: Stable wire code, for example `spawn_failed`.
         message: What is wrong, where, and how to correct it; one line.
-        absolute_path: The file that could not be written; `recording_save` only.
-        owner: Owner of the robot that the request is about.
-        lease_id: The lease that another client holds.
+        details: The other fields of the reply, such as `owner`; see `ErrorReply`.
     """
 
-    code: str
-    message: str
-    absolute_path: str | None
-    owner: str | None
-    lease_id: str | None
-
-    def __init__(
-        self,
-        code: str,
-        message: str,
-        *,
-        absolute_path: str | None = None,
-        owner: str | None = None,
-        lease_id: str | None = None,
-    ) -> None:
+    def __init__(self, code: str, message: str, **details: str) -> None:
         super().__init__(code, message)
-        self.absolute_path = absolute_path
-        self.owner = owner
-        self.lease_id = lease_id
-        self.code = code
-        self.message = message
+        self.code: str = code
+        self.message: str = message
+        self.details: dict[str, str] = details
 
     def __str__(self) -> str:
         return f"{self.code}: {self.message}"
@@ -43,8 +25,6 @@ class Refusal(Exception):
 class CompileFailed(Exception):
     """MuJoCo rejects the scene."""
 
-    message: str
-
     def __init__(self, message: str) -> None:
         super().__init__(message)
-        self.message = message
+        self.message: str = message

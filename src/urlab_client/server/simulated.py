@@ -24,7 +24,7 @@ from urlab_client.server.core import ServerConfig
 from urlab_client.server.dialects import DIALECTS
 from urlab_client.server.faults import Faults
 from urlab_client.server.limits import Limits
-from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level, open_server, take_snapshot
+from urlab_client.server.open_server import LARGEST_PIXELS, OpenServer, is_level
 from urlab_client.server.physics.observe import channel_problem
 from urlab_client.server.rpc.dispatch import ServedRequest
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
@@ -80,7 +80,7 @@ class SimulatedServer:
         camera_size: tuple[int, int] | None = None,
         render_quality: RenderQuality = "auto",
         mjcf_options: bool = False,
-        actor_names: Literal["model", "plugin"] = "model",
+        actor_names: Literal["model", "plugin"] | None = None,
         faults: Faults | None = None,
         shm_dir: str | os.PathLike[str] | None = None,
         dialect: DialectName = "alpha",
@@ -120,8 +120,8 @@ class SimulatedServer:
                 with software rendering, `high` on a graphics card.
             mjcf_options: Use the `<option>` of the first model. Otherwise the alpha ignores all, and the beta merges
                 them.
-            actor_names: Name articulations after their MJCF's model name (`robot`, `copy1_robot`) or as the plugin does
-                (`robot_C_0`, `robot_C_1`).
+            actor_names: Name articulations after their MJCF's model name (`robot`, `copy1_robot`), the default of the
+                alpha, or as the plugin does (`robot_C_0`, `robot_C_1`), that of the beta.
             faults: Faults injected into replies and published messages, for tests; they may change while the server
                 runs.
             shm_dir: Directory in which the server creates its own directory for shared-memory regions; a tmpfs such as
@@ -142,7 +142,7 @@ class SimulatedServer:
         names = tuple(os.fspath(model) for model in models)
         if sum(map(is_level, names)) > 1:
             raise ValueError(f"only one level can be open: {', '.join(filter(is_level, names))}")
-        if actor_names not in ("model", "plugin"):
+        if actor_names not in ("model", "plugin", None):
             raise ValueError(f"actor_names must be 'model' or 'plugin', not {actor_names!r}")
         if render_quality not in get_args(RenderQuality):
             raise ValueError(f"render_quality must be {', '.join(get_args(RenderQuality))}, not {render_quality!r}")
@@ -187,7 +187,7 @@ class SimulatedServer:
             camera_size=camera_size,
             render_quality=render_quality,
             mjcf_options=mjcf_options,
-            actor_names=actor_names,
+            actor_names=actor_names or DIALECTS[dialect].actor_names,
             faults=faults,
             shm_dir=None if shm_dir is None else Path(shm_dir),
             dialect=DIALECTS[dialect],
@@ -224,7 +224,7 @@ class SimulatedServer:
         """
         with self._lock:
             if self._opened is None:
-                self._opened = open_server(self._config)
+                self._opened = OpenServer(self._config)
                 self._finalizer = weakref.finalize(self, self._opened.close)
         return self
 
@@ -279,8 +279,7 @@ class SimulatedServer:
         """
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
             raise ValueError(f"size must be a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
-        opened = self._running
-        return take_snapshot(opened.core, opened.dispatcher, (int(size[0]), int(size[1])), frame_all=frame_all)
+        return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
 
     @property
     def failure(self) -> str | None:

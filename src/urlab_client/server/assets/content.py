@@ -18,7 +18,6 @@ import logging
 import os
 import shutil
 import stat
-import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -41,7 +40,7 @@ from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_mo
 from urlab_client.server.assets.importer import build_confined, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.temporary_folder import sweep, working_in
+from urlab_client.server.system.temporary_folder import TemporaryFolder, sweep
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -49,7 +48,7 @@ UPLOADED: Final = "uploaded"
 """Source of a blueprint that a client has uploaded."""
 
 _UNDER_WAY: Final = ".import-"
-"""Prefix of folders that are being written or removed."""
+"""Prefix of the temporary folders in which imports are written and removed."""
 
 _DEFAULT_LIMITS: Final = Limits()
 
@@ -69,7 +68,7 @@ class ContentRoot:
         self.root: Path = saved_dir.resolve()
         self.model_roots: tuple[Path, ...] = tuple(root.resolve() for root in model_roots)
         self._blueprints: dict[str, Blueprint] = {}
-        sweep(self.root / IMPORTS, f"*/{_UNDER_WAY}*", f"{_UNDER_WAY}*")
+        sweep(self.root / IMPORTS, _UNDER_WAY)
         for record in sorted(self.root.glob(f"{IMPORTS}/*/blueprint.json")):
             try:
                 blueprint = load_blueprint(record)
@@ -167,11 +166,8 @@ class ContentRoot:
         folder = home / other.digest
         if not _is_sound(folder):
             home.mkdir(parents=True, exist_ok=True)
-            with (
-                working_in(self.root / IMPORTS),
-                tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
-            ):
-                copy = Path(temporary_folder) / "snapshot"
+            with TemporaryFolder(self.root / IMPORTS, _UNDER_WAY) as temporary_folder:
+                copy = temporary_folder.path / "snapshot"
                 shutil.copytree(other.folder, copy)
                 _replace(copy, folder)
         return self._register(home, folder, other.record)
@@ -182,11 +178,9 @@ class ContentRoot:
         Raises:
             OSError: It cannot be deleted.
         """
-        removed = self.root / IMPORTS / f"{_UNDER_WAY}{stem}"
-        shutil.rmtree(removed, ignore_errors=True)
-        os.replace(self.root / IMPORTS / stem, removed)  # whole, or not at all
-        del self._blueprints[stem]
-        shutil.rmtree(removed, ignore_errors=True)
+        with TemporaryFolder(self.root / IMPORTS, _UNDER_WAY) as removed:
+            os.replace(self.root / IMPORTS / stem, removed.path / stem)  # whole, or not at all
+            del self._blueprints[stem]
 
     def open_to_clients(self, path: Path) -> bool:
         """Whether a resolved path lies where clients may read: below the content root, a model root, or bundled."""
@@ -245,11 +239,10 @@ class ContentRoot:
         home = self.root / IMPORTS / stem
         home.mkdir(parents=True, exist_ok=True)
         with (
-            working_in(self.root / IMPORTS),
-            tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+            TemporaryFolder(self.root / IMPORTS, _UNDER_WAY) as temporary_folder,
             contextlib.ExitStack() as undo,
         ):
-            snapshot = Path(temporary_folder) / "snapshot"
+            snapshot = temporary_folder.path / "snapshot"
 
             def put_in_place() -> Path:
                 """Move the snapshot to the folder that its content names, unless that is as it was written."""

@@ -6,12 +6,10 @@ client sent them. Names are bare file names and hashes are checked, so no reques
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import re
 import shutil
-import tempfile
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable
@@ -29,7 +27,7 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelManifest,
 )
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.system.temporary_folder import sweep, working_in
+from urlab_client.server.system.temporary_folder import TemporaryFolder, sweep
 from urlab_client.values.names import is_file_name
 
 DOCUMENT: Final = "model.xml"
@@ -65,7 +63,7 @@ class _Upload:
     assets: dict[str, _File]
     step_mode: StepMode | None
     touched: float
-    folder: Path
+    folder: TemporaryFolder
 
     def file(self, kind: str, name: str) -> tuple[str, _File]:
         """Return a file and its name in replies."""
@@ -90,12 +88,11 @@ class Uploads:
     cache_bytes: int
     clock: Callable[[], float] = time.monotonic
     _open: dict[str, _Upload] = field(default_factory=dict[str, _Upload])
-    _working: contextlib.ExitStack | None = None
     _held: int = 0
     """Size of the cache, bytes: as of the last manifest, with the changes since."""
 
     def __post_init__(self) -> None:
-        sweep(self.root, f"{_UNDER_WAY}*")
+        sweep(self.root, _UNDER_WAY)
 
     @property
     def _cache(self) -> Path:
@@ -131,14 +128,11 @@ class Uploads:
             )
         document = _File(manifest.xml_sha256, None)
         with _storing("the upload"):
-            if self._working is None:  # so that no other server removes the open uploads as leftovers
-                self._cache.mkdir(parents=True, exist_ok=True)
-                self._working = contextlib.ExitStack()
-                self._working.enter_context(working_in(self.root))
+            self._cache.mkdir(parents=True, exist_ok=True)
             needed = [name for name, file in named.items() if not self._take(file)]
             need_xml = not self._take(document)
             self._held = sum(about.st_size for _, about in _files(self._cache.iterdir()))
-            folder = Path(tempfile.mkdtemp(dir=self.root, prefix=_UNDER_WAY))
+            folder = TemporaryFolder(self.root, _UNDER_WAY)
         upload_id = str(uuid.uuid4()).upper()
         self._open[upload_id] = _Upload(document, named, _step_mode(manifest.step_mode), self.clock(), folder)
         return upload_id, need_xml, needed
@@ -168,7 +162,7 @@ class Uploads:
             )
         upload = self._find(chunk.upload_id)
         label, file = upload.file(kind, chunk.name)
-        partial = upload.folder / (DOCUMENT if kind == "xml" else chunk.name)
+        partial = upload.folder.path / (DOCUMENT if kind == "xml" else chunk.name)
         if file.size is not None and total != file.size:
             raise Refusal("bad_request", f"'{label}' has {file.size} bytes in the manifest, not {total}")
         if self._cached(file):
@@ -204,7 +198,7 @@ class Uploads:
         if missing:
             raise Refusal("bad_request", f"the upload is incomplete: {', '.join(missing[:5])} must be sent first")
         try:
-            laid_out = upload.folder / "model"
+            laid_out = upload.folder.path / "model"
             laid_out.mkdir()
             for name, file in {DOCUMENT: upload.document, **upload.assets}.items():
                 shutil.copyfile(self._cache / file.sha256, laid_out / name)
@@ -218,12 +212,9 @@ class Uploads:
         """Discard all open uploads. Idempotent."""
         for upload_id in list(self._open):
             self._close(upload_id)
-        if self._working is not None:
-            self._working.close()
-            self._working = None
 
     def _close(self, upload_id: str) -> None:
-        shutil.rmtree(self._open.pop(upload_id).folder, ignore_errors=True)
+        self._open.pop(upload_id).folder.close()
 
     def _find(self, upload_id: str) -> _Upload:
         self._forget_idle()

@@ -36,10 +36,14 @@ def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
         real = file.resolve()
         is_folder = path.endswith(("/", os.sep)) or folder.is_relative_to(real) or real.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, a loop of links
-        raise Refusal(code, f"{path!r} is not a usable path: {error}", absolute_path=path) from None
+        raise Refusal(code, f"{path!r} is not a usable path: {error}", **_where(code, path)) from None
     if is_folder:
-        raise Refusal(code, f"{file} is a folder", absolute_path=str(file))
+        raise Refusal(code, f"{file} is a folder", **_where(code, file))
     return real, folder
+
+
+def _where(code: str, path: object) -> dict[str, str]:
+    return {"absolute_path": str(path)} if code == "path_not_writable" else {}
 
 
 def _to_write(server: ServerCore, path: str) -> Path:

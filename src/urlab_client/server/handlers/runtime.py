@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
+import msgspec
 import mujoco
 import numpy as np
 from msgspec import field
@@ -25,7 +26,7 @@ from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need, usable
 from urlab_client.simulation.controllers import float32
 from urlab_client.values.rotation import Quat, Vec3
-from urlab_client.values.types import Contact, KeyframeInfo, SimOptions
+from urlab_client.values.types import Contact, KeyframeInfo
 
 
 def _owner(request: ControlRequest[Any]) -> str:
@@ -90,19 +91,14 @@ def set_user_channels(server: ServerCore, request: runtime.SetUserChannels) -> r
     running = server.play.running()
     applied = 0
     rejected: dict[str, str] = {}
-    for name, values in (request.arts or {}).items():
+    for name, values in [*(request.arts or {}).items(), (SCENE, request.scene or {})]:
         robot = running.engine.articulations.find(name)
-        owner = name if robot is None else running.engine.articulations.name(robot)
+        owner = name if robot is None else running.engine.articulations.names[robot.index.key]
         for channel, value in values.items():
             reason = running.channels.write(owner, channel, value)
             applied += reason is None
             if reason is not None:
                 rejected[f"{name}/{channel}"] = reason
-    for channel, value in (request.scene or {}).items():
-        reason = running.channels.write(SCENE, channel, value)
-        applied += reason is None
-        if reason is not None:
-            rejected[f"{SCENE}/{channel}"] = reason
     return runtime.SetUserChannelsOk(applied=applied, rejected=rejected)
 
 
@@ -137,15 +133,14 @@ def set_sim_speed(server: ServerCore, request: runtime.SetSimSpeed) -> runtime.S
 def set_control_source(server: ServerCore, request: runtime.SetControlSource) -> runtime.SetControlSourceOk:
     engine = server.play.running().engine
     source = parse_control_source(need(request, request.source, "source"))
-    if not request.articulation:
+    key = request.articulation or None
+    if key is None:
         check_all_owners(server, request)
-        with engine.commanding() as articulations:
-            articulations.set_source(source)
-        return runtime.SetControlSourceOk(source=source, scope="global")
-    check_owner(server, request, engine.articulations.control(request.articulation))
+    else:
+        check_owner(server, request, engine.articulations.control(key))
     with engine.commanding() as articulations:
-        articulations.set_source(source, request.articulation)
-    return runtime.SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
+        articulations.set_source(source, key)
+    return runtime.SetControlSourceOk(source=source, scope="articulation" if key else "global", articulation=key)
 
 
 class AnyTwist(runtime.SetTwist, tag="set_twist", kw_only=True):
@@ -332,8 +327,7 @@ def set_sim_options(server: ServerCore, request: runtime.SetSimOptions) -> runti
     running = server.play.running()
     options = need(request, request.options, "options")
     with running.engine.lock:
-        echo = running.options.apply(running.scene.model, running.scene.data, options)
-    return runtime.SetSimOptionsOk(options=cast("SimOptions", echo))  # its fields, in the order of the wire
+        return runtime.SetSimOptionsOk(options=running.options.apply(running.scene.model, running.scene.data, options))
 
 
 def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
@@ -425,10 +419,5 @@ def _latency(
 
 
 def _rounded(latency: cameras.CameraDelayInForce) -> cameras.CameraDelayInForce:
-    return cameras.CameraDelayInForce(
-        delay_s=float32(latency.delay_s),
-        jitter_s=float32(latency.jitter_s),
-        clock=latency.clock,
-        on_state_change=latency.on_state_change,
-        max_fps=float32(latency.max_fps),
-    )
+    rounded = {name: float32(getattr(latency, name)) for name in ("delay_s", "jitter_s", "max_fps")}
+    return msgspec.structs.replace(latency, **rounded)

@@ -26,6 +26,9 @@ from urlab_client.simulation.controllers import float32
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
+URLAB_VERSION_AT_START: Final = "urlab/0.1"
+"""What the handshake inside the reply to `begin_pie` says, whatever `hello` says."""
+
 _PICTURES_WAIT_S: Final = 0.2
 """Default wait of a step for its pictures, seconds."""
 
@@ -179,8 +182,7 @@ def step(server: ServerCore, request: session.Step) -> session.StepOk | bytes:
     def observe(mode: StepMode) -> tuple[session.StepOk, Film | None]:
         film = None
         if shots and (forms or mode in (StepMode.DIRECT, StepMode.PUPPET)):
-            draw = server.dialect.draws_for_steps
-            film = running.cameras.capture(shots, running.engine.snapshots.number, draw=draw)
+            film = running.cameras.capture(shots, running.engine.snapshots.number)
         return _observe_step(running, level), film
 
     reply, film = running.engine.step(request, observe)
@@ -255,7 +257,7 @@ def begin_pie(server: ServerCore, request: sim.BeginPie) -> sim.BeginPieOk:
     reply = sim.BeginPieOk(state=state, compile_error=play.compile_error)
     if state is PIEState.READY:
         reply.handshake_payload = payload = handshake(server, request.session_id)
-        payload.urlab_version = server.dialect.urlab_version_at_start
+        payload.urlab_version = URLAB_VERSION_AT_START
     return reply
 
 

@@ -56,7 +56,6 @@ class Articulations:
         )
         self._steered = [control for control in self.controls.values() if control.controller is not None]
         self._folded = _folded(self.controls, dialect)
-        self._names = {control: name for name, control in self.controls.items()}
         self.names: Mapping[str, str] = {control.index.key: name for name, control in self.controls.items()}
 
     def _neutral_ctrl(self) -> NDArray[np.float64]:
@@ -72,18 +71,12 @@ class Articulations:
         return self._folded.get(key.casefold()) if control is None else control
 
     def control(self, key: str) -> ArticulationControl:
-        """Return the articulation with this key, in any case."""
         control = self.find(key)
         if control is None:
             raise Refusal("unknown_articulation", key)
         return control
 
-    def name(self, control: ArticulationControl) -> str:
-        """Return what an articulation is called in requests and replies."""
-        return self._names[control]
-
     def set_source(self, source: ControlSource, key: str | None = None) -> None:
-        """Choose which set-points drive the articulation `key`, or all when None."""
         for control in self.controls.values() if key is None else [self.control(key)]:
             control.set_points.source = source
 
@@ -107,12 +100,11 @@ class Articulations:
         return controller.params()
 
     def stage_positional(self, commands: Mapping[str, ArticulationCommand]) -> None:
-        """Stage the `ctrl` of a step's commands."""
-        with np.errstate(over="ignore"):  # as in `SetPoints.stage`: entered once, it costs the robots nothing
+        with np.errstate(over="ignore"):  # infinite, as in C; entered once for all robots
             for key, command in commands.items():
                 control = self.find(key)
                 if control is not None and command.ctrl is not None:
-                    control.set_points.stage_quietly(command.ctrl)
+                    control.set_points.stage(command.ctrl)
 
     def stage_named(self, commands: Mapping[str, ArticulationCommand]) -> set[ArticulationControl]:
         """Stage `ctrl_map` and return the articulations whose controller the request bypasses."""
@@ -146,7 +138,6 @@ class Articulations:
         return others
 
     def zero_set_points(self) -> None:
-        """Set all set-points to 0, whatever their source."""
         for control in self.controls.values():
             control.set_points.network[:] = 0.0
             control.set_points.ui[:] = 0.0
@@ -174,7 +165,6 @@ class Articulations:
         return bodies
 
     def clear_wrenches(self, bodies: list[int]) -> None:
-        """Take wrenches off again."""
         if bodies:
             self._xfrc[bodies] = 0.0
 

@@ -68,16 +68,13 @@ class SetPoints:
 
     @property
     def selected(self) -> Float32s | Float64s:
-        """The set-points of the source in force, shape (n controls,)."""
         return self.network if self.source is ControlSource.ZMQ else self.ui
 
     def stage(self, values: Sequence[float] | Float64s) -> None:
-        """Stage network set-points by position; surplus ones are ignored, missing ones keep their value."""
-        with np.errstate(over="ignore"):  # beyond the range of float32 lies infinity, as in C
-            self.stage_quietly(values)
+        """Stage network set-points by position; surplus ones are ignored, missing ones keep their value.
 
-    def stage_quietly(self, values: Sequence[float] | Float64s) -> None:
-        """`stage` without silencing overflow warnings, for callers that have silenced them for many articulations."""
+        Numbers beyond the range of float32 become infinite, as in C; the caller keeps NumPy from warning of that.
+        """
         if len(values) == len(self.network):
             self.network[:] = values
         else:

@@ -12,8 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
-from types import MappingProxyType, TracebackType
-from typing import Any, Final, Self, TypeVar
+from types import MappingProxyType
+from typing import Any, Final, TypeVar
 
 import mujoco
 
@@ -23,7 +23,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.integrator import Hook, Integrator, Snapshots, call_hooks
+from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.physics.scheduling import (
     GIVE_WAY_S,
@@ -46,11 +46,17 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")
 
+SLICE_S: Final = 0.05
+"""About how long a direct request integrates between two looks at the stop flag."""
+
+MAX_SLICE: Final = 1000
+"""Sub-steps in such a slice at most, for models that get slower while they run."""
+
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
 
-class Engine:
+class Engine(PhysicsThread):
     """Owns the stepping of a compiled scene.
 
     One thread integrates in live mode and serves queued direct steps. A direct step that is short and meets neither a
@@ -96,27 +102,18 @@ class Engine:
             controllers: Controller to attach by articulation key; `*` means all keys not listed.
             step_timeout_s: Seconds after which a direct step that has not finished raises `step_timeout`.
         """
+        self._call = MujocoCall(step_timeout_s)
+        super().__init__(scene.model, DataLock(step_timeout_s, self._call), Health() if health is None else health)
         self.scene = scene
         self.dialect = dialect
-        self._call = MujocoCall(step_timeout_s)
-        self.lock: DataLock = DataLock(step_timeout_s, self._call)
         self.on_tick: list[Hook] = []
         self.step_wanted: Callable[[], bool] = lambda: True
         self.seed: int | None = None
-        self._model = scene.model
         self._data = scene.data
         self.articulations: Articulations = Articulations(scene, controllers, dialect)
         self.variation: SceneVariation | None = None
-        self._thread = PhysicsThread(
-            scene.model,
-            self.lock,
-            iterate=self._iterate,
-            fail=self._fail,
-            give_up=self._drop_queue,
-            health=Health() if health is None else health,
-        )
-        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._thread.stopping)
-        self.on_substep: list[Hook] = self._integrator.on_substep
+        self.on_substep: list[Hook] = []
+        self._substep_s = math.inf  # what a sub-step of the newest slice took
         self._pacing = LivePacing(scene.model)
         self.pinned_mode: StepMode | None = None if pinned_mode is StepMode.AUTO else pinned_mode
         self.mode: StepMode = self.pinned_mode or StepMode.LIVE
@@ -131,30 +128,6 @@ class Engine:
         self._queue: deque[QueuedStep[Any]] = deque()
         self._tick_due = False
         self._last_tick = -math.inf
-        self._wake = self._thread.wake
-
-    def start(self) -> Self:
-        """Start the physics thread and return self."""
-        self._thread.start()
-        return self
-
-    def close(self, timeout: float = 1.0) -> bool:
-        """Stop the physics thread and release every waiting step with `shutting_down`.
-
-        A request under way ends between two sub-steps. Safe to call twice.
-
-        Returns:
-            False when physics was still busy after `timeout`, for example inside one very long `mj_step`.
-        """
-        return self._thread.stop(timeout)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def speed(self) -> float:
@@ -163,12 +136,10 @@ class Engine:
 
     @property
     def time(self) -> float:
-        """`mjData.time`, seconds."""
         return float(self._data.time)
 
     @property
     def overdue(self) -> Overdue | None:
-        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
         return self._call.overdue
 
     def begin_replay(self, make: Callable[[], Player]) -> None:
@@ -180,7 +151,6 @@ class Engine:
             self._set_paused(False)
 
     def end_replay(self) -> None:
-        """Let steps integrate again; the state stays where the replay left it."""
         with self.lock:
             self.replay = None
 
@@ -205,10 +175,10 @@ class Engine:
             return self._await(self._queued(request, observe), 0.0)
         try:
             mode = self.mode
-            if self._thread.stopping:
+            if self._stopping:
                 raise shutting_down()
-            if self._thread.death is not None:
-                raise Refusal("internal_error", self._thread.death)
+            if self._death is not None:
+                raise Refusal("internal_error", self._death)
             if mode is StepMode.PUPPET:
                 self._push(request)
                 return observe(mode)
@@ -224,7 +194,7 @@ class Engine:
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
-            if not self.paused and not self._queue and n_steps * self._integrator.substep_s <= self._inline_budget_s:
+            if not self.paused and not self._queue and n_steps * self._substep_s <= self._inline_budget_s:
                 self._tick_if_due()
                 self._run_direct(request)
                 result = observe(mode)
@@ -274,7 +244,7 @@ class Engine:
             try:
                 self._reset_data(key, seed)
                 self.articulations.override_joints(per_articulation_qpos or {})
-                self._integrator.forward()
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
             self.step_count = 0
@@ -294,11 +264,10 @@ class Engine:
             self.variation.start()
 
     def forward(self) -> None:
-        """Run `mj_forward`; time and step counter stay."""
         with self.lock:
             self._tick_if_due()
             try:
-                self._integrator.forward()
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
 
@@ -344,7 +313,6 @@ class Engine:
             self._kick()
 
     def reset_step_count(self) -> None:
-        """Set the step counter to 0, as a handshake does."""
         with self.lock.look():
             self.step_count = 0
 
@@ -386,7 +354,7 @@ class Engine:
             pushed = self.articulations.apply_wrenches(commands)
         n_steps = max(1, request.n_steps)
         try:
-            self._integrator.advance(n_steps, raw)
+            self._advance(n_steps, raw)
         except Refusal:
             raise
         except Exception as error:
@@ -394,6 +362,33 @@ class Engine:
         finally:
             self.articulations.clear_wrenches(pushed)
         self._count(n_steps)
+
+    def _advance(self, n_steps: int, raw: Collection[ArticulationControl]) -> None:
+        """Integrate a direct step, in slices short enough to stop between two of them."""
+        mj_step, model, data = mujoco.mj_step, self._model, self._data
+        apply_controls = self.articulations.apply_controls
+        every_substep = self.on_substep or self.articulations.any_controlled(raw)
+        if not every_substep:
+            apply_controls(raw)
+        while n_steps > 0:
+            if self._stopping:
+                raise shutting_down()
+            count = min(n_steps, MAX_SLICE, max(1, int(SLICE_S / self._substep_s)))
+            started = time.perf_counter()
+            with self._call:
+                if every_substep:
+                    for _ in range(count):
+                        apply_controls(raw)
+                        mj_step(model, data)
+                        call_hooks(self.on_substep)
+                else:
+                    mj_step(model, data, count)
+            self._substep_s = max((time.perf_counter() - started) / count, 1e-9)
+            n_steps -= count
+
+    def _forward(self) -> None:
+        with self._call:
+            mujoco.mj_forward(self._model, self._data)
 
     def _count(self, n_steps: int) -> None:
         self.step_count += n_steps
@@ -405,8 +400,13 @@ class Engine:
             self._play(self.replay, request.n_steps)
             return
         self._tick_if_due()
+        data = self._data
         try:
-            self._integrator.push(request)
+            for values, target in ((request.qpos, data.qpos), (request.qvel, data.qvel), (request.ctrl, data.ctrl)):
+                if values is not None and len(values) == len(target):
+                    target[:] = values
+            data.time = request.time or 0.0
+            self._forward()
         except Exception as error:
             raise self._fail(error) from error
         call_hooks(self.on_substep)
@@ -422,7 +422,7 @@ class Engine:
 
     def _drop_queue(self, refusal: Refusal) -> None:
         while self._queue:
-            self._queue.popleft().fail(refusal)
+            self._queue.popleft().drop(refusal)
 
     def _tick_if_due(self) -> None:
         """Publish the last direct step before its state is overwritten."""
@@ -454,7 +454,9 @@ class Engine:
             return
         self.articulations.apply_controls()
         if not self.paused:
-            self._integrator.advance_live()
+            with self._call:
+                mujoco.mj_step(self._model, self._data)
+                call_hooks(self.on_substep)
             self.snapshots.take()
         self.articulations.clear_wrenches(self._live_pushed)
         self._live_pushed.clear()

@@ -52,7 +52,6 @@ class UserChannels:
 
     @property
     def declared(self) -> bool:
-        """Whether there is any."""
         return bool(self._values)
 
     def write(self, owner: str, channel: str, value: object) -> str | None:
@@ -69,7 +68,6 @@ class UserChannels:
         return None
 
     def of(self, owner: str) -> dict[str, Any] | None:
-        """Return the channels of a robot or of the scene by name; None without any."""
         if not self._values:
             return None
         with self._lock:
@@ -115,13 +113,11 @@ def wall_seconds() -> tuple[int, int]:
 
 
 def sim_clock(seconds: float) -> Clock:
-    """Return a time in seconds, split as `sim_seconds` does."""
     sec, nsec = sim_seconds(seconds)
     return Clock(sec=sec, nsec=nsec)
 
 
 def wall_clock() -> Clock:
-    """Return UTC now; `nsec` is a multiple of 100."""
     sec, nsec = wall_seconds()
     return Clock(sec=sec, nsec=nsec)
 
@@ -227,7 +223,6 @@ class Observer:
         self._qvel = data.qvel
 
     def state(self, level: ObservationLevel, time: float, step: int) -> StateFields:
-        """Return the fields that all replies and messages with a state share."""
         return StateFields(
             time=time,
             step=step,
@@ -245,7 +240,6 @@ class Observer:
         return states
 
     def scene_channels(self) -> dict[str, Any]:
-        """Return the channels of the scene by name."""
         return {} if self._channels is None else self._channels.of(SCENE) or {}
 
     def entities(self) -> dict[str, EntityState]:

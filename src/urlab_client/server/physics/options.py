@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, Final, get_type_hints
+from typing import Any, Final
 
 import mujoco
 import numpy as np
-from msgspec import Struct, defstruct
 
 from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.server.dialects import ALPHA, Dialect
@@ -52,15 +51,6 @@ MASKS: Final = ("disableflags", "enableflags")
 IN_ORDER: Final = tuple(name for name in SimOptions.__struct_fields__ if name not in (*THREADS, *MASKS))
 """The remembered options in the order in which a request's are looked at: an unknown name stops at its place."""
 
-IN_REPLY: Final = (IN_ORDER[0], *THREADS, *IN_ORDER[1:], *MASKS)
-"""All options in the order of the reply."""
-
-_TYPES: Final = get_type_hints(SimOptions)
-OptionsInForce: type[Struct] = defstruct(
-    "OptionsInForce", [(name, _TYPES[name], None) for name in IN_REPLY], omit_defaults=True, module=__name__
-)
-"""The fields of `SimOptions` in that order."""
-
 SLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 NO_MULTICCD: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 
@@ -79,7 +69,7 @@ class OptionOverrides:
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}
         self._threads = 0
 
-    def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> Struct:
+    def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> SimOptions:
         """Take over the options that are not None, write all remembered ones and return what is in force.
 
         Raises:
@@ -119,17 +109,18 @@ class OptionOverrides:
             set_threads(data, threads)
             self._threads = threads
 
-    def _in_force(self, model: mujoco.MjModel) -> Struct:
+    def _in_force(self, model: mujoco.MjModel) -> SimOptions:
         opt = model.opt
-        computed: dict[str, object] = {
+        computed: dict[str, Any] = {
             "num_worker_threads": self._threads,
             "max_worker_threads": thread_limit(_cores()),
             "enable_multiccd": not opt.disableflags & NO_MULTICCD,
             "enable_sleep": bool(opt.enableflags & SLEEP),
             **{name: self._choice(name, getattr(opt, name)) for name in CHOICES},
         }
-        return OptionsInForce(
-            **{name: computed[name] if name in computed else _plain(getattr(opt, name)) for name in IN_REPLY}
+        names = SimOptions.__struct_fields__
+        return SimOptions(
+            **{name: computed[name] if name in computed else _plain(getattr(opt, name)) for name in names}
         )
 
     def _stored(self, name: str, value: Any) -> Any:
@@ -155,7 +146,7 @@ class OptionOverrides:
         return text if self._dialect.options_float32 else MJCF_SPELLING.get(text, text)
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

@@ -6,12 +6,13 @@ in a separate thread, so that the caller can stop waiting for it.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -45,7 +46,6 @@ class ControlClaims:
         self._claims: dict[str, _Claim] = {}
 
     def owner(self, key: str) -> str:
-        """Return the owner of a robot, or `(unclaimed)`."""
         claim = self._claims.get(key)
         if claim is not None and 0 < claim.ttl_s < self._clock() - claim.touched:
             del self._claims[key]
@@ -53,7 +53,6 @@ class ControlClaims:
         return UNCLAIMED if claim is None else claim.owner
 
     def claim(self, key: str, owner: str, ttl_s: float, *, force: bool) -> None:
-        """Make `owner` the owner, unless another client is."""
         holder = self.owner(key)
         if holder not in (UNCLAIMED, owner) and not force:
             raise Refusal("control_claimed", f"'{key}' belongs to '{holder}'", owner=holder)
@@ -83,45 +82,34 @@ class ControlClaims:
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MAX_WAIT_S: Final = 86400.0
-_DEFAULT_LIMITS: Final = Limits()
 
 
-@dataclass(frozen=True)
 class Running:
     """A simulation that is ready."""
 
-    scene: CompiledScene
-    engine: Engine
-    observer: Observer
-    cameras: CameraRenderer
-    recordings: Sequence[Path] = ()
-    limits: Limits = _DEFAULT_LIMITS
-    channels: UserChannels = field(default_factory=lambda: UserChannels({}))
+    def __init__(
+        self,
+        engine: Engine,
+        cameras: CameraRenderer,
+        channels: UserChannels,
+        files: Sequence[Path],
+        limits: Limits,
+    ) -> None:
+        self.engine: Engine = engine
+        self.cameras: CameraRenderer = cameras
+        self.channels: UserChannels = channels
+        self.scene: CompiledScene = engine.scene
+        controls, dialect = engine.articulations.controls, engine.dialect
+        self.observer: Observer = Observer(self.scene, controls, channels)
+        self.claims: ControlClaims = ControlClaims()
+        self.step_replies: StepReplies = StepReplies(self.scene, controls, dialect)
+        self.options: OptionOverrides = OptionOverrides(self.scene.model, limits, dialect)
+        self.sessions: ReplaySessions = ReplaySessions(self.scene, files, limits)
 
     def mjb(self) -> bytes:
         """Return the model in MuJoCo's binary format, without variations. The caller holds the engine's lock."""
         variation = self.engine.variation
         return self.scene.mjb() if variation is None else variation.mjb()
-
-    @cached_property
-    def claims(self) -> ControlClaims:
-        """The owners of the robots."""
-        return ControlClaims()
-
-    @cached_property
-    def step_replies(self) -> StepReplies:
-        """The encoder of the replies to `step`."""
-        return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
-
-    @cached_property
-    def options(self) -> OptionOverrides:
-        """The options set by `set_sim_options`."""
-        return OptionOverrides(self.scene.model, self.limits, self.engine.dialect)
-
-    @cached_property
-    def sessions(self) -> ReplaySessions:
-        """The recorded sessions."""
-        return ReplaySessions(self.scene, self.recordings, self.limits)
 
     def delay_cameras(self, wanted: Mapping[str, tuple[CameraDelayInForce, int]]) -> None:
         """Set latencies of cameras, with the seeds of their jitter, by `ARTICULATION/CAMERA`."""
@@ -148,58 +136,44 @@ class Running:
         return ended and drawn
 
 
-class _Attempt:
-    """One start of play, from the request to its end."""
-
-    def __init__(self) -> None:
-        self.running: Running | None = None
-        self.error: str | None = None
-        self.abandoned = False
-
-    @property
-    def state(self) -> PIEState:
-        if self.running is not None:
-            return PIEState.READY
-        return PIEState.COMPILING if self.error is None else PIEState.COMPILE_FAILED
-
-
 class Play:
     """The play session of a server: at most one at a time. Safe to use from several threads.
 
     Attributes:
         listeners: Callbacks invoked in order, with the simulation when it is ready and with None when it ends; they
             must not block.
+        current: The running simulation, or None.
     """
 
     def __init__(self, health: Health) -> None:
         self._health = health
         self.listeners: list[Callable[[Running | None], None]] = []
-        self._changed = threading.Condition()
-        self._attempt: _Attempt | None = None
+        self._lock = threading.Lock()
+        self.current: Running | None = None
+        self._attempt: Future[None] | None = None
         self._closing = False
 
     @property
     def state(self) -> PIEState:
         """`OFF`, `COMPILING`, `COMPILE_FAILED` or `READY`."""
         attempt = self._attempt
-        return PIEState.OFF if attempt is None else attempt.state
+        if attempt is None:
+            return PIEState.OFF
+        if self.current is not None:
+            return PIEState.READY
+        return PIEState.COMPILE_FAILED if attempt.done() else PIEState.COMPILING
 
     @property
     def compile_error(self) -> str:
         """MuJoCo's message in state `COMPILE_FAILED`, otherwise empty."""
         attempt = self._attempt
-        return "" if attempt is None or attempt.error is None else attempt.error
+        error = None if attempt is None or not attempt.done() or attempt.cancelled() else attempt.exception()
+        return "" if error is None else str(error)
 
     @property
     def manager_present(self) -> bool:
         """Whether a play session runs, compiled or not."""
         return self._attempt is not None
-
-    @property
-    def current(self) -> Running | None:
-        """The running simulation, or None."""
-        attempt = self._attempt
-        return None if attempt is None else attempt.running
 
     def running(self) -> Running:
         """Return the simulation; refuse with `not_ready` and the reason if none is running."""
@@ -217,15 +191,11 @@ class Play:
             build: Compiles and starts the simulation. Must not access state that the caller may change meanwhile.
         """
         self.stop()
-        attempt = _Attempt()
+        self._attempt = attempt = Future[None]()
 
         def die(reason: str) -> None:
-            with self._changed:
-                attempt.error = reason
-                self._changed.notify_all()
+            attempt.set_exception(CompileFailed(reason))
 
-        with self._changed:
-            self._attempt = attempt
         self._health.thread("urlab-compile", self._build, attempt, build, on_death=die).start()
 
     def wait(self, timeout_s: float) -> PIEState:
@@ -236,60 +206,59 @@ class Play:
         """
         # NaN compares false, so it does not wait.
         wait_s = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0
-        with self._changed:
-            self._changed.wait_for(lambda: self._closing or self.state is not PIEState.COMPILING, wait_s)
-            if self._closing:
-                raise Refusal("shutting_down", "the server is stopping")
-            return PIEState.TIMEOUT if self.state is PIEState.COMPILING else self.state
+        attempt = self._attempt
+        if attempt is not None:
+            with contextlib.suppress(TimeoutError, CancelledError):
+                attempt.exception(wait_s)
+        if self._closing:
+            raise Refusal("shutting_down", "the server is stopping")
+        state = self.state
+        return PIEState.TIMEOUT if state is PIEState.COMPILING else state
 
     def stop(self) -> None:
         """End play; a compilation in progress finishes in the background, and its result is discarded."""
-        with self._changed:
+        with self._lock:
             attempt, self._attempt = self._attempt, None
+            running, self.current = self.current, None
             if attempt is not None:
-                attempt.abandoned = True
+                attempt.cancel()
                 self._announce(None)
-        if attempt is not None and attempt.running is not None:
-            attempt.running.close()
+        if running is not None:
+            running.close()
 
     def close(self, timeout: float) -> bool:
-        """End play permanently and refuse waiting callers with `shutting_down`.
-
-        Returns:
-            False if it was still busy then.
-        """
-        with self._changed:
+        """End play permanently and refuse waiting callers with `shutting_down`; return False if it was still busy."""
+        with self._lock:
             self._closing = True
-            attempt = self._attempt
-            if attempt is not None:
-                attempt.abandoned = True
-            self._changed.notify_all()
+            if self._attempt is not None:
+                self._attempt.cancel()
         running = self.current
         return running is None or running.close(timeout)
 
-    def _build(self, attempt: _Attempt, build: Callable[[], Running]) -> None:
+    def _build(self, attempt: Future[None], build: Callable[[], Running]) -> None:
         running: Running | None = None
-        error = ""
+        failure: BaseException | None = None
         try:
             running = build()
-        except CompileFailed as failure:
-            error = failure.message
-        except BaseException as failure:  # noqa: BLE001 - a caller that waits for the start must not hang
-            error = _unexpected(failure)
+        except BaseException as error:  # noqa: BLE001 - a caller that waits for the start must not hang
+            failure = error
         try:
-            with self._changed:
-                if not attempt.abandoned:
-                    if running is not None:
-                        try:
-                            self._announce(running)
-                        except Exception as failure:  # noqa: BLE001 - likewise
-                            error = _unexpected(failure)
-                            self._announce(None)
-                        else:
-                            attempt.running, running = running, None
-                    if attempt.running is None:
-                        attempt.error = error
-                self._changed.notify_all()
+            with self._lock:
+                if not attempt.set_running_or_notify_cancel():
+                    return
+                if running is not None:
+                    try:
+                        self._announce(running)
+                    except Exception as error:  # noqa: BLE001 - likewise
+                        failure = error
+                        self._announce(None)
+                if failure is None:
+                    self.current, running = running, None
+                elif not isinstance(failure, CompileFailed):
+                    logger.error("play could not be started", exc_info=failure)
+                    text = f"the server failed with {type(failure).__name__}: {failure}; its log has the details"
+                    failure = CompileFailed(text)
+                attempt.set_exception(failure)
         finally:
             if running is not None:
                 running.close()
@@ -297,9 +266,3 @@ class Play:
     def _announce(self, running: Running | None) -> None:
         for listener in self.listeners:
             listener(running)
-
-
-def _unexpected(failure: BaseException) -> str:
-    """Log why play could not be started, and return the message for clients."""
-    logger.error("play could not be started", exc_info=failure)
-    return f"the server failed with {type(failure).__name__}: {failure}; its log has the details"

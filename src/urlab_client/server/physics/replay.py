@@ -116,7 +116,6 @@ class Player:
         return mixed
 
     def _match(self, layout: JointLayout) -> dict[int, str]:
-        """Return the recorded name by the joint it drives."""
         known = self._matches.get(id(layout))
         if known is None:
             known = self._matches[id(layout)] = self._match_joints(layout)
@@ -161,7 +160,6 @@ class Player:
 
 
 def _slerp(value: Floats, target: Floats, share: float) -> Floats:
-    """Interpolate two quaternions along the shorter arc."""
     cosine = float(value @ target)
     if cosine < 0.0:
         target, cosine = -target, -cosine
@@ -191,12 +189,10 @@ class ReplaySessions:
 
     @property
     def names(self) -> list[str]:
-        """The live recording first, then the others as they came."""
         return [LIVE_SESSION, *self._loaded]
 
     @property
     def frames(self) -> list[Frame]:
-        """The frames of the active session."""
         return list(self.live.frames) if self.active == LIVE_SESSION else self._loaded[self.active]
 
     def scan(self) -> None:
@@ -231,7 +227,6 @@ class ReplaySessions:
 
 
 def replay_folder(root: Path) -> Path:
-    """Return the folder of recordings below a content root."""
     return root / "URLab" / "Replays"
 
 

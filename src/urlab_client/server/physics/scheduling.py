@@ -12,10 +12,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Generic, TypeVar
+from typing import Final, NamedTuple, Self, TypeVar
 
 import mujoco
 
@@ -53,15 +53,8 @@ HOLD_S: Final = 0.005
 GIVE_WAY_S: Final = 0.0005
 
 
-@dataclass(frozen=True)
-class Overdue:
-    """A MuJoCo call that has exceeded the step timeout.
-
-    Attributes:
-        thread: The calling thread.
-        began_at: Start of the call, seconds of `time.perf_counter`.
-        seconds: Time since then.
-    """
+class Overdue(NamedTuple):
+    """A MuJoCo call that has exceeded the step timeout; it began at `began_at` of `time.perf_counter`."""
 
     thread: threading.Thread
     began_at: float
@@ -152,68 +145,47 @@ class DataLock:
 
 
 def shutting_down() -> Refusal:
-    """Return the refusal of a step that the end of the simulation breaks off."""
     return Refusal("shutting_down", "the simulation is stopping")
 
 
 def busy() -> Refusal:
-    """Return the refusal for a caller that does not get the lock in time."""
     return Refusal("not_ready", "physics is busy with a step request that is still running; try again later")
 
 
-class QueuedStep(Generic[T]):
+class QueuedStep(Future[T]):
     """A direct step that waits for the physics thread."""
 
     def __init__(self, request: Step, observe: Callable[[StepMode], T]) -> None:
+        super().__init__()
         self._request = request
         self._observe = observe
-        self._settled = threading.Event()
         self._abandoned = False
-        self._begun = False
-        self._dropped = False
-        self._lock = threading.Lock()
-        self._results: list[T] = []
-        self._error: Exception | None = None
 
     def run(self, advance: Callable[[Step], None]) -> None:
-        """Run the step, unless it was cancelled by its timeout; observe, and release the caller.
-
-        Args:
-            advance: Executes the request; called with the engine's lock held.
-        """
-        with self._lock:
-            self._begun = True
-            if self._dropped:
-                return
+        """Run the step under the engine's lock, unless its timeout has cancelled it, and release the caller."""
+        if not self.set_running_or_notify_cancel():
+            return
         try:
             advance(self._request)
             if not self._abandoned:
-                self._results.append(self._observe(StepMode.DIRECT))
+                self.set_result(self._observe(StepMode.DIRECT))
         except Exception as error:  # noqa: BLE001 - raised again where the step was requested
-            self.fail(error)
-        else:
-            self._settled.set()
+            self.set_exception(error)
 
-    def fail(self, error: Exception) -> None:
-        """Release the caller with an error."""
-        self._error = error
-        self._settled.set()
+    def drop(self, refusal: Refusal) -> None:
+        if self.set_running_or_notify_cancel():
+            self.set_exception(refusal)
 
     def wait(self, remaining: float, timeout: float, *, runs_late: bool) -> T:
-        """Return the observation, or raise what the step raised.
-
-        Args:
-            remaining: Seconds until `step_timeout` is raised.
-        """
-        if not self._settled.wait(max(0.0, remaining)):
-            self._abandoned = True
-            with self._lock:
-                self._dropped = not (runs_late or self._begun)
-            fate = "was cancelled" if self._dropped else "will still run to its end"
-            raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
-        if self._error is not None:
-            raise self._error
-        return self._results[0]
+        """Return the observation, or raise what the step raised; `step_timeout` after `remaining` seconds."""
+        try:
+            return self.result(max(0.0, remaining))
+        except TimeoutError:
+            if self.done():  # just now
+                return self.result()
+        self._abandoned = True
+        fate = "was cancelled" if not runs_late and self.cancel() else "will still run to its end"
+        raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
 
 
 class _WarningLog:
@@ -253,92 +225,85 @@ _mujoco_warnings: _WarningLog = _WarningLog()
 
 
 class PhysicsThread:
-    """Iterates under the lock of a simulation until it is stopped.
+    """Iterates under the lock of a simulation until it is closed; a subclass says what an iteration does.
 
     Attributes:
-        stopping: Whether the thread has been asked to stop.
-        death: Description of the error that ended the thread, or None.
+        lock: Guards the simulation; the thread holds it except while an iteration waits for `_wake`.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        lock: DataLock,
-        *,
-        iterate: Callable[[], None],
-        fail: Callable[[Exception], object],
-        give_up: Callable[[Refusal], None],
-        health: Health,
-    ) -> None:
-        """Create the thread; `start` starts it.
-
-        Args:
-            model: The model; if stopping takes too long, its solver tolerances are raised so that they finish early.
-            lock: Guards the simulation; held except while `iterate` waits.
-            iterate: Does the pending work, or waits for `wake`.
-            fail: Callback invoked with an exception raised by `iterate`; the thread continues afterwards.
-            give_up: Callback invoked at the end with the refusal for requests that still wait.
-            health: Receives a report if the thread dies.
-        """
+    def __init__(self, model: mujoco.MjModel, lock: DataLock, health: Health) -> None:
+        self.lock: DataLock = lock
         self._model = model
-        self._lock = lock
-        self._iterate = iterate
-        self._fail = fail
-        self._give_up = give_up
-        self.wake: threading.Condition = threading.Condition(lock.inner)
-        self.stopping: bool = False
-        self.death: str | None = None
+        self._wake = threading.Condition(lock.inner)
+        self._stopping = False
+        self._death: str | None = None
         self._thread = health.thread("urlab-physics", self._run, on_death=self._die)
 
-    @property
-    def alive(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start the thread."""
+    def start(self) -> Self:
+        """Start the thread and return self."""
         _mujoco_warnings.acquire()
-        atexit.register(self.stop, 1.0)  # a thread inside MuJoCo must not meet the interpreter's end
+        atexit.register(self.close, 1.0)  # a thread inside MuJoCo must not meet the interpreter's end
         self._thread.start()
+        return self
 
-    def stop(self, timeout: float) -> bool:
-        """End the thread between two sub-steps, and release callers that wait for a step. Idempotent.
+    def close(self, timeout: float = 1.0) -> bool:
+        """End the thread between two sub-steps, and release every waiting step with `shutting_down`. Idempotent.
 
         Returns:
-            False when physics was still busy after `timeout`.
+            False when physics was still busy after `timeout`, for example inside one very long `mj_step`.
         """
-        first, self.stopping = not self.stopping, True
+        first, self._stopping = not self._stopping, True
         deadline = time.monotonic() + timeout
-        idle = within(timeout / 2.0, lambda seconds: self._lock.inner.acquire(timeout=seconds))
+        idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
         if not idle:
             # The result is no longer needed, so the solver stops at its next iteration.
             self._model.opt.tolerance = self._model.opt.noslip_tolerance = math.inf
-            idle = within(timeout / 2.0, lambda seconds: self._lock.inner.acquire(timeout=seconds))
+            idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
         if idle:
-            self.wake.notify_all()
-            self._lock.inner.release()
+            self._wake.notify_all()
+            self.lock.inner.release()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             idle = ended(self._thread, deadline - time.monotonic()) and idle
         if first and self._thread.ident is not None:
             _mujoco_warnings.release()
-            atexit.unregister(self.stop)
+            atexit.unregister(self.close)
         if not idle:
             logger.warning("physics did not stop within %g s", timeout)
         return idle
 
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _iterate(self) -> None:
+        """Do the pending work, or wait for `_wake`."""
+        raise NotImplementedError
+
+    def _fail(self, error: Exception) -> Refusal:
+        """Note an error of an iteration, after which the thread continues, and return the refusal that reports it."""
+        raise NotImplementedError
+
+    def _drop_queue(self, refusal: Refusal) -> None:
+        """Refuse the requests that still wait."""
+        raise NotImplementedError
+
     def _run(self) -> None:
-        with self._lock.inner:
-            while not self.stopping:
+        with self.lock.inner:
+            while not self._stopping:
                 try:
                     self._iterate()
                 except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
                     self._fail(error)
-            self._give_up(shutting_down())
+            self._drop_queue(shutting_down())
 
     def _die(self, reason: str) -> None:
-        with self._lock.inner:
-            self.death = reason
-            self._give_up(Refusal("internal_error", reason))
+        with self.lock.inner:
+            self._death = reason
+            self._drop_queue(Refusal("internal_error", reason))
 
 
 class LivePacing:
@@ -352,7 +317,6 @@ class LivePacing:
 
     @property
     def speed(self) -> float:
-        """Speed in force, percent of real time, 5 to 100, a float32."""
         return float32(min(max(self._speed, MIN_SPEED), MAX_SPEED))
 
     @speed.setter
@@ -360,7 +324,6 @@ class LivePacing:
         self._speed = float(percent)
 
     def restart(self) -> None:
-        """Make the next iteration due immediately."""
         self._slot = -math.inf
 
     def take_slot(self, *, idle: bool) -> float:

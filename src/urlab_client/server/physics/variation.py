@@ -40,7 +40,6 @@ class SceneVariation:
 
     @property
     def visible_fields(self) -> tuple[str, ...]:
-        """Varied fields of the model that pictures depend on."""
         return self._variation.visible_fields
 
     def begin(self, seed: int | None) -> None:
@@ -62,12 +61,10 @@ class SceneVariation:
             controller.factors = self._variation.gain_factors(draws, controller.bound_actuators)
 
     def start(self) -> None:
-        """Vary the start of the episode, after the reset."""
         if self.draws is not None:
             self._variation.start(self.draws, self._scene.data.qpos)
 
     def restore(self) -> None:
-        """Write the model as it is without variation."""
         if self.draws is not None:
             self.draws = None
             self._restore(self._scene.model)

@@ -264,17 +264,16 @@ class CameraRenderer:
         """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
         return {key: camera.info.resolution for key, camera in self._by_name.items()}
 
-    def capture(self, shots: Iterable[Shot], frame_id: int = 0, *, draw: bool = True) -> Film:
+    def capture(self, shots: Iterable[Shot], frame_id: int = 0) -> Film:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
-            draw: Whether frames may be drawn; otherwise existing ones are used.
 
         Returns:
             The argument for `frames`.
         """
         self._given_up = [drawn for drawn in self._given_up if not drawn.done()]
-        now, draw = self._now(), draw and not self._made_painter().ended and len(self._given_up) < GIVEN_UP
+        now, draw = self._now(), not self._made_painter().ended and len(self._given_up) < GIVEN_UP
         look = self._copy_look()
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}

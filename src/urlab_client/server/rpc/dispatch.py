@@ -25,7 +25,7 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
-from urlab_client.server.system.threads import Health, ServingThread, ended
+from urlab_client.server.system.threads import Health, ServedThread, ServingThread
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -112,10 +112,7 @@ class HandlerTable:
 HANDLERS: Final = HandlerTable()
 """The handlers of this package; filled when `urlab_client.server.handlers` is imported."""
 
-
-def handles(request: type[Q]) -> Callable[[Callable[[ServerCore, Q], A]], Callable[[ServerCore, Q], A]]:
-    """Register the decorated function as the handler of a request, in the table of all handlers."""
-    return HANDLERS.handles(request)
+handles: Final = HANDLERS.handles
 
 
 class Dispatcher:
@@ -254,8 +251,9 @@ class Dispatcher:
             raise Refusal("missing_op", "the request has no field 'op' that reads as a string")
         if name not in _NO_SIGN_OF_USE:
             self._core.lease.touch()
-        if op is None or op.name not in _WITHOUT_SESSION:
-            self._check_session(incoming.session_id)
+        needs_session = op is None or op.name not in _WITHOUT_SESSION
+        if needs_session and not self._core.session.accepts(incoming.session_id):
+            raise Refusal("session_expired", f"session '{incoming.session_id}' is not the active one: send hello first")
         if op is None:
             raise Refusal("unknown_op", f"this server has no op '{name}'")
         if incoming.missing:
@@ -267,7 +265,6 @@ class Dispatcher:
         return op
 
     def _job(self, name: str, handler: Handler, request: Any) -> dict[str, Any]:
-        """Return the result of a job's handler as plain data with the numbers of the wire."""
         try:
             reply: Any = handler(self._core, request)
             frame = encode_reply(reply)
@@ -275,20 +272,10 @@ class Dispatcher:
             frame = encode_reply(_error(name, failure))
         return msgspec.msgpack.decode(frame)
 
-    def _check_session(self, session_id: str) -> None:
-        if not self._core.session.accepts(session_id):
-            raise Refusal("session_expired", f"session '{session_id}' is not the active one: send hello first")
-
 
 def _error(name: str, failure: Exception) -> ErrorReply:
     if isinstance(failure, Refusal):
-        return ErrorReply(
-            code=failure.code,
-            message=failure.message,
-            absolute_path=failure.absolute_path if failure.code == "path_not_writable" else None,
-            owner=failure.owner,
-            lease_id=failure.lease_id,
-        )
+        return ErrorReply(code=failure.code, message=failure.message, **failure.details)
     logger.error("%s failed", name, exc_info=failure)
     return ErrorReply(
         code="internal_error",
@@ -305,8 +292,8 @@ def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
     raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")
 
 
-class Watchdog:
-    """A thread that checks the physics of a server a few times a second.
+class Watchdog(ServedThread):
+    """Checks the physics of a server a few times a second.
 
     A short step runs on the thread that serves requests. If MuJoCo holds that thread for longer than the step timeout,
     the client gets an error, and another thread serves. Meanwhile the engine's lock refuses requests that need physics;
@@ -314,27 +301,9 @@ class Watchdog:
     """
 
     def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
+        super().__init__(health.thread("urlab-watchdog", self._run))
         self._core = core
         self._dispatcher = dispatcher
-        self._stopping = threading.Event()
-        self._thread = health.thread("urlab-watchdog", self._run)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stopping.set()
-
-    def join(self, timeout: float) -> bool:
-        """Wait for the thread to end after `stop`; return False if it takes longer."""
-        return self._thread.ident is None or ended(self._thread, timeout)
 
     def _run(self) -> None:
         told: object = None

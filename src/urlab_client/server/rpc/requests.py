@@ -2,7 +2,8 @@
 
 For the dispatcher. msgspec decodes a `step` and a chunk of an upload directly to their structs, as our client sends
 them: they come at kilohertz rates, or with megabytes. What this strict decoder refuses, and all other ops, is read
-leniently, as the plugin does it. Both ways agree where the first one succeeds.
+leniently, as the plugin does it. Both ways agree where the first one succeeds, except that only the lenient one drops
+all but the last of a map's keys that differ in letter case.
 
 The lenient way turns a frame into plain data, and that into a struct, field by field: names in any letter case, several
 spellings of a value. A value that cannot be used counts as absent, which is `ABSENT` here. msgspec's own lax conversion
@@ -16,7 +17,6 @@ import math
 import re
 import types
 from collections.abc import Callable, Mapping
-from enum import Enum
 from functools import cache
 from typing import Any, Final, TypeAlias, TypeVar, Union, cast
 
@@ -56,11 +56,7 @@ _NUMBERS: Final = frozenset({float, int})
 T = TypeVar("T")
 
 
-class _Absent(Enum):
-    ABSENT = "absent"
-
-
-ABSENT: Any = _Absent.ABSENT
+ABSENT: Final[Any] = UNSET
 
 
 def read_plain(frame: bytes, depth: int) -> dict[str, Plain]:
@@ -108,7 +104,6 @@ def _tidy(value: Plain, depth: int, most: int) -> Plain:
 
 
 def fold_keys(fields: Mapping[str, Plain]) -> dict[str, Plain]:
-    """Return the fields by their keys in lower case."""
     return {key.lower(): value for key, value in fields.items()}
 
 
@@ -130,7 +125,6 @@ def fill(struct: type[Struct], fields: Mapping[str, Plain]) -> Any:
 
 @cache
 def _plan(struct: type[Struct]) -> tuple[tuple[str, str, inspect.Type, Callable[[], Any]], ...]:
-    """Return name, key, type and default of each field of a struct."""
     return tuple(
         (field.name, field.encode_name.lower(), bare(inspect.type_info(field.type)), _default(field))
         for field in msgspec.structs.fields(struct)
@@ -138,7 +132,6 @@ def _plan(struct: type[Struct]) -> tuple[tuple[str, str, inspect.Type, Callable[
 
 
 def bare(kind: inspect.Type) -> inspect.Type:
-    """Return a type without its description."""
     return kind.type if isinstance(kind, inspect.Metadata) else kind
 
 
@@ -278,7 +271,6 @@ class Incoming(Struct, frozen=True):
 
 
 def usable(value: T, otherwise: T) -> T:
-    """Return the value of a required field, or `otherwise` if the request has no usable value there."""
     return otherwise if value is UNSET else value
 
 
@@ -315,7 +307,6 @@ class RequestReader:
         self._hot: dict[type, Op] = {op.request: op for op in ops.values() if op.hot}
 
     def read(self, frame: bytes) -> Incoming:
-        """Decode one frame."""
         most = self._limits.request_bytes
         if len(frame) > most:
             raise Refusal("bad_request", f"a request of {len(frame)} bytes exceeds the limit request_bytes, {most}")
@@ -324,7 +315,7 @@ class RequestReader:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return self._read_leniently(frame)
         op = self._hot.get(type(request))
-        if op is None or _names_collide(request):
+        if op is None:
             return self._read_leniently(frame)
         self._check_strings(op, request, frame)
         return Incoming(op.name, op, request.session_id, request)
@@ -369,32 +360,6 @@ def _strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.floa
     """Decode an array; its elements must be numbers."""
     del kind
     return np.array(msgspec.convert(value, list[float]), dtype=np.float64)
-
-
-def _names_collide(value: object) -> bool:
-    """Return whether a map has keys that differ only in case, of which only the last one counts."""
-    if isinstance(value, dict):
-        entries = cast("dict[str, object]", value)
-        if len(entries) > 1 and len({*map(str.lower, entries)}) < len(entries):
-            return True
-        return any(map(_names_collide, entries.values()))
-    if isinstance(value, Struct):
-        for name in _maps_of(type(value)):
-            inside = getattr(value, name)
-            if inside and _names_collide(inside):
-                return True
-    return False
-
-
-@cache
-def _maps_of(struct: type[Struct]) -> tuple[str, ...]:
-    """Return the names of the fields that can hold a map."""
-    return tuple(
-        field.name
-        for field in msgspec.structs.fields(struct)
-        if isinstance(kind := bare(inspect.type_info(field.type)), inspect.UnionType)
-        and any(isinstance(member, inspect.DictType) for member in kind.types)
-    )
 
 
 def _longest_string(value: object) -> int:

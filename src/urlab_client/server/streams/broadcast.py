@@ -7,19 +7,18 @@ import dataclasses
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import mujoco
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from urlab_client.enums import ObservationLevel, StepMode
 from urlab_client.errors import UNCLAIMED
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.messages.session import Clock
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow
 from urlab_client.protocol.topics import STATE_FULL, StreamTopic, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
@@ -34,6 +33,10 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats: TypeAlias = NDArray[np.float64]
 Encoder: TypeAlias = Callable[[], bytes | None]
+"""Encodes the current data; None for no message."""
+
+PublishedRow: TypeAlias = tuple[bytes, Encoder]
+"""A row of the state stream, with its topic."""
 
 _ROW_KINDS: Final = {
     int(mujoco.mjtJoint.mjJNT_FREE): TopicKind.BASE_STATE,
@@ -43,16 +46,7 @@ _ROW_KINDS: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class PublishedRow:
-    """A row of the state stream: its topic, and a function that encodes the current data; None for no message."""
-
-    topic: bytes
-    encode: Encoder
-
-
 def topic_frame(kind: TopicKind, owner: str, name: str = "") -> bytes | None:
-    """Return a topic frame; None for names that cannot be part of a topic."""
     try:
         return StreamTopic(kind, owner, name).encode()
     except ValueError as error:
@@ -70,7 +64,7 @@ def published_rows(
         for kind, name, encode in _articulation_rows(scene.model, data, control):
             topic = topic_frame(kind, control.index.key, name)
             if topic is not None:
-                yield PublishedRow(topic, encode)
+                yield topic, encode
     if none:  # as in the plugin, the scene comes with the articulations
         return
     for entity in scene.entities:
@@ -81,7 +75,7 @@ def published_rows(
         for kind, view in values.items():
             topic = topic_frame(kind, entity.name)
             if topic is not None:
-                yield PublishedRow(topic, SceneRow(kind, view).encode)
+                yield topic, SceneRow(kind, view).encode
 
 
 def _articulation_rows(
@@ -127,27 +121,11 @@ INFO_LATER_EVERY: Final = 500
 _LIVE: Final = frozenset({StepMode.LIVE, StepMode.AUTO})
 
 
-class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True):
-    """The map of a `state/full` message. All fields but the last are always present."""
-
-    time: float
-    step: int
-    sim_time: Clock
-    wall_time: Clock
-    per_articulation: dict[str, ArticulationState]
-    entities: dict[str, EntityState]
-    user: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(NamedTuple):
     """One tick, copied by the physics thread.
 
     Attributes:
         live: Number of the tick among the live ones, from 1; 0 outside live mode.
-        time: `mjData.time`, seconds.
-        step: Step counter.
-        wall_time: Time of the copies.
         arrays: Copies of the arrays in `Broadcast.sources`; empty without subscribers.
         twists: Commanded twist and action keys of each articulation; empty without subscribers.
         full: Whether the snapshot is subscribed to.
@@ -205,7 +183,7 @@ class Broadcast:
     def want(self, state: Iterable[bytes], info: Iterable[bytes]) -> None:
         """Apply the subscriptions of the two sockets; listen to physics only if there are any."""
         prefixes = tuple(state)
-        self._wanted_rows = [row for row in self._rows if row.topic.startswith(prefixes)] if prefixes else []
+        self._wanted_rows = [row for row in self._rows if row[0].startswith(prefixes)] if prefixes else []
         self.full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
         self._info_wanted = any(True for _ in info)
         hooks = self._engine.on_tick
@@ -220,7 +198,7 @@ class Broadcast:
         if self._capture in self._engine.on_tick:
             self._engine.on_tick.remove(self._capture)
 
-    def state_messages(self, tick: Tick) -> Iterator[tuple[bytes, Callable[[], bytes | None]]]:
+    def state_messages(self, tick: Tick) -> Iterator[PublishedRow]:
         """Yield topic and encoder of a tick's messages on the state socket, the snapshot last.
 
         The next one may be taken although an encoder has failed.
@@ -232,16 +210,15 @@ class Broadcast:
         for twist, values in zip(self._twists, tick.twists, strict=True):
             twist.vx, twist.vy, twist.yaw_rate, twist.actions = values
         if tick.live:
-            for row in self._wanted_rows:
-                yield row.topic, row.encode
+            yield from self._wanted_rows
         if tick.full:
             yield STATE_FULL, partial(self._state_full, tick)
 
     def _state_full(self, tick: Tick) -> bytes:
-        snapshot = StateFull(
+        snapshot = StateSnapshot(
             **self._observer.state(ObservationLevel.STANDARD, tick.time, tick.step),
             entities=self._observer.entities(),
-            user=self._observer.scene_channels() or None,
+            user=self._observer.scene_channels(),
         )
         snapshot.wall_time = tick.wall_time
         return encode_reply(self._dialect.shaped(snapshot))
@@ -258,7 +235,6 @@ class Broadcast:
             yield partial(self._actuators.info, control, endpoints)
 
     def command_topics(self) -> Iterator[bytes]:
-        """Yield the topics to which the articulations subscribe."""
         for control in self._controls:
             for kind in (TopicKind.CONTROL, TopicKind.SET_GAINS):
                 topic = topic_frame(kind, control.index.key)
@@ -324,7 +300,7 @@ class Broadcast:
                 step=engine.step_count,
                 wall_time=wall_clock(),
                 arrays=[array.copy() for array in self._sources] if shown else [],
-                twists=[_values(control.twist) for control in self._controls] if shown else [],
+                twists=[dataclasses.astuple(control.twist) for control in self._controls] if shown else [],
                 full=full,
             ),
         )
@@ -336,10 +312,6 @@ def _with_own_twist(control: ArticulationControl) -> ArticulationControl:
     return mirrored
 
 
-def _values(twist: Twist) -> tuple[float, float, float, int]:
-    return twist.vx, twist.vy, twist.yaw_rate, twist.actions
-
-
 def _arrays(scene: CompiledScene, data: mujoco.MjData) -> list[Floats]:
     """Return views of all arrays in the messages, never an empty list."""
     arrays = [data.qpos, data.qvel, data.qacc, data.ctrl, data.act, data.sensordata]
@@ -347,6 +319,5 @@ def _arrays(scene: CompiledScene, data: mujoco.MjData) -> list[Floats]:
 
 
 def next_info(tick: int) -> int:
-    """Return the first live tick after `tick` with info messages."""
     every = INFO_EVERY if tick < INFO_START_TICKS else INFO_LATER_EVERY
     return (tick // every + 1) * every

@@ -11,12 +11,10 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
 from typing import Final, TypeAlias
 
 import zmq
 
-from urlab_client._platform.signals import uninterrupted
 from urlab_client.enums import StepMode
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.protocol.topics import camera_filter
@@ -24,9 +22,10 @@ from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import Film, Shot
-from urlab_client.server.system.threads import Health, ended
-from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
-from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
+from urlab_client.server.streams.publishing import Publisher, read_subscriptions
+from urlab_client.server.system.threads import Health
+from urlab_client.server.transport.curve_authentication import CurveKeys
+from urlab_client.server.transport.endpoint import PortInUse, tcp
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
 from urlab_client.values.pictures import camera_header
 
@@ -38,9 +37,6 @@ _Sent: TypeAlias = dict[str, int]
 PERIOD_S: Final = 1.0 / 30.0
 QUEUED_FRAMES: Final = 10
 
-MAX_FILTER_BYTES: Final = 4096
-"""Largest subscription; a larger one closes the connection."""
-
 PORTS: Final = 100
 """Number of ports above the first that are tried for a camera."""
 
@@ -48,31 +44,15 @@ PORTS: Final = 100
 class _Stream:
     """The socket of one camera: XPUB, a PUB socket that reports subscriptions."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], guard: ZapAuthenticator, host: str, port: int) -> None:
-        self.socket = context.socket(zmq.XPUB)
-        self.socket.maxmsgsize = MAX_FILTER_BYTES
-        guard.protect(self.socket)
-        bound_peers(self.socket)
-        self.socket.sndhwm = QUEUED_FRAMES
-        self.socket.linger = 0
+    def __init__(self, socket: zmq.Socket[bytes], port: int) -> None:
+        self.socket = socket
+        self.port = port
         self.key = ""
         self.topic = b""
         self._filters: set[bytes] = set()
-        try:
-            self.port = bind_tcp(self.socket, host, port, "camera_port")
-        except BaseException:
-            self.socket.close()
-            raise
 
     def wanted(self) -> bool:
-        """Whether the camera has a subscriber."""
-        with contextlib.suppress(zmq.Again):
-            while True:
-                message = self.socket.recv(zmq.DONTWAIT)
-                if message[:1] == b"\x01":
-                    self._filters.add(message[1:])
-                else:
-                    self._filters.discard(message[1:])
+        read_subscriptions(self.socket, self._filters)
         return bool(self.key) and any(self.topic.startswith(prefix) for prefix in self._filters)
 
     def show(self, key: str, topic: str) -> None:
@@ -81,13 +61,8 @@ class _Stream:
         self.topic = camera_filter(topic)
 
 
-class CameraStreams:
-    """Publishes the cameras of the play session. The first port is bound while the server is open.
-
-    Attributes:
-        filter: Called with topic and pixels of an image; returns the pixels to send, or None to drop it. Set it before
-            `start`; called on the sending thread.
-    """
+class CameraStreams(Publisher):
+    """Publishes the cameras of the play session. The first port is bound while the server is open."""
 
     def __init__(
         self,
@@ -99,49 +74,26 @@ class CameraStreams:
         memory: SharedMemoryServer | None = None,
         dialect: Dialect = ALPHA,
     ) -> None:
-        """Bind the first port.
-
-        Args:
-            port: Port of the first camera; the others get the free ones after it. 0 picks any.
-
-        Raises:
-            PortInUse: The port is in use.
-            OSError: The address does not belong to this machine.
-        """
-        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
+        """Bind the first camera's port, 0 for any; the other cameras get the free ones after it."""
+        super().__init__(health.thread("urlab-cameras", self._run), health, host, curve_keys)
         self._dialect = dialect
         self._zmq_on: set[str] = set()
         self._shm_on: set[str] = set()
         # Apart, because subscribers and readers of shared memory come at different times.
         self._zmq_sent: _Sent = {}
         self._shm_sent: _Sent = {}
-        self._host = host
         self._memory = memory
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
-        self._failed = 0
         self._lock = threading.Lock()
-        self._stopping = threading.Event()
         self._running: Running | None = None
-        self._streams: list[_Stream] = []
-        self._thread = health.thread("urlab-cameras", self._run)
         try:
-            self._streams.append(_Stream(self._context, self._authenticator, host, port))
+            self._streams = [self._stream(port)]
         except BaseException:
-            self._authenticator.close()
-            with uninterrupted():
-                self._context.term()
+            self._release()
             raise
         self.port: int = self._streams[0].port
 
-    @property
-    def alive(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start publishing."""
-        self._thread.start()
+    def _stream(self, port: int) -> _Stream:
+        return _Stream(*self._bound(zmq.XPUB, port, "camera_port", sndhwm=QUEUED_FRAMES))
 
     def endpoint(self, articulation: str, camera: str) -> str:
         """Return the endpoint of a camera; the first port for a camera that does not publish."""
@@ -201,29 +153,20 @@ class CameraStreams:
     def _header_bytes(self) -> int:
         return len(camera_header(0, 0.0, 0, 0, 0.0)) if self._dialect.camera_headers else 0
 
-    def stop(self) -> None:
-        """Ask the thread to end."""
-        self._stopping.set()
-
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end and close the sockets; return False if a picture is still being drawn."""
-        if self._thread.ident is not None:
-            ended(self._thread, timeout)
+        ended = super().join(timeout)
         with self._lock:
             self._running = None
-            for stream in self._streams:
-                stream.socket.close()
+            self._release()
             self._streams.clear()
-        self._authenticator.close()
-        with uninterrupted():
-            self._context.term()
-        return not self._thread.is_alive()
+        return ended
 
     def _next_free(self) -> _Stream | None:
         last = self._streams[-1].port
         for port in range(last + 1, min(self.port + PORTS, 65535) + 1):
             with contextlib.suppress(PortInUse):
-                return _Stream(self._context, self._authenticator, self._host, port)
+                return self._stream(port)
         return None
 
     def _run(self) -> None:
@@ -233,73 +176,57 @@ class CameraStreams:
             try:
                 self._publish()
             except Exception as error:  # noqa: BLE001 - the next images may do better
-                self._skip("the camera images of a moment are not published", error)
+                self._omit("the camera images of a moment are", error)
             pause = max(0.0, began + PERIOD_S - time.monotonic())
-
-    def _skip(self, what: str, error: Exception) -> None:
-        """Log an error, unless the sockets were closed because the server is closing."""
-        self._failed += 1
-        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # ever more rarely
-            logger.error("%s (%d so far)", what, self._failed, exc_info=error)
 
     def _publish(self) -> None:
         with self._lock:
             running = self._running
-            wanted = [stream for stream in self._streams if stream.wanted()]
-            topics = {stream.key: stream.topic for stream in wanted if stream.key in self._zmq_on}
+            streams = {stream.key: stream for stream in self._streams if stream.wanted() and stream.key in self._zmq_on}
         if running is None:
             return
         if self._dialect.cameras_on and running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
-            topics = {}
+            streams = {}
         shared = [] if self._memory is None else self._memory.wanted_cameras()
-        if not (topics or shared):
+        if not (streams or shared):
             return
-        shots = running.cameras.stream_shots(dict.fromkeys([*topics, *shared]))
+        shots = running.cameras.stream_shots(dict.fromkeys([*streams, *shared]))
         try:
             with running.engine.lock:
                 film = running.cameras.capture(shots, running.engine.snapshots.number)
         except Refusal:  # physics is busy; retried next time
             return
-        places = (shared, self._shm_sent), (topics, self._zmq_sent)
-        for_memory, for_topics = self._payloads(running, shots, film, places)
-        if self._memory is not None:
-            with self._lock:
-                for key, payload in for_memory.items() if self._running is running else ():
-                    self._memory.publish_picture(key, payload)
-        images: dict[str, bytes] = {}
-        for key, payload in for_topics.items():
-            try:
-                image = self._filtered(topics[key], payload)
-            except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
-                self._skip(f"an image of '{key}' is not published", error)
-                continue
-            if image is not None:
-                images[key] = image
-        with self._lock:
-            if self._running is running:
-                for stream in self._streams:
-                    if stream.key in images:
-                        stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
-
-    def _payloads(
-        self, running: Running, shots: Sequence[Shot], film: Film, places: Sequence[tuple[Collection[str], _Sent]]
-    ) -> list[dict[str, bytes]]:
-        """Draw, and return the messages for each place, given by its cameras and the last pictures sent there."""
         frames = running.cameras.frames(shots, film) or {}
-        news: list[dict[str, bytes]] = [{} for _ in places]
-        with self._lock:
-            for shot in shots if self._running is running else ():
-                frame = frames.get(shot.key)
-                if frame is None:
-                    continue
-                number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
+        for shot in shots:
+            frame, stream = frames.get(shot.key), streams.get(shot.key)
+            if frame is not None:
                 try:
-                    for (keys, sent), messages in zip(places, news, strict=True):
-                        if shot.key in keys and self._is_news(running, shot.key, number, sent):
-                            messages[shot.key] = self._headed(frame, film.capture_time(shot))
+                    self._publish_picture(running, film, shot, frame, stream=stream, shared=shot.key in shared)
                 except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
-                    self._skip(f"an image of '{shot.key}' is not published", error)
-        return news
+                    self._omit(f"an image of '{shot.key}' is", error)
+
+    def _publish_picture(
+        self, running: Running, film: Film, shot: Shot, frame: CameraFrame, *, stream: _Stream | None, shared: bool
+    ) -> None:
+        """Publish a picture where it is wanted, unless another simulation is shown by now."""
+        key, memory = shot.key, self._memory
+        number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
+        with self._lock:
+            if self._running is not running:
+                return
+            in_memory = shared and self._is_news(running, key, number, self._shm_sent)
+            on_socket = stream is not None and self._is_news(running, key, number, self._zmq_sent)
+            if not (in_memory or on_socket):
+                return
+            payload = self._headed(frame, film.capture_time(shot))
+            if in_memory and memory is not None:
+                memory.publish_picture(key, payload)
+        if stream is None or not on_socket:
+            return
+        image = self._filtered(stream.topic, payload)  # which may take its time
+        with self._lock:
+            if image is not None and self._running is running:
+                stream.socket.send_multipart([stream.topic, image], zmq.DONTWAIT)
 
     def _is_news(self, running: Running, key: str, number: int, sent: _Sent) -> bool:
         """Whether to send a picture of snapshot `number`, if the camera sends only changes."""
@@ -313,6 +240,3 @@ class CameraStreams:
             return frame.data
         sim_time = frame.sim_time or 0.0
         return camera_header(frame.frame_id or 0, sim_time, frame.width, frame.height, captured) + frame.data
-
-    def _filtered(self, topic: bytes, image: bytes) -> bytes | None:
-        return image if self.filter is None else self.filter(topic, image)

@@ -23,7 +23,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick
 from urlab_client.server.streams.commands import CameraEndpoint, StreamedCommand, read_commands
-from urlab_client.server.system.threads import Health, ended
+from urlab_client.server.system.threads import Health, ServedThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
 from urlab_client.server.transport.shared_memory import SharedMemoryServer
@@ -48,7 +48,72 @@ MAX_FILTER_BYTES: Final = 4096
 _WAKE: Final = "inproc://urlab-streams-wake"
 
 
-class StreamServer:
+class Publisher(ServedThread):
+    """Sockets on which a thread publishes.
+
+    Attributes:
+        filter: Called with topic and payload of a message; returns the payload to send, or None to drop it. Set it
+            before `start`; called on the sending thread.
+    """
+
+    def __init__(self, thread: threading.Thread, health: Health, host: str, curve_keys: CurveKeys | None) -> None:
+        super().__init__(thread)
+        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
+        self._host = host
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._context.linger = 0
+        self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
+        self._failed = 0
+
+    def _bound(
+        self, kind: int, port: int, option: str, *, most: int = MAX_FILTER_BYTES, **options: int
+    ) -> tuple[zmq.Socket[bytes], int]:
+        """Return a new socket and its port; a peer that sends more than `most` bytes is disconnected.
+
+        Raises:
+            PortInUse: The port is in use.
+            OSError: The address does not belong to this machine.
+        """
+        socket = self._context.socket(kind)
+        socket.maxmsgsize = most
+        for name, value in options.items():
+            setattr(socket, name, value)
+        self._authenticator.protect(socket)
+        bound_peers(socket)
+        try:
+            return socket, bind_tcp(socket, self._host, port, option)
+        except BaseException:
+            socket.close()
+            raise
+
+    def _filtered(self, topic: bytes, payload: bytes) -> bytes | None:
+        return payload if self.filter is None else self.filter(topic, payload)
+
+    def _omit(self, what: str, error: Exception) -> None:
+        """Log why something is not published, unless the sockets were closed because the server is closing."""
+        self._failed += 1
+        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # ever more rarely
+            logger.error("%s not published (%d so far)", what, self._failed, exc_info=error)
+
+    def _release(self) -> None:
+        self._authenticator.close()
+        with uninterrupted():
+            self._context.destroy(linger=0)
+
+
+def read_subscriptions(socket: zmq.Socket[bytes], topics: set[bytes]) -> bool:
+    """Update the subscriptions to an XPUB socket, and return whether they changed."""
+    before = topics.copy()
+    for frames in _waiting(socket):
+        kind, topic = frames[0][:1], frames[0][1:]
+        if kind == b"\x01":
+            topics.add(topic)
+        elif kind == b"\x00":
+            topics.discard(topic)
+    return topics != before
+
+
+class StreamServer(Publisher):
     """The state, info and control sockets of a server. They stay bound while it is open, and send nothing between play
     sessions.
 
@@ -58,8 +123,6 @@ class StreamServer:
         state_port: Port of the state stream.
         ctrl_port: Port of streamed controls and gains.
         info_port: Port of the info stream.
-        filter: Called with topic and payload of a message; returns the payload to send, or None to drop it. Set it
-            before `start`; called on the sending thread.
     """
 
     state_port: int
@@ -78,45 +141,23 @@ class StreamServer:
         curve_keys: CurveKeys | None = None,
         memory: SharedMemoryServer | None = None,
     ) -> None:
-        """Bind the sockets; `start` begins to serve.
-
-        Raises:
-            PortInUse: A port is in use.
-            OSError: The address does not belong to this machine.
-        """
-        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
+        super().__init__(health.thread("urlab-streams", self._run), health, host, curve_keys)
         self._cameras = cameras
         self._memory = memory
-        self._context = zmq.Context()
-        self._context.linger = 0
-        self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
-        self._failed = 0
-        # XPUB is PUB that reports subscriptions.
-        self._state = self._context.socket(zmq.XPUB)
-        self._info = self._context.socket(zmq.XPUB)
-        self._control = self._context.socket(zmq.SUB)
-        self._control.maxmsgsize = MAX_COMMAND_BYTES
-        for socket in (self._state, self._info):
-            socket.maxmsgsize = MAX_FILTER_BYTES
-        for socket in (self._state, self._info, self._control):
-            self._authenticator.protect(socket)
-            bound_peers(socket)
-        try:
-            self.state_port = bind_tcp(self._state, host, state_port, "state_port")
-            self.ctrl_port = bind_tcp(self._control, host, ctrl_port, "ctrl_port")
-            self.info_port = bind_tcp(self._info, host, info_port, "info_port")
-        except BaseException:
-            self._authenticator.close()
-            with uninterrupted():
-                self._context.destroy(linger=0)
-            raise
         self._wake = self._context.socket(zmq.PAIR)
         self._wake.bind(_WAKE)
         self._waker = self._context.socket(zmq.PAIR)
         self._waker.connect(_WAKE)
         self._waking = threading.Lock()
         self._awake = False
-        self._stopping = False
+        try:
+            # XPUB is PUB that reports subscriptions.
+            self._state, self.state_port = self._bound(zmq.XPUB, state_port, "state_port")
+            self._control, self.ctrl_port = self._bound(zmq.SUB, ctrl_port, "ctrl_port", most=MAX_COMMAND_BYTES)
+            self._info, self.info_port = self._bound(zmq.XPUB, info_port, "info_port")
+        except BaseException:
+            self._release()
+            raise
         self._target: Running | None = None
         self._shown: Running | None = None
         self._ticks: deque[tuple[Broadcast, Tick]] = deque(maxlen=WAITING_TICKS)
@@ -125,16 +166,6 @@ class StreamServer:
         self._subscribed: dict[zmq.Socket[bytes], set[bytes]] = {self._state: set(), self._info: set()}
         self._listening: list[bytes] = []
         self._broadcast: Broadcast | None = None
-        self._thread = health.thread("urlab-streams", self._run)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the thread is running."""
-        return self._thread.is_alive()
-
-    def start(self) -> None:
-        """Start the thread that serves."""
-        self._thread.start()
 
     def show(self, running: Running | None) -> None:
         """Serve this simulation from now on, or none. Returns immediately; thread-safe."""
@@ -142,20 +173,14 @@ class StreamServer:
         self._rouse()
 
     def stop(self) -> None:
-        """Ask the thread to end, without waiting."""
-        self._stopping = True
+        super().stop()
         self._rouse()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the thread to end after `stop`.
-
-        Returns:
-            False if the thread is still busy; it then closes the sockets when it ends.
-        """
-        if self._thread.ident is None:
-            self._close()
-            return True
-        return ended(self._thread, timeout)
+        """Wait for the thread to end; if it is still busy, it closes the sockets when it ends."""
+        if not self.started:
+            self._release()
+        return super().join(timeout)
 
     def _hand_over(self, broadcast: Broadcast, tick: Tick) -> None:
         self._ticks.append((broadcast, tick))
@@ -176,7 +201,7 @@ class StreamServer:
         for socket in (self._wake, self._state, self._info, self._control):
             poller.register(socket, zmq.POLLIN)
         try:
-            while not self._stopping:
+            while not self._stopping.is_set():
                 # Retry commands for which physics was too busy.
                 ready = dict(poller.poll(0 if self._commands else None))
                 if self._wake in ready:
@@ -189,24 +214,15 @@ class StreamServer:
                 except Exception as error:
                     if self._broadcast is None and self._shown is not None:
                         raise  # the play session cannot be streamed, and subscribers would wait in vain
-                    self._skip(error)
+                    self._ticks.clear()
+                    self._commands.clear()
+                    self._omit("the messages of a moment are", error)
         finally:
             self._leave()
-            self._close()
-
-    def _skip(self, error: Exception) -> None:
-        """Log an error and continue without the current ticks and commands."""
-        self._ticks.clear()
-        self._commands.clear()
-        self._note_failure(error)
-
-    def _note_failure(self, error: Exception) -> None:
-        self._failed += 1
-        if self._failed & (self._failed - 1) == 0:  # ever more rarely
-            logger.error("messages were not streamed (%d times so far)", self._failed, exc_info=error)
+            self._release()
 
     def _turn(self, ready: dict[Any, int]) -> None:
-        changed = [self._read_subscriptions(socket) for socket in self._subscribed if socket in ready]
+        changed = [read_subscriptions(socket, topics) for socket, topics in self._subscribed.items() if socket in ready]
         self._publish()
         if self._shown is not self._target:
             self._switch()
@@ -220,18 +236,6 @@ class StreamServer:
             else:
                 self._broadcast.obey(self._commands)
 
-    def _read_subscriptions(self, socket: zmq.Socket[bytes]) -> bool:
-        """Update the subscriptions, and return whether they changed."""
-        topics = self._subscribed[socket]
-        before = topics.copy()
-        for frames in _waiting(socket):
-            kind, topic = frames[0][:1], frames[0][1:]
-            if kind == b"\x01":
-                topics.add(topic)
-            elif kind == b"\x00":
-                topics.discard(topic)
-        return topics != before
-
     def _switch(self) -> None:
         target = self._shown = self._target
         self._leave()
@@ -244,7 +248,6 @@ class StreamServer:
         broadcast.want(self._subscribed[self._state], self._subscribed[self._info])
 
     def _leave(self) -> None:
-        """Stop publishing and listening."""
         broadcast, self._broadcast = self._broadcast, None
         if broadcast is not None:
             broadcast.leave()
@@ -266,7 +269,7 @@ class StreamServer:
             for encode in broadcast.info_messages(tick, self._cameras):
                 with self._skipping():
                     frame = encode()
-                    sent = frame if self.filter is None else self.filter(frame, frame)
+                    sent = self._filtered(frame, frame)
                     if sent is not None:
                         self._info.send(sent, zmq.NOBLOCK)
 
@@ -278,7 +281,7 @@ class StreamServer:
                 self._memory.publish_state(payload)
             if not full_wanted:
                 return
-        sent = payload if self.filter is None else self.filter(topic, payload)
+        sent = self._filtered(topic, payload)
         if sent is not None:
             self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
             self._state.send(sent, zmq.NOBLOCK)
@@ -291,7 +294,7 @@ class StreamServer:
         except zmq.ZMQError:
             raise
         except Exception as error:  # noqa: BLE001 - the next ones are none the worse
-            self._note_failure(error)
+            self._omit("a message is", error)
 
     def _read_commands(self) -> None:
         for frames in _waiting(self._control):
@@ -302,12 +305,10 @@ class StreamServer:
                 if self._malformed & (self._malformed - 1) == 0:  # ever more rarely
                     logger.warning("a control message is ignored (%d so far): %s", self._malformed, error)
 
-    def _close(self) -> None:
+    def _release(self) -> None:
         with self._waking:
             self._waker.close()
-        self._authenticator.close()
-        with uninterrupted():
-            self._context.destroy(linger=0)
+        super()._release()
 
 
 def _waiting(socket: zmq.Socket[bytes]) -> Iterator[list[bytes]]:

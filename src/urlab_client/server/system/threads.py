@@ -13,6 +13,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Final, TypeVarTuple
 
 from urlab_client._platform.threads import daemon
@@ -102,7 +103,37 @@ def _tell(callback: Callable[[str], None], reason: str) -> None:
         logger.exception("%r failed when called with the failure of the server", callback)
 
 
-class ServingThread:
+class ServedThread:
+    """A part of a server with a thread of its own, which ends once `_stopping` is set.
+
+    Attributes:
+        thread: The thread, made by `Health.thread`.
+    """
+
+    def __init__(self, thread: threading.Thread) -> None:
+        self.thread: threading.Thread = thread
+        self._stopping = threading.Event()
+
+    @property
+    def alive(self) -> bool:
+        return self.thread.is_alive()
+
+    @property
+    def started(self) -> bool:
+        return self.thread.ident is not None
+
+    def start(self) -> None:
+        self.thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the thread to end after `stop`; return False if it is still busy after `timeout` seconds."""
+        return not self.started or ended(self.thread, timeout)
+
+
+class ServingThread(ServedThread):
     """A thread that serves requests one by one. It calls `begin` before a request and `finish` after it.
 
     Inside a call of MuJoCo it cannot be interrupted, only abandoned: another thread then sends the reply and serves.
@@ -114,37 +145,16 @@ class ServingThread:
         Args:
             run: Body of the thread. Its argument is the reply to send first when it replaces another thread.
         """
-        self._name = name
-        self._run = run
-        self._health = health
+        self._make: Callable[[bytes | None], threading.Thread] = partial(health.thread, name, run)
+        super().__init__(self._make(None))
         self._lock = threading.Lock()
         self._working = False
-        self._thread = self._made(None)
-
-    def _made(self, owed: bytes | None) -> threading.Thread:
-        return self._health.thread(self._name, self._run, owed)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    @property
-    def started(self) -> bool:
-        """Whether it was started."""
-        return self._thread.ident is not None
-
-    @property
-    def alive(self) -> bool:
-        """Whether requests are served."""
-        return self._thread.is_alive()
 
     @property
     def is_current(self) -> bool:
-        """Whether the calling thread is the one that serves."""
-        return threading.current_thread() is self._thread
+        return threading.current_thread() is self.thread
 
     def begin(self) -> None:
-        """Mark the calling thread as working on a request."""
         self._working = True
 
     def finish(self) -> bool:
@@ -163,19 +173,17 @@ class ServingThread:
             release: Called before the new thread starts, to hand over what the old one holds.
         """
         with self._lock:
-            if thread is not self._thread or not self._working:
+            if thread is not self.thread or not self._working:
                 return False
             self._working = False
             release()
-            self._thread = self._made(owed)
-            self._thread.start()
+            self.thread: threading.Thread = self._make(owed)
+            self.thread.start()
             return True
 
     def join(self, timeout: float) -> bool:
         """Wait for the thread to end and return whether it has. Does not wait for replaced threads."""
-        if self.is_current:
-            return False
-        return ended(self._thread, timeout)
+        return not self.is_current and super().join(timeout)
 
 
 # Settings of glibc's allocator, without effect with other C libraries.
