@@ -69,7 +69,7 @@ async def memory(tmp_path: Path) -> AsyncIterator[ServerRegions]:
 
 @pytest.fixture
 async def publishers(publisher: Publisher, memory: ServerRegions) -> AsyncIterator[Publishers]:
-    session = Session(transport_to("tcp://127.0.0.1", 1, None, shm=True), default_timeout=DEADLINE_S)
+    session = Session(transport_to("tcp://127.0.0.1", 1, None), default_timeout=DEADLINE_S)
     made = Publishers(session, lambda: publisher.port, live=lambda: True, memory=memory)
     yield made
     made.close()

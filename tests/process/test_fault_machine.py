@@ -22,7 +22,6 @@ from fault_proxy import Delay, Fault, FaultProxy, Garbage, Throttle, Truncate
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from urlab_client.server.physics.integrator import Integrator
 from waiting import eventually, in_time
 
 from urlab_client.aio import Stream, URLabClient
@@ -41,6 +40,7 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.server import SimulatedServer
+from urlab_client.server.physics.engine import Engine
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
 TIMEOUT_S = 0.3
@@ -65,7 +65,7 @@ class Steps:
 
     def __call__(self, model: Any, data: Any, nstep: int = 1) -> None:
         self._real(model, data, nstep)
-        if sys._getframe(1).f_code is Integrator.advance.__code__:
+        if sys._getframe(1).f_code is Engine._advance.__code__:
             self.taken += nstep
 
 
