@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
 from urlab_client._platform.windows import read_aside
-from urlab_client.cli._arguments import DIALECT
+from urlab_client.cli._arguments import DIALECT, Kinds
 from urlab_client.cli._common import CommandError, import_mujoco, in_background
 from urlab_client.enums import CameraMode
 from urlab_client.simulation.controller_config import ControllerConfig
@@ -126,7 +126,7 @@ def _camera_mode(text: str) -> tuple[str, CameraMode]:
     return camera, CameraMode(mode)
 
 
-KINDS = {"controller": _controller, "camera_mode": _camera_mode}
+KINDS: Kinds = {"controller": _controller, "camera_mode": _camera_mode}
 
 
 def run(arguments: Namespace) -> int:

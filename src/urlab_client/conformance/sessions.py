@@ -90,7 +90,7 @@ class Ports:
             raise ValueError(f"{host} can be reached by others, so it needs a key (--listen-key)")
         self.host = host
         self._keys = keys
-        self.sockets = contextlib.ExitStack()
+        self.sockets: contextlib.ExitStack = contextlib.ExitStack()
 
     @cached_property
     def context(self) -> zmq.Context[Socket]:

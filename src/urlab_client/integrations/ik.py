@@ -15,11 +15,11 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from urlab_client._installation import need
+from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, finite_array
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator, Joint
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation

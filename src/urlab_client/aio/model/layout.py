@@ -12,8 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import QPOS_WIDTH, QVEL_WIDTH, control_counts, control_starts, force_counts, spans
-from urlab_client.aio.model.mirror import model_names
+from urlab_client._mujoco import (
+    QPOS_WIDTH,
+    QVEL_WIDTH,
+    control_counts,
+    control_starts,
+    force_counts,
+    model_names,
+    spans,
+)
 from urlab_client.values.descriptions import JointKind, SetPointMeaning
 from urlab_client.values.names import split_prefix
 

@@ -31,9 +31,9 @@ from typing import cast
 import msgspec
 import numpy as np
 
+from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, is_array, mapping, require
 from urlab_client.aio.defaults import DEFAULT, Timeout
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session.jobs import OnProgress

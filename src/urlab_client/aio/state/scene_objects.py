@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
+from urlab_client._mujoco import model_names
 from urlab_client.aio.controllers import check_controller
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.messages.session import CameraInfo, EntityInfo, HelloOk
 from urlab_client.values.names import owner_of

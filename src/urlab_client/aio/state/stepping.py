@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 
+from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, mapping, text
 from urlab_client.aio.model.articulation_state import MirroredArticulation, SentWrenches, restore_wrenches
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.session.session import leaves_open
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState

@@ -83,8 +83,8 @@ class RegionReader:
         on_lost: Callable[[], None],
         fastest_s: float,
     ) -> None:
-        self.name = name
-        self.ring = ring
+        self.name: str = name
+        self.ring: bytes = ring
         self.file: MappedFile = MappedFile(location.find(name))
         self.region: Region = attached(self.file)
         self.waits: bool = True

@@ -71,7 +71,7 @@ class _StreamReader(RegionReader):
     """A region of published messages and its handlers."""
 
     def __init__(self, regions: Regions, location: ServerRegions, place: Place) -> None:
-        self.place = place
+        self.place: Place = place
         self.handlers: dict[MessageHandler, None] = {}
         super().__init__(
             location,
@@ -85,7 +85,7 @@ class _StreamReader(RegionReader):
     def message(self) -> BytesLike | None:
         """Return the current publication, or None if there is none. Raises `ProtocolError`."""
         if self.ring == Ring.CAMERA:
-            self.seen = self.region.sequence
+            self.seen: int = self.region.sequence
             # The handlers use its length and pass it back to their source, which handles this type.
             picture = SharedPicture(self, self.seen, self.region.max_payload)
             return cast("BytesLike", picture) if self.seen else None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.model.mirror import model_names
+from urlab_client._mujoco import model_names
 from urlab_client.integrations._feed.messages import (
     Color,
     CylinderPrimitive,

@@ -10,12 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from urlab_client._mujoco import control_counts
+from urlab_client._mujoco import control_counts, model_names
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,

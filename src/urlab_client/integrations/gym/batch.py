@@ -13,9 +13,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import batch_class, spans
+from urlab_client._mujoco import batch_class, model_names, spans
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
 from urlab_client.integrations.gym.episode import EnvEpisode

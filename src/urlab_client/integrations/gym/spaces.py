@@ -11,10 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import control_counts
+from urlab_client._mujoco import control_counts, model_names
 from urlab_client.aio.arguments import collection
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, driven_joint
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.enums import CameraMode
 from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.base import Floats

@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import require
-from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Actions, Space, SpaceMapping, SpaceMode, dict_space, unbounded
 from urlab_client.protocol.base import Floats
 from urlab_client.values.names import NameMap, element_ids
