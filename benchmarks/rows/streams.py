@@ -18,6 +18,8 @@ from benchmarks.harness import Figure, Pair, Row
 from benchmarks.robots import recorded
 from urlab_client import aio
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.launch import transport_to
+from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
@@ -138,7 +140,8 @@ def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
         info = CameraInfo(
             mode=mode, resolution=(width, height), fovy=45.0, zmq_endpoint=endpoint, zmq_topic="robot/camera/eye"
         )
-        publishers = Publishers(lambda: endpoint, lambda: 0, live=lambda: True, default_timeout=10.0)
+        session = Session(transport_to(endpoint, 0, None), default_timeout=10.0)
+        publishers = Publishers(session, lambda: 0, live=lambda: True)
         stream = URLabCameraView("eye", info, publishers).frames("all", buffer=per_burst, buffer_bytes=1 << 30)
 
         async def read(pictures: int) -> float:
