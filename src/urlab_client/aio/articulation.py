@@ -13,6 +13,7 @@ from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.defaults import DEFAULT, Timeout
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor, elements_of
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.aio.session.control import CLAIM_S
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
@@ -150,22 +151,13 @@ class URLabEntity(Local):
                 return qpos[:3], qpos[3:7]
             if state.pose is not None:
                 return np.array(state.pose.xpos), np.array(state.pose.xquat)
-            pair = state.mirror.derived()
-            if pair is None:
-                raise self._needs_model("pose", "positions")
-            return pair[1].xpos[state.body_id].copy(), pair[1].xquat[state.body_id].copy()
+            derived = state.mirror.derived()
+            _, data = require_local(derived, f"The pose of {self.name!r}, which joint positions determine,")
+            return data.xpos[state.body_id].copy(), data.xquat[state.body_id].copy()
 
     def _derived_velocity(self) -> Floats:
         velocity = self._state.mirror.body_velocity(self._state.body_id)
-        if velocity is None:
-            raise self._needs_model("velocity", "velocities")
-        return velocity
-
-    def _needs_model(self, what: str, source: str) -> URLabError:
-        return URLabError(
-            f"The {what} of {self.name!r} follows from joint {source}, which needs a local model.",
-            hint="Create the client with local_model=True and call discover() during play.",
-        )
+        return require_local(velocity, f"The velocity of {self.name!r}, which joint velocities determine,")
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r}>"

@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.console.messages import ReplayView
 from urlab_client.console.pictures import OF_SCENE, Cameras
 from urlab_client.console.shared_view import SharedView
@@ -242,9 +243,7 @@ class Replay:
     # The simulation
 
     async def _take_over(self) -> None:
-        data = self._client.data
-        if data is None:
-            raise URLabError("Robots cannot be placed without a local model.")
+        data = require_local(self._client.data, "Placing robots")
         mode = self._client.step_mode
         await self._client.runtime.set_mode(StepMode.PUPPET)
         self._before = _Before(mode, data.qpos.copy(), data.qvel.copy())

@@ -20,6 +20,7 @@ from urlab_client.aio.arguments import finite, finite_array
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator, Joint
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
@@ -115,12 +116,7 @@ class InverseKinematics:
             URLabError: The client has no local model, or the scene does not have exactly one robot and `articulation`
                 is None.
         """
-        model = client.model
-        if model is None:
-            raise URLabError(
-                "Inverse kinematics needs the local model, which this client does not have.",
-                hint="Make the client with local_model=True and call discover() during play.",
-            )
+        model = require_local(client.model, "Inverse kinematics")
         self._client = client
         self._source = model
         self._robot = only_robot(client, articulation)
@@ -273,9 +269,7 @@ class InverseKinematics:
             raise URLabError(
                 "The client's model has been replaced since.", hint="Make a new InverseKinematics after discover()."
             )
-        data = self._client.data
-        if data is None:
-            raise URLabError("The client has no local state.", hint="Call discover() during play.")
+        data = require_local(self._client.data, "Inverse kinematics")
         with self._client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
             return np.array(data.qpos)
 

@@ -10,13 +10,13 @@ import math
 import threading
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from urlab_client._mujoco import forget_last_document, model_names, saved_model, without_newer_attributes
 from urlab_client.aio.arguments import first_not_finite
-from urlab_client.errors import ProtocolError, URLabVersionMismatch
+from urlab_client.errors import ProtocolError, URLabError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
 from urlab_client.values.types import SimOptions
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
+T = TypeVar("T")
+
 _CHOICES = {
     "integrator": ("mjtIntegrator", "mjINT_"),
     "cone": ("mjtCone", "mjCONE_"),
@@ -33,6 +35,27 @@ _CHOICES = {
 }
 _HEADER_BYTES = 20  # five 32-bit integers
 _NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
+
+
+def require_local(part: T | None, what: str, *, op: str | None = None, otherwise: str = "") -> T:
+    """Return a client's local model, its data, or what follows from them.
+
+    Args:
+        part: What the client has, or None.
+        what: What needs it, the subject of the error.
+        op: The op that does.
+        otherwise: What to do instead, continuing the hint.
+
+    Raises:
+        URLabError: The client has no local model.
+    """
+    if part is None:
+        raise URLabError(
+            f"{what} needs the local model, which this client does not have.",
+            op=op,
+            hint=f"Create the client with local_model=True and call discover() during play{otherwise}.",
+        )
+    return part
 
 
 @cache

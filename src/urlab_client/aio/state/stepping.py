@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, mapping, text
 from urlab_client.aio.model.articulation_state import MirroredArticulation, SentWrenches, restore_wrenches
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.aio.session.session import leaves_open
 from urlab_client.aio.session.turn import Turn
 from urlab_client.aio.state.sim_state import SimState
@@ -116,13 +117,8 @@ def _direct_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
 
 def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
     mirror = state.mirror
-    model, data = mirror.model, mirror.data
-    if model is None or data is None:
-        raise URLabError(
-            "step: puppet mode integrates the local model, which this client does not have.",
-            op="step",
-            hint="Create the client with local_model=True and call discover() during play.",
-        )
+    model = require_local(mirror.model, "step: puppet mode", op="step")
+    data = require_local(mirror.data, "step: puppet mode", op="step")
     if take_wrenches(state):
         warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=4)
     with mirror.lock:

@@ -16,6 +16,7 @@ from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.client_types import ClientObserver
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
@@ -77,11 +78,8 @@ class Follower(ClientObserver):
     def check(self) -> FollowedScene:
         if not self._client.urlab_version:
             raise URLabError(f"{self._name}: the scene is not known yet.", hint="Call discover() first, during play.")
-        if self._needs_model is not None and self._client.model is None:
-            raise URLabError(
-                f"{self._name}: poses are computed with the local model, which this client does not have.",
-                hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
-            )
+        if self._needs_model is not None:
+            require_local(self._client.model, f"{self._name}: computing poses", otherwise=self._needs_model)
         return self._current()
 
     @property

@@ -15,6 +15,7 @@ from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations._variation import (
@@ -63,11 +64,11 @@ class EnvEpisode:
         earlier: EnvEpisode | None = None,
     ) -> None:
         """Set up the episodes of a client, which may replace that of `earlier` episodes; see `URLabEnv` for errors."""
-        model, data = client.model, client.data
-        if model is None or data is None or not client.articulations:
+        model = require_local(client.model, "An environment")
+        if not client.articulations:
             raise URLabError(
                 "The client has discovered no articulation to act on.",
-                hint="Start play, then call discover() with local_model=True.",
+                hint="Add a robot to the scene, and call discover() during play.",
             )
         if client.step_mode not in (StepMode.DIRECT, StepMode.PUPPET):
             raise URLabError(
@@ -105,9 +106,7 @@ class EnvEpisode:
 
     def state(self) -> tuple[Floats, Floats, float]:
         """Return the positions and velocities of the whole scene, and the simulation time."""
-        data = self.client.data
-        if data is None:
-            raise URLabError("The client has no model.", hint="Call discover() with local_model=True.")
+        data = require_local(self.client.data, "The state of the scene")
         return data.qpos, data.qvel, data.time
 
     def draws(self) -> dict[str, Any] | None:

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.messages import EpisodeOutcome
@@ -162,12 +163,7 @@ class _Session:
 
     def __post_init__(self) -> None:
         client = self.client
-        model = client.model
-        if model is None:
-            raise URLabError(
-                "Teleoperation needs the local model, which this client does not have.",
-                hint="Make the client with local_model=True and call discover() during play.",
-            )
+        model = require_local(client.model, "Teleoperation")
         if client.step_mode is not StepMode.DIRECT:
             raise URLabError(
                 f"Teleoperation steps physics itself, but the step mode is {client.step_mode}.",

@@ -7,7 +7,6 @@ can be moved. Besides what the ops author, a level is the way to bring in static
 from __future__ import annotations
 
 import logging
-import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -205,8 +204,6 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
     """Check an entry and return its actor."""
     if not entry.name or entry.name != sanitized(entry.name):
         raise ValueError("a name has letters, digits and underscores only")
-    if not all(math.isfinite(value) for value in (*entry.location, *entry.scale)):
-        raise ValueError("location and scale must be finite")
     _check_settings(entry)
     mesh = entry.mesh
     if mesh is not None:
@@ -248,7 +245,7 @@ def _check_settings(entry: _Actor) -> None:
 
 
 def _check_mesh(mesh: Mesh, convert: ConversionSettings | None) -> None:
-    if len(mesh.size) != _SIZES[mesh.shape] or not all(size > 0 and math.isfinite(size) for size in mesh.size):
+    if len(mesh.size) != _SIZES[mesh.shape] or min(mesh.size, default=1.0) <= 0:
         raise ValueError(f"shape '{mesh.shape}' takes {_SIZES[mesh.shape]} positive numbers as 'size'")
     if bool(mesh.file) != (mesh.shape == "file"):
         raise ValueError("shape 'file', and no other, takes a 'file'")
