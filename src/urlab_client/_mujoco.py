@@ -16,6 +16,7 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -450,6 +451,38 @@ def copy_options(source: Any, target: Any) -> None:
     """Copy all options of a model or spec to another; before 3.10 they must be copied one by one."""
     for name in option_names(source):
         setattr(target, name, getattr(source, name))
+
+
+@cache
+def option_choices() -> Mapping[str, Mapping[str, int]]:
+    """Return the numbers of the integrators, cones and solvers by lower-case name: `euler`, `elliptic`, `newton`."""
+    import mujoco
+
+    kinds = ("integrator", mujoco.mjtIntegrator), ("cone", mujoco.mjtCone), ("solver", mujoco.mjtSolver)
+    return {
+        option: {name.partition("_")[2].lower(): int(member) for name, member in kind.__members__.items()}
+        for option, kind in kinds
+    }
+
+
+def write_options(option: mujoco.MjOption, values: Mapping[str, Any]) -> None:
+    """Write options by name; `enable_multiccd` and `enable_sleep` take precedence over the masks that they are part of.
+
+    Args:
+        option: Options of a model.
+        values: As in `mjOption`, besides these two; integrator, cone and solver are numbers.
+    """
+    import mujoco
+
+    for name, value in values.items():
+        if not name.startswith("enable_"):
+            setattr(option, name, value)
+    if "enable_sleep" in values:
+        bit = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        option.enableflags = option.enableflags & ~bit | bit * values["enable_sleep"]
+    if "enable_multiccd" in values:
+        bit = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+        option.disableflags = option.disableflags & ~bit | bit * (not values["enable_multiccd"])
 
 
 def batch_class() -> Any:

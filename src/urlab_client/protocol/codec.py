@@ -319,17 +319,13 @@ def _packed(value: Any) -> msgspec.Raw:
 
 
 def _widened(value: Any) -> Any:
-    match value:
-        case bool():
-            return value
-        case int():
-            return float(value)
-        case dict():
-            return {key: _widened(item) for key, item in cast("dict[str, Any]", value).items()}
-        case list() | tuple():
-            return [_widened(item) for item in cast("list[Any]", value)]
-        case _:
-            return value
+    # No call for what nearly all values are: floats.
+    if isinstance(value, dict):
+        items = cast("dict[str, Any]", value).items()
+        return {key: item if type(item) is float else _widened(item) for key, item in items}
+    if isinstance(value, (list, tuple)):
+        return [item if type(item) is float else _widened(item) for item in cast("list[Any]", value)]
+    return float(value) if type(value) is int else value
 
 
 def _spelled(value: Any) -> Any:

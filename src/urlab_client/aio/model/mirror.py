@@ -10,11 +10,18 @@ import math
 import threading
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
-from urlab_client._mujoco import forget_last_document, model_names, saved_model, without_newer_attributes
+from urlab_client._mujoco import (
+    forget_last_document,
+    model_names,
+    option_choices,
+    saved_model,
+    without_newer_attributes,
+    write_options,
+)
 from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
@@ -28,13 +35,8 @@ log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
 T = TypeVar("T")
 
-_CHOICES = {
-    "integrator": ("mjtIntegrator", "mjINT_"),
-    "cone": ("mjtCone", "mjCONE_"),
-    "solver": ("mjtSolver", "mjSOL_"),
-}
 _HEADER_BYTES = 20  # five 32-bit integers
-_NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
+_THREADS = ("num_worker_threads", "max_worker_threads")
 
 
 def require_local(part: T | None, what: str, *, op: str | None = None, otherwise: str = "") -> T:
@@ -66,42 +68,22 @@ def _mjb_header() -> bytes:
     return saved_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
 
 
-def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
+def mirror_options(opt: mujoco.MjOption, options: SimOptions) -> None:
     """Write the options that are not None to a model's `mjOption`, all or none.
-
-    Write the raw masks first, so that the named switches take precedence, as on the server.
 
     Raises:
         ValueError: An integrator, cone or solver is unknown.
     """
-    import mujoco
-
-    values: dict[str, Any] = {}
-    for name in SimOptions.__struct_fields__:
-        value = getattr(options, name)
-        if value is None or name in _NOT_IN_MJOPTION:
-            continue
-        values[name] = _choice(name, value) if name in _CHOICES else value
-    for name, value in values.items():
-        setattr(opt, name, value)
-    if options.enable_sleep is not None:
-        opt.enableflags = _switched(opt.enableflags, int(mujoco.mjtEnableBit.mjENBL_SLEEP), options.enable_sleep)
-    if options.enable_multiccd is not None:
-        bit = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
-        opt.disableflags = _switched(opt.disableflags, bit, not options.enable_multiccd)
-
-
-def _choice(name: str, value: str) -> int:
-    """Return the number of an integrator, cone or solver. The wire carries the number of one without a name."""
-    import mujoco
-
-    enum, prefix = _CHOICES[name]
-    members = getattr(mujoco, enum).__members__
-    known = {key.removeprefix(prefix).lower(): int(member) for key, member in members.items()}
-    found = known.get(value.lower(), next((number for number in known.values() if str(number) == value), None))
-    if found is None:
-        raise ValueError(f"{name} is {value!r}; MuJoCo knows {', '.join(known)}")
-    return found
+    given = {name: getattr(options, name) for name in SimOptions.__struct_fields__ if name not in _THREADS}
+    values = {name: value for name, value in given.items() if value is not None}
+    for name, known in option_choices().items():
+        if name in values:
+            word = values[name].lower()
+            # The wire carries the number of one without a name.
+            values[name] = known.get(word, next((number for number in known.values() if str(number) == word), None))
+            if values[name] is None:
+                raise ValueError(f"{name} is {given[name]!r}; MuJoCo knows {', '.join(known)}")
+    write_options(opt, values)
 
 
 def _from_binary(mjb: bytes) -> mujoco.MjModel:
@@ -126,10 +108,6 @@ def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco
             f"{error}. The server is neither on this machine nor known by its key, so its model may use only limited "
             "resources and files: trust_server=True lifts the limits, local_model=False loads no model"
         ) from None
-
-
-def _switched(mask: int, bit: int, on: bool) -> int:
-    return mask | bit if on else mask & ~bit
 
 
 class Loaded(NamedTuple):

@@ -16,7 +16,7 @@ import numpy as np
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
-from urlab_client.aio.model.mirror import Mirror, write_options
+from urlab_client.aio.model.mirror import Mirror, mirror_options
 from urlab_client.aio.session.session import Session
 from urlab_client.aio.state.progress import Clocks, PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
@@ -337,7 +337,7 @@ class SimState:
             check_sim_options(options)
             if self.mirror.model is not None:
                 with self.mirror.lock:
-                    write_options(self.mirror.model.opt, options)
+                    mirror_options(self.mirror.model.opt, options)
         except ValueError as error:
             raise ProtocolError(
                 f"set_sim_options: the server returned an invalid option: {error}.", op="set_sim_options"

@@ -7,32 +7,22 @@ time, spoil the state or keep the solver busy for good: the server may have othe
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
-from urlab_client._mujoco import set_threads, thread_limit
+from urlab_client._mujoco import option_choices, set_threads, thread_limit, write_options
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.limits import Limits, option_problem
 from urlab_client.server.refusal import Refusal
 from urlab_client.simulation.controllers import float32
 from urlab_client.values.types import SimOptions
 
-CHOICES: Final[Mapping[str, Mapping[str, Any]]] = {
-    "integrator": {
-        "euler": mujoco.mjtIntegrator.mjINT_EULER,
-        "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-        "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-        "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    },
-    "cone": {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC},
-    "solver": {
-        "pgs": mujoco.mjtSolver.mjSOL_PGS,
-        "cg": mujoco.mjtSolver.mjSOL_CG,
-        "newton": mujoco.mjtSolver.mjSOL_NEWTON,
-    },
+_INTEGRATORS: Final = {"euler", "rk4", "implicit", "implicitfast"}  # the plugin's; a newer MuJoCo has others
+CHOICES: Final = {
+    option: {word: number for word, number in words.items() if option != "integrator" or word in _INTEGRATORS}
+    for option, words in option_choices().items()
 }
 MJCF_SPELLING: Final = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
 SCALARS: Final = (
@@ -83,22 +73,11 @@ class OptionOverrides:
                 raise Refusal("bad_value", problem)
         for name, value in given:
             self._kept[name] = self._stored(name, value)
-        opt, kept = model.opt, self._kept
-        for name in MASKS:
-            mask = getattr(options, name)
-            if mask is not None:
-                setattr(opt, name, mask)
-        for name, value in kept.items():
-            if name in ("gravity", "wind", "magnetic"):
-                getattr(opt, name)[:] = value
-            elif name not in ("enable_multiccd", "enable_sleep", "sleep_tolerance"):
-                setattr(opt, name, value)
-        if "enable_multiccd" in kept:
-            opt.disableflags = _switched(opt.disableflags, NO_MULTICCD, not kept["enable_multiccd"])
-        if "enable_sleep" in kept:
-            opt.enableflags = _switched(opt.enableflags, SLEEP, kept["enable_sleep"])
-            if kept["enable_sleep"]:
-                opt.sleep_tolerance = kept["sleep_tolerance"]
+        masks = {name: mask for name in MASKS if (mask := getattr(options, name)) is not None}
+        kept = {**self._kept}
+        if not kept.get("enable_sleep"):
+            del kept["sleep_tolerance"]
+        write_options(model.opt, masks | kept)
         if options.num_worker_threads is not None:
             self._set_threads(data, options.num_worker_threads)
         return self._in_force(model)
@@ -128,7 +107,7 @@ class OptionOverrides:
             found = CHOICES[name].get(value.casefold())
             if found is None:
                 raise Refusal("bad_value", f"unknown {name} '{value}': use {', '.join(CHOICES[name])}")
-            return int(found)
+            return found
         if name in SCALARS:
             return self._number(value)
         if name in SCALED:
@@ -142,16 +121,12 @@ class OptionOverrides:
 
     def _choice(self, name: str, number: int) -> str:
         """Return an option's name; a model of its own options may use one that the protocol has no name for."""
-        text = next((text for text, item in CHOICES[name].items() if int(item) == int(number)), str(int(number)))
+        text = next((text for text, item in CHOICES[name].items() if item == int(number)), str(int(number)))
         return text if self._dialect.options_float32 else MJCF_SPELLING.get(text, text)
 
 
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def _switched(mask: int, bit: int, on: bool) -> int:
-    return mask | bit if on else mask & ~bit
 
 
 def _cores() -> int:
