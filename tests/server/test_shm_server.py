@@ -97,8 +97,8 @@ def test_the_files_are_laid_out_as_the_plugins(server: SimulatedServer, rpc: Rpc
         assert HEADER.unpack_from((directory / name).read_bytes())[:4] == (0x424C5255, 1, 1_048_576, 2)
         if os.name == "posix":
             assert stat.S_IMODE((directory / name).stat().st_mode) == 0o600
-    state = eventually(lambda: (directory / "state.shm").is_file() and directory / "state.shm")
-    assert state.stat().st_size == 32_832
+    state = directory / "state.shm"
+    eventually(lambda: state.is_file() and state.stat().st_size == 32_832)
     for camera in ("overview", "wrist"):
         stride = 32 * 24 * 4 + 4
         assert (directory / f"cam_arm_{camera}.shm").stat().st_size == 64 + 2 * stride
