@@ -109,6 +109,7 @@ class MappedFile:
         if self._mmap is not None:
             with contextlib.suppress(BufferError):
                 self._mmap.close()
+            self._mmap = None  # Windows removes no mapped file, so nothing but a view that somebody holds may keep it
         self._release()
 
     def __del__(self) -> None:
