@@ -237,10 +237,11 @@ class Viewing(Block):
                 started = time.monotonic()
                 self._drain()
                 if not self._backend.idle():
-                    return
+                    break
                 took = time.monotonic() - started
                 pause = max(self._period - took, took)  # at most half of a processor's time
-            self._drain()
+            else:
+                self._drain()
         except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on
             self._error = error
             log.warning("%s: the view ended: %s", self._name, error)
@@ -250,7 +251,7 @@ class Viewing(Block):
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
                 log.warning("%s: closing the view failed: %s", self._name, error)
-            self._gone.set()
+        self._gone.set()
 
     def _fail(self, error: URLabError) -> None:
         self._error = error
