@@ -58,6 +58,9 @@ def test_options_of_another_view_are_refused(capsys: pytest.CaptureFixture[str])
     assert "require --rerun" in refused(capsys, "--foxglove", "--save", "a.rrd")
     assert "give one of" in refused(capsys, "--rerun", "--page", "--save", "a.rrd")
     assert "do not apply to --web" in refused(capsys, "--web", "--seconds", "1")
+    # The address of a viewer, as the help writes it, is accepted: it is not the URL of a page.
+    viewer = "rerun+http://localhost:9876/proxy"
+    assert "require --rerun" in refused(capsys, "--foxglove", "--connect", viewer)
 
 
 def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -532,8 +532,13 @@ OVERSIZED: dict[str, tuple[Callable[[Path], Any], Callable[[Run], Any], str]] = 
         "the names of its sensors are too long",
     ),
     "joints": (lambda path: path.write_bytes(JOINTS), lambda run: run.table(), "bytes of memory"),
+    "what are no frames of joints": (
+        lambda path: path.write_bytes(b'{"Frames": [' + b"0," * MIB + b"0]}"),
+        lambda run: run.table(),
+        "its frames take more than 8388608 bytes of memory",
+    ),
     "a frame of joints": (
-        lambda path: path.write_bytes(b'{"Frames": [[' + b"[]," * MIB + b"[]]]}"),
+        lambda path: path.write_bytes(b'{"Frames": [["' + b"x" * MIB + b'"]]}'),
         lambda run: run.table(),
         "a frame has more than 16384 bytes",
     ),

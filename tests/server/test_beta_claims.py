@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +13,9 @@ from beta_bench import ME, OTHER, Bench, Clock
 from waiting import eventually
 from wire import Wire, set_points
 
+from urlab_client import URLabClient
+from urlab_client.protocol.messages.runtime import SetUserChannels
+from urlab_client.server import SimulatedServer
 from urlab_client.server.core import DriverLease
 
 # Claims.
@@ -217,3 +221,18 @@ def test_a_claim_of_a_robot_that_is_not_there(playing: Bench) -> None:
     assert playing.refused("claim_control", articulation="")[0] == "missing_field"
     assert playing.refused("claim_control", articulation=7)[0] in {"missing_field", "unknown_articulation"}
     assert playing.refused("step", **playing.drive()) == ("not_control_owner", "(unclaimed)")
+
+
+def test_channels_of_the_scene_are_no_robots(tmp_path: Path) -> None:
+    """A robot that is called like the scene, in another case, leaves the scene's channels alone."""
+    model = tmp_path / "robot.xml"
+    model.write_text('<mujoco model="Scene"><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>')
+    with (
+        SimulatedServer(
+            model, play=True, dialect="beta", actor_names="model", user_channels={"scene/door": False}
+        ) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        client.discover()
+        assert client.articulations
+        assert client.call(SetUserChannels(scene={"door": True})).applied == 1

@@ -42,7 +42,7 @@ USAGE = f"""
 | --rerun  Rerun's window; with --save a file, with --connect another viewer, with --page a page for browsers
 | --foxglove  a server that Foxglove connects to
 --save FILE  with --rerun: write an .rrd file, show nothing
---connect URL  with --rerun: send to a viewer, rerun+http://HOST:9876/proxy
+--connect VIEWER  with --rerun: send to a viewer, rerun+http://HOST:9876/proxy
 --page  with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone
 --port PORT  port for --web, --foxglove or --page
 {STEP_MODE}

@@ -36,6 +36,7 @@ _SMALL_BYTES: Final = 64 << 20
 _BYTES_PER_BYTE: Final = 16  # a frame of one joint takes 8 times as much memory as its text
 _FRAME_BYTES: Final = 2 << 20  # as text; decoded, a frame takes up to 70 times as much memory
 _RAW_BYTES: Final = 64  # about what a frame takes that is found, but not decoded
+_COMMA_BYTES: Final = 40  # for other values, of which a file may have more; of frames, a comma has 10 bytes and more
 _TOO_MANY: Final = "its frames take more than {} bytes of memory"
 _LAYOUT_OVERHEAD: Final = 600  # about the bytes of a joint in a layout
 _NAME_CHARS: Final = 4096
@@ -190,7 +191,8 @@ def decode_json(content: bytes) -> list[Frame]:
     made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
     text = _utf8(content)
     most = min(_READ_BYTES, max(_SMALL_BYTES, _BYTES_PER_BYTE * len(content)))
-    if text.count(b"{") * _RAW_BYTES > most:  # before even the frames' places in the text need that much
+    # Before even the places in the text, of frames or of whatever is in their place, need that much:
+    if max(text.count(b"{") * _RAW_BYTES, text.count(b",") * _COMMA_BYTES) > most:
         raise ValueError(_TOO_MANY.format(most))
     try:
         return _kept((_from_file(_read(frame), made) for frame in _frames(text)), most)

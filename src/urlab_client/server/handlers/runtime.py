@@ -91,9 +91,12 @@ def set_user_channels(server: ServerCore, request: runtime.SetUserChannels) -> r
     running = server.play.running()
     applied = 0
     rejected: dict[str, str] = {}
-    for name, values in [*(request.arts or {}).items(), (SCENE, request.scene or {})]:
-        robot = running.engine.articulations.find(name)
-        owner = name if robot is None else running.engine.articulations.names[robot.index.key]
+    robots = running.engine.articulations
+    named = [
+        (name, name if (robot := robots.find(name)) is None else robots.names[robot.index.key], values)
+        for name, values in (request.arts or {}).items()
+    ]
+    for name, owner, values in [*named, (SCENE, SCENE, request.scene or {})]:  # a robot may have the scene's name
         for channel, value in values.items():
             reason = running.channels.write(owner, channel, value)
             applied += reason is None
