@@ -94,10 +94,10 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
         if found:
             chosen[key] = found
     if not chosen or not len(table):
-        wanted = " ".join(arguments.joints or ["*"])
-        close = did_you_mean(wanted, [*there, *(name.rpartition("/")[2] for name in there)])
+        wanted = arguments.joints or ["*"]
+        close = did_you_mean(wanted[0], [*there, *(name.rpartition("/")[2] for name in there)])
         raise CommandError(
-            f"{arguments.recording}: no {arguments.field} named {wanted}.{close} "
+            f"{arguments.recording}: no {arguments.field} named {' '.join(wanted)}.{close} "
             f"There are: {', '.join(there) or 'none'}"
         )
     return chosen

@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable
@@ -198,8 +199,7 @@ class Uploads:
         if missing:
             raise Refusal("bad_request", f"the upload is incomplete: {', '.join(missing[:5])} must be sent first")
         try:
-            laid_out = upload.folder.path / "model"
-            laid_out.mkdir()
+            laid_out = Path(tempfile.mkdtemp(dir=upload.folder.path))  # a file that is incomplete may have any name
             for name, file in {DOCUMENT: upload.document, **upload.assets}.items():
                 shutil.copyfile(self._cache / file.sha256, laid_out / name)
             yield laid_out / DOCUMENT, upload.step_mode
