@@ -188,6 +188,8 @@ def test_rewards_terminations_and_truncation_come_from_the_users_functions(make_
     assert np.array_equal(seen[0][2], first[0])
     assert env.step(action)[1:4] == (2.0, False, True)
     assert env.step(action)[1:4] == (3.0, True, True)
+    env.reward_fn, env.termination_fn = lambda *_: 7.0, None
+    assert env.step(action)[1:4] == (7.0, False, True)
 
 
 def test_a_reset_can_start_from_a_keyframe(make_env: MakeEnv) -> None:

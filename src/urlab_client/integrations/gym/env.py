@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Self, Unpack
 
@@ -43,13 +43,10 @@ class _Alone(OverWire):
         super().__init__(episode, 1, AutoresetMode.DISABLED)
         self.episode = episode
         self._portal = portal
-        reward_fn, termination_fn = self.reward_fn, self.termination_fn
-        if reward_fn is not None:
-            self.reward_fn = lambda before, action, after, infos: [
-                reward_fn(of_one(before), of_one(action), of_one(after), info_of(infos))
-            ]
-        if termination_fn is not None:
-            self.termination_fn = lambda after, infos: [termination_fn(of_one(after), info_of(infos))]
+
+    def _ask_user(self, function: Callable[..., Any], *trees: Any) -> Any:
+        *arrays, infos = trees
+        return function(*map(of_one, arrays), info_of(infos))
 
     async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
         return self.episode
@@ -195,6 +192,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             gymnasium.error.ResetNeeded: `reset` has not been called yet.
             ValueError: The action has the wrong shape or is not finite. Nothing was sent.
         """
+        self._alone.reward_fn, self._alone.termination_fn = self.reward_fn, self.termination_fn  # may be replaced
         observations, rewards, terminated, truncated, infos = self._alone.step(
             mapped(lambda values: np.asarray(values)[None], action)
         )

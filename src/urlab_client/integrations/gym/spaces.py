@@ -256,7 +256,8 @@ class SpaceMapping:
 
     def scaled(self, flat: Floats) -> Floats:
         """Return the set-points of all articulations, shape (…, n_actions), from actions likewise."""
-        return self._offset + self._scale * np.clip(flat, *self._clip)
+        low, high = self._clip
+        return self._offset + self._scale * np.minimum(np.maximum(flat, low), high)  # np.clip takes thrice as long
 
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Return the part of each articulation with actuators, as a view, shape (…, n_ctrl)."""

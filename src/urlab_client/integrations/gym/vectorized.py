@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, cast
 
 import gymnasium
@@ -191,28 +191,27 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         flat = self.mapping.flat(actions)  # validates before anything moves
         if flat.ndim != 2 or len(flat) != self.num_envs:
             raise ValueError(f"the actions have shape {flat.shape}; their first axis must be {self.num_envs} long")
-        next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
-        fresh, acting = (
-            (np.flatnonzero(resetting), np.flatnonzero(~resetting)) if resetting.any() else (_NONE, self._all)
-        )
+        fresh, acting = _NONE, self._all
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
+            fresh, acting = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
+        self._elapsed += 1
         errors = self._move(fresh, self._keyframe, acting, flat)
         infos = self._infos(errors)
-        stepped = np.zeros(self.num_envs, dtype=bool)
-        stepped[acting] = True
-        stepped[list(errors)] = False
-        rewards, terminated = self._judged(before, actions, stepped, infos)
-        truncated = np.zeros(self.num_envs, dtype=bool)
-        if self.max_episode_steps is not None:
-            truncated[acting] = self._elapsed[acting] >= self.max_episode_steps
-        truncated[list(errors)] = True
+        rewards, terminated = self._judged(before, actions, errors, infos)
+        if idle := [*fresh.tolist(), *errors]:
+            rewards[idle], terminated[idle] = 0.0, False
+        limit = self.max_episode_steps
+        truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self._elapsed >= limit
+        if errors:
+            truncated[list(errors)] = True
         self._ended = terminated | truncated
         self._totals += rewards
-        if self.task is not None and self._ended.any():
-            self._tell_ends(self.task, self._ended & stepped, terminated, infos)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
-            infos = self._same_step_reset(infos)
+        if self._ended.any():
+            if self.task is not None:
+                self._tell_ends(self.task, terminated, errors, infos)
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
 
     @property
@@ -255,9 +254,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
             self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
-        self._elapsed[acting] += 1
-        self._begun[moved] = True
-        self._ended[list(errors)] = True
+        if errors:
+            self._ended[list(errors)] = True
         return errors
 
     def _ask(self, task: Task, moved: Indices, acted: Indices, actions: Floats | None) -> None:
@@ -273,7 +271,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if success is not None:
             if self._success is None:
                 self._success = np.zeros(self.num_envs, dtype=bool)
-            self._success[moved] = success
+            self._success[moved], self._begun[moved] = success, True
 
     def _states(self, indices: Indices) -> States:
         """Return the states of some environments in the form passed to the task."""
@@ -283,54 +281,56 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             self._recent = self._memory.states(indices, *(values[indices] for values in self._state()))
         return self._recent
 
-    def _judged(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
-        """Return the rewards and terminations."""
-        rewards = np.zeros(self.num_envs)
-        terminated = np.zeros(self.num_envs, dtype=bool)
-        after = None
+    def _judged(
+        self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
+    ) -> tuple[Floats, Bools]:
+        """Return the rewards and terminations of all environments, whether they took the action or not."""
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
+        if self.task is not None and len(errors) < self.num_envs:  # otherwise there may be no goal
+            rewards, terminated = judged(self.task, self._states(self._all), actions)
         if self.reward_fn is not None or self.termination_fn is not None:
             after = mapped(np.copy, self._observations)
-        if self.task is not None and not infos.get("_error", terminated).all():  # otherwise there may be no goal
-            rewards, terminated = judged(self.task, self._states(self._all), actions)
-        if self.reward_fn is not None:
-            rewards[:] = self.reward_fn(before, actions, after, infos)
-        if self.termination_fn is not None:
-            terminated[:] = self.termination_fn(after, infos)
-        rewards[~stepped] = 0.0
-        return rewards, terminated & stepped
+            if self.reward_fn is not None:
+                rewards[:] = self._ask_user(self.reward_fn, before, actions, after, infos)
+            if self.termination_fn is not None:
+                terminated[:] = self._ask_user(self.termination_fn, after, infos)
+        return rewards, terminated
 
-    def _tell_ends(self, task: Task, ended: Bools, terminated: Bools, infos: dict[str, Any]) -> None:
+    def _ask_user(self, function: Callable[..., Any], *trees: Any) -> Any:
+        """Call a function for rewards or terminations of all environments; the last of `trees` are the infos."""
+        return function(*trees)
+
+    def _tell_ends(self, task: Task, terminated: Bools, errors: Mapping[int, Exception], infos: dict[str, Any]) -> None:
         states = self._states(self._all)
         success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
-        for i in np.flatnonzero(ended).tolist():
-            steps, total = int(self._elapsed[i]), float(self._totals[i])
-            task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
+        for i in np.flatnonzero(self._ended).tolist():
+            if i not in errors:
+                steps, total = int(self._elapsed[i]), float(self._totals[i])
+                task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
 
-    def _same_step_reset(self, infos: dict[str, Any]) -> dict[str, Any]:
+    def _same_step_reset(self, errors: Mapping[int, Exception], infos: dict[str, Any]) -> dict[str, Any]:
         ended = self._ended.copy()
         final = np.full(self.num_envs, None, dtype=object)
         shown = self._shown()
         for i in np.flatnonzero(ended):
             final[i] = of_one(shown, int(i))
-        errors = self._move(np.flatnonzero(ended), self._keyframe)
-        failed = np.flatnonzero(infos.get("_error", _NONE)).tolist()
-        after = self._infos({**{i: infos["error"][i] for i in failed}, **errors})
+        after = self._infos({**errors, **self._move(np.flatnonzero(ended), self._keyframe)})
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
 
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
         """Return what is known about each environment, and below `_NAME` of which ones it is."""
-        everywhere, failed = np.ones(self.num_envs, dtype=bool), np.zeros(self.num_envs, dtype=bool)
-        failed[list(errors)] = True
         infos: dict[str, Any] = {}
         for name, values in self._clocks().items():
-            infos[name], infos[f"_{name}"] = values, everywhere.copy()
-        known = self._begun & ~failed
-        if self._success is not None and known.any():
-            infos["success"], infos["_success"] = self._success & known, known
+            infos[name], infos[f"_{name}"] = values, np.ones(self.num_envs, dtype=bool)
+        if self._success is not None:
+            known = self._begun.copy()
+            known[list(errors)] = False
+            if known.any():
+                infos["success"], infos["_success"] = self._success & known, known
         if errors:
-            infos["error"], infos["_error"] = np.full(self.num_envs, None, dtype=object), failed
+            infos["error"], infos["_error"] = np.full(self.num_envs, None, dtype=object), np.zeros(self.num_envs, bool)
             for i, error in errors.items():
-                infos["error"][i] = error
+                infos["error"][i], infos["_error"][i] = error, True
         return infos
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
