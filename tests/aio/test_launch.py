@@ -373,3 +373,19 @@ def test_an_address_from_outside_may_say_what_is_allowed(address: str) -> None:
 def test_an_address_from_outside_may_say_nothing_else(address: str, named: str) -> None:
     with pytest.raises(ValueError, match=re.escape(f"the {named} is not one of those that are allowed")):
         check_address(address, models=["arm"], options=["camera-size"], servers=["tcp://localhost:5569"])
+
+
+async def test_a_start_cancelled_twice_leaves_no_process_to_the_next_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with URLabClient("sim://ball") as client:
+        transport: Any = client._transport
+        start = asyncio.create_task(client.discover())
+        await until(lambda: transport._process)
+        process, wait = transport._process, asyncio.Event()
+        monkeypatch.setattr(process, "wait", lambda *_: wait.wait())
+        start.cancel()
+        await until(lambda: process._input.closed, look=0)
+        start.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await start
+        assert transport._process is None
+        await client.discover()

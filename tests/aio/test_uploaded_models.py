@@ -209,6 +209,7 @@ REFUSED = {
     "null bytes": (zipped({**MODEL, "aXb": b""}).replace(b"aXb", b"a\0b"), "not valid everywhere"),
     "too long a name": (zipped({**MODEL, "a" * 250: b""}), "not valid everywhere"),
     "too long a path": (zipped({**MODEL, "/".join(["a" * 200] * 6): b""}), "not valid everywhere"),
+    "twice": (zipped({**MODEL, "M.XML": b""}), "one on some systems: 'M.XML'"),
     "file and folder": (zipped({**MODEL, "meshes": b""}), "damaged"),
     "no model": (zipped({"a.txt": b""}), "must have one .xml file"),
     "two models": (zipped({"a.xml": b"", "b.xml": b""}), "must have one .xml file at its top"),

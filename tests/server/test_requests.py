@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from odd_requests import every_kind, mangled, plain_request
 
@@ -242,10 +242,9 @@ def test_the_last_of_several_spellings_wins() -> None:
 
 
 def test_names_in_maps_that_differ_in_case_only_collapse() -> None:
-    lenient = {"op": "step", "later": None}
-    commands = fields(lenient | {"per_articulation": {"A": {"ctrl": [1]}, "a": {"ctrl": [2]}}}, "per_articulation")
+    commands = fields({"op": "step", "per_articulation": {"A": {"ctrl": [1]}, "a": {"ctrl": [2]}}}, "per_articulation")
     assert commands == {"a": ArticulationCommand(ctrl=[2.0])}
-    maps = fields(lenient | {"per_articulation": {"a": {"ctrl_map": {"m": 1, "M": 2}}}}, "per_articulation")
+    maps = fields({"op": "step", "per_articulation": {"a": {"ctrl_map": {"m": 1, "M": 2}}}}, "per_articulation")
     assert maps == {"a": ArticulationCommand(ctrl_map={"M": 2.0})}
 
 
@@ -459,13 +458,6 @@ def test_a_wider_struct_must_derive_from_the_declared_one() -> None:
 READER_OF_ALL = RequestReader(ops=BETA.ops)
 
 
-def names_collide(value: object) -> bool:
-    if isinstance(value, dict):
-        names = [name.lower() for name in value if isinstance(name, str)]
-        return len(set(names)) < len(names) or any(map(names_collide, value.values()))
-    return isinstance(value, (list, tuple)) and any(map(names_collide, value))
-
-
 def agree(request: dict[str, Any]) -> None:
     """Check that the direct way and the lenient one, which an unknown field calls for, read the same."""
     frames = pack(request), pack({**request, "later": None})
@@ -478,13 +470,11 @@ plain_hot_requests = st.sampled_from(HOT).flatmap(plain_request)
 
 @given(plain_hot_requests)
 def test_both_ways_agree_on_plausible_requests(request: dict[str, Any]) -> None:
-    assume(not names_collide(request))
     agree(request)
 
 
 @given(mangled(plain_hot_requests))
 def test_both_ways_agree_on_odd_requests(request: dict[str, Any]) -> None:
-    assume(not names_collide(request))
     agree(request)
 
 

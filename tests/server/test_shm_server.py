@@ -26,6 +26,7 @@ from waiting import eventually
 from urlab_client.server import SimulatedServer
 from urlab_client.server.system.temporary_folder import TemporaryFolder
 from urlab_client.server.system.threads import Health
+from urlab_client.server.transport import shared_memory
 from urlab_client.server.transport.shared_memory import RegionFile, SharedMemoryServer
 
 Rpc = Callable[..., dict[str, Any]]
@@ -409,3 +410,33 @@ def test_where_replies_cannot_be_written_zmq_goes_on_alone(
         assert shm.call({"op": "step", "session_id": session}, 0.2) is None
         eventually(lambda: not directory.exists())
     assert rpc(op="step", session_id=session)["step"] == 3
+
+
+def test_a_request_that_is_not_counted_yet_is_not_read_as_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = RegionFile(tmp_path / "req.shm", 64)
+    client = file._region
+    client.publish(b"first")
+    client.publish(b"second")
+
+    def count(_: float) -> None:
+        client._sequence[0] = 2
+
+    client._sequence[0] = 1  # as between the two stores of a client
+    monkeypatch.setattr(shared_memory.time, "sleep", count)
+    found = file.read(0)
+    assert found is not None
+    assert (found.sequence, found.payload) == (2, b"second")
+    assert file.read(found.sequence) is None, "it would be executed twice"
+    file.close()
+
+
+def test_a_writer_that_numbers_its_slots_in_another_way_is_served(tmp_path: Path) -> None:
+    file = RegionFile(tmp_path / "req.shm", 64)
+    file._region.publish(b"first")
+    file._region._sequence[0] = 2
+    found = file.read(0)
+    assert found is not None
+    assert found.payload == b"first"
+    file.close()

@@ -230,8 +230,10 @@ class LaunchedTransport(ZmqTransport):
         try:
             ready = await self._ready_line(process, op)
         except BaseException as error:  # also if cancelled: the next call starts another server
-            await process.kill()
-            self._process = None
+            try:
+                await process.kill()
+            finally:  # also if cancelled again
+                self._process = None
             if self._closed and isinstance(error, URLabError):
                 raise self._was_closed() from None
             raise

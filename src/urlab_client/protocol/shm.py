@@ -279,6 +279,10 @@ class Region:
                 return Publication(sequence, payload)
         return None
 
+    def is_counted(self, sequence: int) -> bool:
+        """Return whether what was read as publication `sequence` is that one, and not the next one, uncounted yet."""
+        return self._latest[0] == sequence % self.n_buffers and not self._is_torn(sequence)
+
     def holds(self, sequence: int) -> bool:
         """Return whether what was read since publication `sequence` came out is whole."""
         return not self._is_torn(sequence)

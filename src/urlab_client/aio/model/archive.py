@@ -1,11 +1,12 @@
 """Unpacking a ZIP archive with a model that a stranger has sent.
 
-For the compiling process, which bounds its memory and time. Names that are not valid on every system are refused.
+For the compiling process, which bounds its memory and time. What systems would unpack differently is refused.
 """
 
 from __future__ import annotations
 
 import stat
+import unicodedata
 import zipfile
 from pathlib import Path
 from typing import Final
@@ -66,8 +67,13 @@ def _check(entries: list[zipfile.ZipInfo]) -> None:
         raise _Refused(f"has {len(entries)} entries, more than {MAX_ASSETS}")
     if sum(entry.file_size for entry in entries) > _MAX_BYTES:
         raise _Refused(f"unpacks to more than {_MAX_BYTES} bytes")
+    names: set[str] = set()
     for entry in entries:
         _check_one(entry)
+        alike = unicodedata.normalize("NFC", entry.filename).casefold()
+        if alike in names and not entry.is_dir():
+            raise _Refused(f"has two files that are one on some systems: {entry.filename[:80]!r}")
+        names.add(alike)
 
 
 def _check_one(entry: zipfile.ZipInfo) -> None:

@@ -2,8 +2,7 @@
 
 For the dispatcher. msgspec decodes a `step` and a chunk of an upload directly to their structs, as our client sends
 them: they come at kilohertz rates, or with megabytes. What this strict decoder refuses, and all other ops, is read
-leniently, as the plugin does it. Both ways agree where the first one succeeds, except that only the lenient one drops
-all but the last of a map's keys that differ in letter case.
+leniently, as the plugin does it. Both ways agree where the first one succeeds.
 
 The lenient way turns a frame into plain data, and that into a struct, field by field: names in any letter case, several
 spellings of a value. A value that cannot be used counts as absent, which is `ABSENT` here. msgspec's own lax conversion
@@ -23,6 +22,7 @@ from typing import Any, Final, TypeAlias, TypeVar, Union, cast
 import msgspec
 import numpy as np
 from msgspec import NODEFAULT, UNSET, Struct, inspect
+from msgspec.structs import astuple
 
 from urlab_client.protocol.base import INT32_MAX, INT32_MIN, Op, Request
 from urlab_client.protocol.codec import building
@@ -315,7 +315,7 @@ class RequestReader:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return self._read_leniently(frame)
         op = self._hot.get(type(request))
-        if op is None:
+        if op is None or _names_collide(request):
             return self._read_leniently(frame)
         self._check_strings(op, request, frame)
         return Incoming(op.name, op, request.session_id, request)
@@ -360,6 +360,19 @@ def _strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.floa
     """Decode an array; its elements must be numbers."""
     del kind
     return np.array(msgspec.convert(value, list[float]), dtype=np.float64)
+
+
+def _names_collide(request: Struct) -> bool:
+    """Return whether a map has keys that differ only in letter case, of which only the last one counts."""
+    for value in astuple(request):  # no generators: each step takes this time
+        if type(value) is dict and value:
+            entries = cast("dict[str, object]", value)
+            if len(entries) > 1 and len({*map(str.lower, entries)}) < len(entries):
+                return True
+            for item in entries.values():
+                if isinstance(item, Struct) and _names_collide(item):
+                    return True
+    return False
 
 
 def _longest_string(value: object) -> int:
