@@ -146,6 +146,17 @@ async def test_a_killed_server_is_noticed() -> None:
         assert (await reconnections.receive()).refused is True, "another server, not another connection"
 
 
+async def test_a_server_that_has_exited_is_not_connected_although_its_connection_seems_to_be() -> None:
+    async with URLabClient("sim://ball", step_mode="direct") as client:
+        await client.discover()
+        process: Any = client._transport._process  # type: ignore[attr-defined]
+        os.kill(process.pid, signal.SIGKILL)
+        process._process.wait()  # in which the event loop learns nothing
+        with pytest.raises(ServerUnreachable, match="exited with code -9"):
+            await client.step()
+        assert not client.connected
+
+
 async def test_a_call_that_waits_for_a_connection_to_a_killed_server_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[bool] = []
     known = property(lambda process: process._process.poll() if told else None)

@@ -194,6 +194,8 @@ class LaunchedTransport(ZmqTransport):
         """
         process = self._process
         if process is None or process.returncode is not None:
+            if self.connected:
+                self._lose()  # the server's end is known before that of the connection
             if process is not None and op.request is not Hello:
                 raise self._ended(process, op)
             loop = asyncio.get_running_loop()
@@ -220,8 +222,6 @@ class LaunchedTransport(ZmqTransport):
         """Start a server, and wait until it is ready."""
         if self._closed:
             raise self._was_closed()
-        if self.connected:
-            self._lose()  # the server's end is known before that of the connection
         self._disconnect()
         if self._process is not None:
             await self._process.kill()
