@@ -129,7 +129,11 @@ async def test_pixels_are_kept_only_if_asked_for(tmp_path: Path, images: bool) -
 async def test_the_state_stream_passes(tmp_path: Path) -> None:
     with recorded(tmp_path, "beta") as relay:
         async with URLabClient(
-            f"tcp://127.0.0.1:{relay.port}", state_port=relay.state_port, step_mode="live", local_model=False
+            f"tcp://127.0.0.1:{relay.port}",
+            state_port=relay.state_port,
+            step_mode="live",
+            local_model=False,
+            live_pictures=False,
         ) as client:
             await client.discover()
             await client.runtime.set_paused(False)
