@@ -80,8 +80,8 @@ _DECODERS: Final = {
 class Run:
     """A recording on disk. Opening it reads only its index. Several threads may read.
 
-    Every method raises `OSError` if the file cannot be read, and `RecordingError` if it is no recording any more. Those
-    for a single state or picture also raise `RecordingError` if the file is damaged there.
+    Every method raises `OSError` if the file cannot be read, and `RecordingError` if it has been replaced by something
+    else. Methods for a single state or picture also raise `RecordingError` if the file is damaged there.
 
     Attributes:
         path: The file.

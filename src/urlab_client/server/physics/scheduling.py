@@ -10,6 +10,7 @@ import logging
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
@@ -224,7 +225,7 @@ class _WarningLog:
 _mujoco_warnings: _WarningLog = _WarningLog()
 
 
-class PhysicsThread:
+class PhysicsThread(ABC):
     """Iterates under the lock of a simulation until it is closed; a subclass says what an iteration does.
 
     Attributes:
@@ -279,17 +280,17 @@ class PhysicsThread:
     ) -> None:
         self.close()
 
+    @abstractmethod
     def _iterate(self) -> None:
         """Do the pending work, or wait for `_wake`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _fail(self, error: Exception) -> Refusal:
         """Note an error of an iteration, after which the thread continues, and return the refusal that reports it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _drop_queue(self, refusal: Refusal) -> None:
         """Refuse the requests that still wait."""
-        raise NotImplementedError
 
     def _run(self) -> None:
         with self.lock.inner:
