@@ -791,6 +791,24 @@ class TestInterrupt:
         """)
         assert outcome(process) == (0, ["inner cleaned up", "outer cleaned up", "interrupted 42"], "")
 
+    @pytest.mark.skipif(sys.platform == "win32", reason="signals interrupt no wait there")
+    def test_is_seen_even_if_it_did_not_interrupt_the_wait(self) -> None:
+        process = child("""
+            async def hang():
+                signal.siginterrupt(signal.SIGINT, False)  # as if it had arrived just before the caller blocked
+                os.kill(os.getpid(), signal.SIGINT)
+                await asyncio.Event().wait()
+
+            portal = Portal()
+            signal.signal(signal.SIGUSR1, lambda *_: portal.call(hang))
+            try:
+                portal.call(lambda: asyncio.sleep(signal.raise_signal(signal.SIGUSR1) or 3600))
+            except KeyboardInterrupt:
+                say("interrupted")
+            portal.close()
+        """)
+        assert outcome(process) == (0, ["interrupted"], "")
+
     def test_before_the_coroutine_has_run_leaves_it_closed(self) -> None:
         process = child("""
             def interrupted_at_once():

@@ -42,10 +42,11 @@ T = TypeVar("T")
 GRACE = 1.0
 """Seconds allowed for clean-up, of an interrupted call and in each phase of stopping a loop."""
 
-# On Windows, Ctrl-C does not interrupt a lock wait, so the wait is sliced there.
-_WAIT_SLICE = 0.1 if sys.platform == "win32" else None
+# A signal that arrives just before the main thread blocks on a lock does not interrupt the wait, and on Windows none
+# does. Python looks for signals between two waits, so each is short.
+_WAIT_SLICE = 0.1
 
-# Nor does it interrupt select() there: the main thread must not run the loop.
+# Nor does Ctrl-C interrupt select() on Windows: the main thread must not run the loop there.
 _MAIN_THREAD_DRIVES = sys.platform != "win32"
 
 # Seconds after a call until the thread runs the loop again. A hand-over costs about a hundredth of this pause.
@@ -105,7 +106,7 @@ class Job(Generic[T]):
         self.finished = False
         self._news: SimpleQueue[None] = SimpleQueue()
 
-    def wait(self, timeout: float | None = _WAIT_SLICE) -> None:
+    def wait(self, timeout: float = _WAIT_SLICE) -> None:
         """Block until the caller has something to check, at most `timeout` seconds."""
         with contextlib.suppress(Empty):
             self._news.get(timeout=timeout)
