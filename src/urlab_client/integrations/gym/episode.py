@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.arguments import text
-from urlab_client.aio.articulation import URLabArticulation
+from urlab_client.aio.articulation import URLabArticulation, compiled_prefixes
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
@@ -20,7 +20,6 @@ from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMo
 from urlab_client.errors import URLabError
 from urlab_client.integrations._variation import (
     WireVariation,
-    compiled_prefixes,
     controlled_actuators,
     server_variation,
 )
@@ -189,10 +188,12 @@ class EnvEpisode:
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
         """Return the articulation of a body, and the body's name in it."""
-        key, _, name = body.partition("/")
-        articulation = self.client.articulations[key]
-        articulation.bodies[name]
-        return articulation, name
+        meant = self.mapping.id("body", body)
+        for articulation in self.client.articulations.values():
+            for found in articulation.bodies.values():
+                if found.id == meant:
+                    return articulation, found.name
+        raise ValueError(f"push: body {body!r} belongs to no articulation")
 
     async def _delay_cameras(self, seed: int | None) -> None:
         if self._latencies:
@@ -280,7 +281,7 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
 
 def _space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
     """Return the articulations of a discovered client as the spaces of an environment."""
-    prefixes = compiled_prefixes(client)
+    prefixes = compiled_prefixes(client.articulations)
     controlled = {
         key: layout
         for key, layout in articulation_layouts(model, prefixes).items()
