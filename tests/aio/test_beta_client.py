@@ -155,7 +155,9 @@ async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str
     beta.on("set_mode", set_mode)
 
     def drive() -> str:
-        with urlab_client.URLabClient("tcp://127.0.0.1", step_port=beta.port, live_pictures=False, step_mode="direct") as client:
+        with urlab_client.URLabClient(
+            "tcp://127.0.0.1", step_port=beta.port, live_pictures=False, step_mode="direct"
+        ) as client:
             client.discover()
             assert client.step_mode is StepMode.DIRECT
             assert list(client.articulations) == ["arm_a", "arm_C_1"]

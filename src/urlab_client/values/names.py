@@ -6,10 +6,10 @@ For the wrappers of both clients, whose maps of articulations, joints and so on 
 from __future__ import annotations
 
 import difflib
-import functools
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
 T = TypeVar("T")
@@ -79,7 +79,7 @@ class UnknownName(KeyError):
         return str(self.args[0])  # a plain KeyError puts it in quotes
 
     def __reduce__(self) -> tuple[Any, ...]:
-        kind = functools.partial(type(self), owner=self.owner)
+        kind = partial(type(self), owner=self.owner)
         return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
 
 
@@ -234,7 +234,10 @@ class NameMap(PublicDir, dict[str, T]):
     def _unknown(self, name: object) -> UnknownName:
         known = tuple(self)
         matches = self._aliases.get(cast("str", name), ())
-        suggestions = difflib.get_close_matches(name, self.with_aliases()) if isinstance(name, str) else []
+        spelled = name if isinstance(name, str) else ""
+        suggestions = difflib.get_close_matches(spelled, known) or difflib.get_close_matches(
+            spelled, self.with_aliases()
+        )
         return UnknownName(self.kind, name, matches, known, tuple(suggestions), owner=self.owner)
 
     def __reduce__(self) -> tuple[Any, ...]:
