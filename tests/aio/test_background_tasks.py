@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import traceback
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -122,6 +123,10 @@ async def test_the_switching_of_cameras(caplog: pytest.LogCaptureFixture, monkey
                     with pytest.raises(URLabError, match="urlab-cameras ended unexpectedly: MemoryError") as caught:
                         await switch.settled()
                     assert isinstance(caught.value.__cause__, MemoryError)
+                    length = len(traceback.extract_tb(caught.value.__traceback__))
+                    with pytest.raises(URLabError) as again:
+                        await switch.settled()
+                    assert len(traceback.extract_tb(again.value.__traceback__)) == length, "it grows"
             async with view.frames():
                 await switch.settled()
                 assert switch.is_on(view.info)

@@ -130,7 +130,9 @@ async def test_a_state_port_that_is_given_is_not_replaced_by_the_announced_one(
         assert (parameter.default, repr(parameter.default)) == (5555, "5555"), "help() shows a number"
 
 
-async def test_robots_listed_as_entities(beta: ScriptedBeta) -> None:
+@pytest.mark.parametrize("flavour", ["async", "blocking"])
+@pytest.mark.parametrize("word", ["stepped", "mirror"])
+async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str, word: str) -> None:
     """Beta statement 78."""
 
     def hello(request: dict[str, Any]) -> dict[str, Any]:
@@ -138,23 +140,43 @@ async def test_robots_listed_as_entities(beta: ScriptedBeta) -> None:
         robots = [{**robot, "id": 1.0} for robot in reply.pop("articulations")]
         for robot in robots:
             del robot["default_control_mode"]
-        return {**reply, "entities": [*robots, {"id": 9.0, "has_free_base": True}]}
+        prop = {"id": 9.0, "has_free_base": True, "actor_name": "Crate_0"}
+        return {**reply, "entities": [robots[0], prop, *robots[1:]]}
 
     def set_mode(request: dict[str, Any]) -> dict[str, Any]:
         if request["mode"] not in {"freerun", "stepped", "statepushed"}:
             return error("bad_mode", request["mode"])
         beta.mode = "direct"
-        return {"op": "set_mode_ok", "previous_mode": "freerun", "current_mode": request["mode"]}
+        return {"op": "set_mode_ok", "previous_mode": "freerun", "current_mode": word}
 
     beta.on("hello", hello)
+    listed = beta.answers["meta"]({})["ops"]
+    beta.on("meta", {"op": "meta_ok", "ops": [op for op in listed if op["name"] != "set_control_source"]})
     beta.on("set_mode", set_mode)
-    async with client_of(beta, step_mode="direct") as client:
-        await client.discover()
-        assert client.step_mode is StepMode.DIRECT
-        assert list(client.articulations) == ["arm_a", "arm_C_1"]
-        client.articulations["arm_a"].set_ctrl({"m": 0.5})
-        await client.step()
-        assert beta.ctrl["arm_C_0"] == [0.5]
+
+    def drive() -> str:
+        with urlab_client.URLabClient(
+            "tcp://127.0.0.1", step_port=beta.port, live_pictures=False, step_mode="direct"
+        ) as client:
+            client.discover()
+            assert client.step_mode is StepMode.DIRECT
+            assert list(client.articulations) == ["arm_a", "arm_C_1"]
+            client.articulations["arm_a"].set_ctrl({"m": 0.5})
+            client.step()
+            return str(client.explain())
+
+    if flavour == "blocking":
+        said = await asyncio.to_thread(drive)
+    else:
+        async with client_of(beta, step_mode="direct") as client:
+            await client.discover()
+            assert client.step_mode is StepMode.DIRECT
+            assert list(client.articulations) == ["arm_a", "arm_C_1"]
+            client.articulations["arm_a"].set_ctrl({"m": 0.5})
+            await client.step()
+            said = str(await client.explain())
+    assert beta.ctrl["arm_C_0"] == [0.5]
+    assert "urlab/0.2, generation 3," in said
 
 
 async def test_further_fields_of_an_error_are_kept(client: URLabClient, beta: ScriptedBeta) -> None:

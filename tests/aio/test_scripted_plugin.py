@@ -419,9 +419,9 @@ async def test_keyframes_by_their_short_name(plugin: Any, connect: Any) -> None:
         await client.discover()
         await client.reset(keyframe_name="squat")
         assert plugin.requests[-1]["keyframe_name"] == "robot_2_squat"
-        with pytest.raises(UnknownKeyframe, match="could mean robot_home, arm_C_0_home"):
+        with pytest.raises(UnknownKeyframe, match="could mean 'robot_home' or 'arm_C_0_home'"):
             await client.reset(keyframe_name="home")
-        with pytest.raises(UnknownKeyframe, match="the keyframes are: robot_home, arm_C_0_home, robot_2_squat"):
+        with pytest.raises(UnknownKeyframe, match="Known: 'robot_home', 'arm_C_0_home' and 'robot_2_squat'"):
             await client.reset(keyframe_name="sleep")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
+from typing import Literal
 
 import pytest
 
@@ -19,15 +21,17 @@ CART = """
 </worldbody></mujoco>"""
 
 
-@pytest.fixture(scope="module", params=["alpha", "beta"])
+@pytest.fixture(scope="module", params=[(d, n) for d in ("alpha", "beta") for n in ("plugin", "model")], ids=str)
 def client(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[URLabClient]:
-    dialect: DialectName = request.param
+    dialect: DialectName
+    naming: Literal["model", "plugin"]
+    dialect, naming = request.param
     folder = tmp_path_factory.mktemp("carts")
     models = [folder / "my-cart.xml", folder / "other.xml"]
     for model in models:
         model.write_text(CART)
     with (
-        SimulatedServer(*models, play=True, dialect=dialect, actor_names="plugin") as server,
+        SimulatedServer(*models, play=True, dialect=dialect, actor_names=naming) as server,
         URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
         client.discover()
@@ -42,8 +46,8 @@ def names(client: URLabClient) -> list[str]:
 
 
 def test_bodies(client: URLabClient) -> None:
-    for number, robot in enumerate(names(client)):
-        written = f"{robot}_goal"
+    for number, (robot, between) in enumerate(itertools.product(names(client), "_/")):
+        written = f"{robot}{between}goal"
         pose = client.runtime.set_mocap_pose(written, pos=(number, 0, 0))
         assert (pose.body, pose.pos[0]) == (written, number)
         assert client.runtime.read_mocap_pose(written) == pose
@@ -53,11 +57,20 @@ def test_bodies(client: URLabClient) -> None:
         client.runtime.read_mocap_pose("nobody_goal")
 
 
+def test_elements(client: URLabClient) -> None:
+    robot = client.articulations["my-cart"]
+    [(name, joint)] = robot.joints.items()
+    for called, between in itertools.product(names(client), "_/"):
+        assert robot.joints[f"{called}{between}{name}"] is joint
+        assert robot.bodies[f"{called}{between}load"] is robot.bodies["load"]
+        assert client.entities[called] is client.articulations[called] is robot
+
+
 def test_contacts(client: URLabClient) -> None:
     compiled = client.articulations["my-cart"].compiled_prefix
     for robot in names(client):
-        found = client.runtime.get_contacts(body1=f"{robot}_load", geom2=f"{robot}_top")
-        assert {(c.body1, c.geom2) for c in found.contacts} == {(f"{robot}_load", f"{robot}_top")}
+        found = client.runtime.get_contacts(body1=f"{robot}_load", geom2=f"{robot}/top")
+        assert {(c.body1, c.geom2) for c in found.contacts} == {(f"{robot}_load", f"{robot}/top")}
         assert {(c.geom1, c.body2) for c in found.contacts} == {(f"{compiled}_box", f"{compiled}_deck")}
     assert len(client.runtime.get_contacts().contacts) == 2 * len(found.contacts)
     assert not client.runtime.get_contacts(body1="nobody_deck").contacts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -76,6 +77,28 @@ def test_what_cannot_be_tried(capsys: pytest.CaptureFixture[str]) -> None:
     assert "connection refused" in capsys.readouterr().err
     assert main(["conformance", "--statement", "Beta 320"]) == 2
     assert "'Beta 320' is not a statement. Did you mean" in capsys.readouterr().err
+
+
+def test_nothing_tried_is_no_success(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", address, "--statement", "Beta 9"]) == 2  # which needs --play
+    captured = capsys.readouterr()
+    assert "0 hold, 0 differ" in captured.out
+    assert "nothing was tried" in captured.err
+
+
+def test_long_lines_are_folded_at_a_terminal(
+    address: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def table() -> str:
+        assert main(["conformance", address, "--only", "robot"]) == 0
+        return capsys.readouterr().out.partition("tcp://")[0]
+
+    plain = table()
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    folded = table()
+    assert max(map(len, plain.splitlines())) > 80 >= max(map(len, folded.splitlines()))
+    assert folded.split() == plain.split()
 
 
 def test_play_is_measured(address: str, capsys: pytest.CaptureFixture[str]) -> None:

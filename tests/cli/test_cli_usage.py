@@ -155,6 +155,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["demo", "--steps", "-5"], ["--steps", "'-5'"]),
         (["evaluate", "walk.onnx", "--seed", "-1"], ["--seed", "'-1'", "at least 0"]),
         (["teleop", "--seed", "-1"], ["--seed", "'-1'", "at least 0"]),
+        (["evaluate", "walk.onnx", "--seed", "abc"], ["--seed", "'abc'", "a whole number"]),
         (["view", "--max-hz", "0"], ["--max-hz", "'0'", "per second"]),
         (["record", "sim://arm", "a.mcap", "--step-mode", "puppet"], ["--step-mode", "puppet", "live"]),
     ],

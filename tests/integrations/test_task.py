@@ -28,6 +28,7 @@ from urlab_client.integrations.gym import (
 )
 from urlab_client.integrations.gym.spaces import FIELDS
 from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.values.names import NameMap
 
 STEPPED: Any = {"play": True, "step_mode": "direct"}
 """Options of a server that does not go on in live mode after its clients have closed."""
@@ -274,7 +275,7 @@ def test_an_argument_wins_over_the_task_and_what_is_judged_needs_not_be_observed
             assert ours[1][0] == theirs[1] == expected[2][0] < 0
             single.close()
     with pytest.raises(ValueError, match=r"'sensors' is not observed: .*observations=\['qpos'\]"):
-        SpaceMapping(whole.model, {"arm": "arm_"}, ["qpos"]).field(np.zeros(8), "arm", "sensors")
+        SpaceMapping(whole.model, NameMap({"arm": "arm_"}), ["qpos"]).field(np.zeros(8), "arm", "sensors")
 
 
 @pytest.mark.usefixtures("opengl")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client.values.names import NameMap, UnknownName, element_ids, owner_of, split_prefix
+from urlab_client.values.names import NameMap, UnknownName, element_ids, owner_of, robot_prefixes, split_prefix
 
 
 def two_robots_and_an_arm() -> NameMap[int]:
@@ -221,12 +221,13 @@ class TestPrefixes:
 
 def test_elements_are_found_by_readable_names_whatever_compiled_names_begin_with() -> None:
     compiled = ["world", "arm_C_0_hand", "arm_C_0_2_hand", "", "Cube_MjBody"]
-    bodies = element_ids(compiled, {"arm": "arm_C_0", "arm_2": "arm_C_0_2"}, "body")
+    robots = robot_prefixes([("arm", "", "arm_C_0"), ("arm_2", "", "arm_C_0_2")])
+    bodies = element_ids(compiled, robots, "body")
     assert [*bodies] == ["world", "arm_C_0_hand", "arm_C_0_2_hand", "Cube_MjBody"]
     for written in ("arm/hand", "arm_hand", "arm_C_0/hand", "arm_C_0_hand"):
         assert bodies[written] == 1
     assert (bodies["arm_2/hand"], bodies["Cube/MjBody"]) == (2, 4)
     with pytest.raises(UnknownName, match=r"^no body 'arm/2_hand'\. "):
         bodies["arm/2_hand"]
-    shared = element_ids(["left_hand", "hand"], {"left": "left"}, "site")
+    shared = element_ids(["left_hand", "hand"], robot_prefixes([("left", "", "left")]), "site")
     assert (shared["left/hand"], shared["hand"]) == (0, 1)

@@ -103,6 +103,11 @@ def test_a_model_is_sent_and_spawned(wire: Wire) -> None:
             for name in ("a/b.stl", "..", "", "a\\b.stl", "C:x.stl", "model.xml", "Model.XML", "nul.stl", "a\nb")
         ),
         ({"assets": [{"name": "a.stl", "sha256": "0" * 63, "size": 0}]}, "bad_request"),
+        # One file on some systems, with the content of either.
+        (
+            {"assets": [{"name": n, "sha256": digest(n.encode()), "size": 5} for n in ("a.stl", "A.STL")]},
+            "bad_request",
+        ),
         ({"assets": [{"name": "a.stl", "sha256": digest(b""), "size": 2**27}]}, "payload_too_large"),
         ({"assets": [{"name": "a.stl", "sha256": digest(b""), "size": -1}]}, "payload_too_large"),
         (
@@ -116,6 +121,12 @@ def test_manifests_that_are_refused(wire: Wire, tmp_path: Path, change: dict[str
     """Beta statement 58."""
     assert wire.refused("upload_model_manifest", **{**manifest(), **change}) == code
     assert not list(tmp_path.glob("saved/Uploads/.upload-*"))
+
+
+def test_names_that_differ_in_letter_case_may_mean_the_same_content(wire: Wire) -> None:
+    assets = [{"name": name, "sha256": digest(b"same"), "size": 4} for name in ("a.stl", "A.stl")]
+    opened = wire.ask("upload_model_manifest", **{**manifest(), "assets": assets, "total_bytes": len(XML) + 4})
+    assert opened["need_assets"] == ["a.stl", "A.stl"]
 
 
 def test_uploads_that_are_open(wire: Wire, server: SimulatedServer) -> None:

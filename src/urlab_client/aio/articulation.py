@@ -375,6 +375,11 @@ class LocalArticulation(URLabEntity):
         self._state.drive()
 
 
+def compiled_prefixes(robots: NameMap[Any]) -> NameMap[str]:
+    """Return the `compiled_prefix` of each articulation, to look up elements of the compiled model."""
+    return robots.over({key: robot.compiled_prefix for key, robot in robots.items()})
+
+
 class URLabArticulation(LocalArticulation):
     """A robot imported from MJCF.
 

@@ -172,7 +172,7 @@ def _versions(session: Session, state: SimState) -> Finding:
     hello, mirror = state.hello, state.mirror
     assert hello is not None  # noqa: S101  # checked by the caller
     generation = session.features.generation
-    which = f"{hello.urlab_version} ({generation})" if generation else hello.urlab_version
+    which = f"{hello.urlab_version}, generation {generation}," if generation else hello.urlab_version
     server = f"{which} with MuJoCo {hello.mujoco_version}"
     if mirror.approximate:
         text = f"The server runs {server}; the local model was compiled here and only approximates the server's."

@@ -346,7 +346,7 @@ _KINDS: Final[Kinds] = {
     "WxH": image_size,
     "PORT": _whole(0, 65535, "a port is a whole number from 0 (any free one) to 65535"),
     "INDEX": _whole(0, 5000, "an index is a whole number from 0 to 5000"),
-    "SEED": _whole(0, 2**63, "a seed must be at least 0"),
+    "SEED": _whole(0, 2**63, "a seed is a whole number, at least 0"),
     "N": _whole(1, 10**9, "give a whole number above 0"),
     **dict.fromkeys(("S", "SECONDS"), _positive("give a number of seconds above 0")),
     **dict.fromkeys(("HZ", "M/S", "RAD/S"), _positive("give a number per second, above 0")),

@@ -10,8 +10,10 @@ differs, with 1 if something does, and with 2 if the server cannot be checked.
 from __future__ import annotations
 
 import asyncio
+import shutil
 import sys
 import tempfile
+import textwrap
 from argparse import Namespace
 from typing import Final
 from urllib.parse import urlencode
@@ -69,6 +71,7 @@ urlab conformance --play --author --bundle report.zip  everything; keep a file t
 urlab conformance sim://arm --play --html report.html  the same on a simulated server, as one page
 """
 _FAILED: Final = 2
+_WHAT: Final = "what was checked"
 
 
 def run(arguments: Namespace) -> int:
@@ -81,7 +84,11 @@ def run(arguments: Namespace) -> int:
     with sigterm_interrupts():
         bench, report = asyncio.run(_check(arguments, choice))
     _write(arguments, bench, report)
-    return 1 if report.differing else _FAILED if report.stopped else 0
+    if report.differing:
+        return 1
+    if report.stopped or any(row.verdict is Verdict.HOLDS for row in report.statements):
+        return _FAILED if report.stopped else 0
+    raise CommandError("nothing was tried: no check that was chosen could run on this server; --all says why")
 
 
 def _choice(arguments: Namespace) -> Choice:
@@ -146,10 +153,18 @@ def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
     _print(arguments, report)
 
 
+def _folded(table: str) -> str:
+    """Return a table whose last column is folded at a terminal."""
+    if not sys.stdout.isatty():
+        return table
+    columns, below = shutil.get_terminal_size().columns, " " * table.index(_WHAT)
+    return "\n".join(textwrap.fill(line, columns, subsequent_indent=below) for line in table.splitlines())
+
+
 def _print(arguments: Namespace, report: Report) -> None:
     shown = [row for row in differences_first(report) if row.verdict is not Verdict.NOT_TRIED or arguments.all]
     rows = [(row.id, WORDS[row.verdict], row.detail) for row in shown]
-    print(aligned([("statement", "verdict", "what was checked"), *rows]))
+    print(_folded(aligned([("statement", "verdict", _WHAT), *rows])))
     server = report.server
     generation = f", generation {server['generation']}" if server["generation"] else ""
     print(f"{server['address']}: {server['urlab_version']}{generation}, MuJoCo {server['mujoco_version']}")

@@ -21,6 +21,7 @@ import anyio.to_thread
 import msgspec
 import numpy as np
 
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.protocol.messages.streams import StateSnapshot
 
@@ -144,7 +145,7 @@ class MujocoViewer:
         if model is None:
             return None
         if self._shown is None or self._shown.model is not model:
-            prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
+            prefixes = compiled_prefixes(self._client.articulations)
             self._shown = await anyio.to_thread.run_sync(_prepare, model, prefixes)
             self._written = self._placed = None
         return self._shown

@@ -19,6 +19,7 @@ import anyio.to_thread
 import numpy as np
 from msgspec import Struct
 
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.aio.model.mirror import require_local
 from urlab_client.console.messages import ReplayView
@@ -254,7 +255,7 @@ class Replay:
         if self._before is None or model is None or data is None or time.monotonic() - self._placed_at < _PLACED_S:
             return
         self._placed_at = time.monotonic()
-        prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
+        prefixes = compiled_prefixes(self._client.articulations)
         for key, layout in articulation_layouts(model, prefixes).items():
             robot = self._robots.get(key)
             values = None if robot is None or self._state is None else _values(self._state, robot)

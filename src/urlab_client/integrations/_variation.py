@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
@@ -30,7 +31,7 @@ def server_variation(
     declared = declared_in(model)
     if declared is None:
         return None
-    return Variation(declared, model, controlled_actuators(client, layouts), compiled_prefixes(client))
+    return Variation(declared, model, controlled_actuators(client, layouts), compiled_prefixes(client.articulations))
 
 
 def wire_variation(client: URLabClient) -> WireVariation | None:
@@ -67,7 +68,7 @@ class WireVariation(ClientObserver):
 
         self.declaration = declared
         self.draws: EpisodeDraws | None = None
-        controlled, prefixes = controlled_actuators(client, layouts), compiled_prefixes(client)
+        controlled, prefixes = controlled_actuators(client, layouts), compiled_prefixes(client.articulations)
 
         def settable(vary: Vary) -> bool:
             if vary.what in ("kp", "kv"):
@@ -134,8 +135,3 @@ def controlled_actuators(client: URLabClient, layouts: Mapping[str, Articulation
         if controller is not None and controller.kind == ControllerKind.PD:
             controlled.update(layout.actuators[name] for name in controller.params["kp"])
     return frozenset(controlled)
-
-
-def compiled_prefixes(client: URLabClient) -> dict[str, str]:
-    """Return what the names of an articulation's elements begin with in the compiled model, by its key."""
-    return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}

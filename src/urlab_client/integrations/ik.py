@@ -18,6 +18,7 @@ from urlab_client._installation import need
 from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, finite_array
 from urlab_client.aio.articulation import URLabArticulation as AsyncArticulation
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.mirror import require_local
@@ -25,7 +26,7 @@ from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.names import split_prefix, unknown_name
+from urlab_client.values.names import NameMap, own_aliases, split_prefix, unknown_name
 from urlab_client.values.plain import Serializable
 
 need("mink", extra="teleop")
@@ -125,7 +126,7 @@ class InverseKinematics:
         kind, name = ("site", site) if site is not None else ("body", body or "")
         self.frame: str = name
         self._kind = kind
-        self._id = self._robot.bodies[name].id if kind == "body" else _frame_id(client, self._robot, name)
+        self._id = self._robot.bodies[name].id if kind == "body" else own_sites(client, self._robot)[name]
         root = int(model.site_bodyid[self._id]) if kind == "site" else self._id
         held = _held(self._robot, _chain(model, root), None if joints is None else [*joints], f"{kind} {name!r}")
         self.joints: tuple[str, ...] = tuple(held)
@@ -378,19 +379,13 @@ def hand_frames(
     return sites or [{"body": name} for i, name in moved.items() if int(model.body_parentid[i]) not in moved]
 
 
-def own_sites(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation) -> dict[str, int]:
+def own_sites(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation) -> NameMap[int]:
     """Return the ids of a robot's sites by their short names; empty without a local model."""
+    prefixes = compiled_prefixes(client.articulations)
     names = [] if client.model is None else model_names(client.model, "site")
-    owned = split_prefix(names, {art.compiled_prefix for art in client.articulations.values()})
-    return {name: i for i, (owner, name) in enumerate(owned) if owner == robot.compiled_prefix}
-
-
-def _frame_id(client: URLabClient | AsyncClient, robot: URLabArticulation | AsyncArticulation, site: str) -> int:
-    sites = own_sites(client, robot)
-    found = sites.get(site, sites.get(site.removeprefix(f"{robot.compiled_prefix}_")))
-    if found is None:
-        raise unknown_name("site", site, sites, owner=robot.name)
-    return found
+    owned = enumerate(split_prefix(names, [*prefixes.values()]))
+    ids = {name: i for i, (owner, name) in owned if owner == robot.compiled_prefix}
+    return NameMap(ids, own_aliases([*ids], robot.compiled_prefix, prefixes), "site", robot.name)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from urlab_client._mujoco import model_names
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Vary
-from urlab_client.values.names import spellings
+from urlab_client.values.names import NameMap, spellings
 
 Ints = NDArray[np.intp]
 Fields = Callable[[str], NDArray[Any]]
@@ -67,7 +67,7 @@ class Elements:
     names: tuple[str, ...]
 
 
-def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int], prefixes: Mapping[str, str]) -> Elements:
+def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int], prefixes: NameMap[str]) -> Elements:
     """Return the elements whose quantity varies; there must be one.
 
     A geom is found by its own name or its body's, a free joint likewise. `controlled` are the actuators that a

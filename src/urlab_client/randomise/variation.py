@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, Final
 
 import mujoco
@@ -15,6 +14,9 @@ from numpy.typing import NDArray
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation, Range, Vary
 from urlab_client.randomise.quantities import DERIVED_FROM, QUANTITIES, START, Elements, Fields, elements_of, write
+from urlab_client.values.names import NameMap
+
+_NO_ROBOTS: Final[NameMap[str]] = NameMap()
 
 MODEL_STREAM, NOISE_STREAM, PUSH_STREAM, DELAY_STREAM, DROP_STREAM = range(5)
 """What follows the episode's seed in the seeds of the random streams, by part of the declaration."""
@@ -104,7 +106,7 @@ class Variation:
         declaration: Randomisation,
         model: mujoco.MjModel,
         controlled: frozenset[int] = frozenset(),
-        prefixes: Mapping[str, str] = MappingProxyType({}),
+        prefixes: NameMap[str] = _NO_ROBOTS,
     ) -> None:
         """Find the elements that vary.
 
@@ -112,7 +114,7 @@ class Variation:
             declaration: The declaration.
             model: The compiled scene without variation; the varying fields are copied.
             controlled: Actuators that a controller with gains drives.
-            prefixes: Prefix of the compiled element names of each articulation, by key.
+            prefixes: Prefix of the compiled element names of each articulation, by key, with its aliases.
 
         Raises:
             ValueError: A name matches no element.

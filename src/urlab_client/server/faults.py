@@ -35,7 +35,8 @@ NEVER_USED: Final = 0xC1
 class Fault:
     """Base class of the faults below: what goes wrong, and which messages are affected.
 
-    A fault affects requests, of one op or of all. With `topic` it affects published messages instead.
+    A fault affects requests, of one op or of all. With `topic` it affects published messages instead. A subclass whose
+    methods raise ends the thread of the server that asks it, and clients are told so.
 
     Attributes:
         op: Name of the op whose requests are affected; None for every op.

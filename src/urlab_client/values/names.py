@@ -6,10 +6,10 @@ For the wrappers of both clients, whose maps of articulations, joints and so on 
 from __future__ import annotations
 
 import difflib
-import functools
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar, cast, overload
 
 T = TypeVar("T")
@@ -21,6 +21,8 @@ WINDOWS_DEVICES: Final = frozenset(
 """Names that Windows keeps for devices, whatever follows their first dot."""
 
 _LISTED = 20
+# Unreal's actor names: class, then a number or a generated id.
+_ENGINE_NAME: Final = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 _NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
 _MAX_FILE_NAME_BYTES: Final = 240
 
@@ -77,7 +79,7 @@ class UnknownName(KeyError):
         return str(self.args[0])  # a plain KeyError puts it in quotes
 
     def __reduce__(self) -> tuple[Any, ...]:
-        kind = functools.partial(type(self), owner=self.owner)
+        kind = partial(type(self), owner=self.owner)
         return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
 
 
@@ -182,6 +184,26 @@ class NameMap(PublicDir, dict[str, T]):
         """The keys that each alias stands for; aliases that are also keys are left out."""
         return dict(self._aliases)
 
+    def with_aliases(self) -> dict[str, T]:
+        """Return the entries by key, then again by each alias that means one of them."""
+        return {**self, **{alias: self[keys[0]] for alias, keys in self._aliases.items() if len(keys) == 1}}
+
+    def over(self, entries: Mapping[str, D]) -> NameMap[D]:
+        """Return a map of other entries for these keys, or some of them, which the same aliases mean."""
+        known = {alias: keys for alias, keys in self._aliases.items() if entries.keys() >= {*keys}}
+        return NameMap(entries, known, self.kind, self.owner)
+
+    def key(self, name: str) -> str:
+        """Return the key that `name` is or, as an alias, means.
+
+        Raises:
+            UnknownName: There is none, or more than one.
+        """
+        found = self._key(name)
+        if found is None:
+            raise self._unknown(name)
+        return found
+
     def _key(self, name: object) -> str | None:
         """Return the key that `name` or its alias means, None when there is none or more than one."""
         if super().__contains__(name):
@@ -193,10 +215,7 @@ class NameMap(PublicDir, dict[str, T]):
                 return None
 
     def __missing__(self, name: str) -> T:
-        key = self._key(name)
-        if key is None:
-            raise self._unknown(name)
-        return super().__getitem__(key)
+        return super().__getitem__(self.key(name))
 
     def __contains__(self, name: object) -> bool:
         return self._key(name) is not None
@@ -215,8 +234,10 @@ class NameMap(PublicDir, dict[str, T]):
     def _unknown(self, name: object) -> UnknownName:
         known = tuple(self)
         matches = self._aliases.get(cast("str", name), ())
-        unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
-        suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
+        spelled = name if isinstance(name, str) else ""
+        suggestions = difflib.get_close_matches(spelled, known) or difflib.get_close_matches(
+            spelled, self.with_aliases()
+        )
         return UnknownName(self.kind, name, matches, known, tuple(suggestions), owner=self.owner)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -224,7 +245,7 @@ class NameMap(PublicDir, dict[str, T]):
 
     def _ipython_key_completions_(self) -> list[str]:
         """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""
-        return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
+        return [*self.with_aliases()]
 
     def _repr_html_(self) -> str:
         from urlab_client.values.html import fields  # NumPy, which the command line loads late
@@ -267,52 +288,75 @@ def split_prefix(names: Iterable[str], prefixes: Collection[str]) -> list[tuple[
     return [(owner, name if owner is None else name[len(owner) + 1 :]) for owner, name in owned]
 
 
-def names_meant(name: str, names: Collection[str], prefixes: Mapping[str, str]) -> list[str]:
-    """Return the compiled names that a user may mean by a name: that very name or, without one, those of any robot.
+def robot_prefixes(robots: Iterable[tuple[str, str, str]]) -> NameMap[str]:
+    """Return what the compiled names of robots' elements begin with, without the underscore, by the robots' keys.
+
+    Aliases are what else users may call a robot: its actor id, what its compiled names begin with or, where that means
+    no other robot, its class.
 
     Args:
-        name: A compiled name, the name that an articulation's author gave, or that with the articulation's key and `_`
-            in front.
-        names: The names in the compiled model.
-        prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
+        robots: Per robot its key, its actor id or "", and what its compiled names begin with.
     """
-    if name in names:
-        return [name]
-    local = {f"{prefix}_{name}" for prefix in prefixes.values()}
-    keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
-    return [found for found in names if found in local | keyed]
+    prefixes: dict[str, str] = {}
+    aliases: dict[str, list[str]] = {}
+    classes: dict[str, list[str]] = {}
+    for key, actor_id, prefix in robots:
+        prefixes[key] = prefix
+        for alias in {actor_id, prefix} - {""}:
+            aliases.setdefault(alias, []).append(key)
+        if found := _ENGINE_NAME.fullmatch(prefix):
+            classes.setdefault(found["stem"], []).append(key)
+    return NameMap(prefixes, classes | aliases, kind="articulation")
 
 
-def spellings(names: Iterable[str], prefixes: Mapping[str, str]) -> list[tuple[str, ...]]:
+def spellings(names: Sequence[str], prefixes: NameMap[str]) -> list[tuple[str, ...]]:
     """Return what users may write for the elements of a compiled model.
 
     Args:
         names: Compiled names.
-        prefixes: As in `names_meant`.
+        prefixes: As from `robot_prefixes`.
 
     Returns:
-        Per name, in order, the name itself, then `ARTICULATION/NAME` by the articulation's key and by its prefix, and
-        `ARTICULATION_NAME` by its key. Where an element belongs to none, any underscore may be written as the slash.
+        Per name, in order, the name itself, then `ROBOT/NAME` and `ROBOT_NAME` by every name that means the robot.
+        Where an element belongs to none, any underscore may be written as the slash.
     """
-    keys = {prefix: key for key, prefix in prefixes.items()}
+    called: dict[str, list[str]] = {prefix: [prefix] for prefix in prefixes.values()}
+    for robot, prefix in prefixes.with_aliases().items():
+        called[prefix].append(robot)
     found: list[tuple[str, ...]] = []
-    for owner, local in split_prefix(names, keys):
+    for name, (owner, local) in zip(names, split_prefix(names, called), strict=True):
         if owner is None:
-            cuts = (i for i, character in enumerate(local) if character == "_")
-            found.append((local, *(f"{local[:i]}/{local[i + 1 :]}" for i in cuts)))
+            cuts = (i for i, character in enumerate(name) if character == "_")
+            others = [f"{name[:i]}/{name[i + 1 :]}" for i in cuts]
         else:
-            key = keys[owner]
-            found.append((f"{owner}_{local}", f"{key}/{local}", f"{owner}/{local}", f"{key}_{local}"))
+            others = [f"{robot}{between}{local}" for between in "/_" for robot in called[owner]]
+        found.append(tuple(dict.fromkeys((name, *others))))
     return found
 
 
-def element_ids(names: Iterable[str], prefixes: Mapping[str, str], kind: str) -> NameMap[int]:
-    """Return the ids of the named elements of one kind by compiled name, with their other `spellings` as aliases."""
+def own_aliases(names: Sequence[str], prefix: str, prefixes: NameMap[str]) -> dict[str, list[str]]:
+    """Return what else users may write for the elements of one robot, each with the name that means it.
+
+    Args:
+        names: What the robot itself calls its elements.
+        prefix: What its compiled names begin with.
+        prefixes: As from `robot_prefixes`.
+    """
+    written = spellings([f"{prefix}_{name}" for name in names], prefixes)
+    return {alias: [name] for name, others in zip(names, written, strict=True) for alias in others}
+
+
+def element_ids(names: Sequence[str], prefixes: NameMap[str], kind: str) -> NameMap[int]:
+    """Return the ids of the named elements of one kind by compiled name.
+
+    Aliases are their other `spellings`, and what a robot itself calls its element: `NAME`.
+    """
     ids: dict[str, int] = {}
     aliases: dict[str, list[str]] = {}
-    for i, (name, *others) in enumerate(spellings(names, prefixes)):
+    owned = split_prefix(names, [*prefixes.values()])
+    for i, ((name, *others), (_, local)) in enumerate(zip(spellings(names, prefixes), owned, strict=True)):
         if name:
             ids[name] = i
-            for other in others:
+            for other in (*others, local):
                 aliases.setdefault(other, []).append(name)
     return NameMap(ids, aliases, kind)

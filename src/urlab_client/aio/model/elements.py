@@ -29,7 +29,6 @@ from urlab_client.aio.model.layout import (
 )
 from urlab_client.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.messages.session import ArticulationInfo
 from urlab_client.values.descriptions import (
     ActuatorDescription,
     JointDescription,
@@ -37,7 +36,7 @@ from urlab_client.values.descriptions import (
     SensorDescription,
     SetPointMeaning,
 )
-from urlab_client.values.names import NameMap, PublicDir
+from urlab_client.values.names import NameMap, PublicDir, own_aliases
 
 if TYPE_CHECKING:
     import mujoco
@@ -364,10 +363,10 @@ def elements_of(record: MirroredArticulation) -> ArticulationElements:
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
     bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
     record.elements = ArticulationElements(
-        joints=_named(record.info, "joint", _joints(record, model), original.joints),
-        actuators=_named(record.info, "actuator", _actuators(record, model), original.actuators),
-        sensors=_named(record.info, "sensor", _sensors(record, model), original.sensors),
-        bodies=_named(record.info, "body", bodies, original.bodies),
+        joints=_named(record, "joint", _joints(record, model), original.joints),
+        actuators=_named(record, "actuator", _actuators(record, model), original.actuators),
+        sensors=_named(record, "sensor", _sensors(record, model), original.sensors),
+        bodies=_named(record, "body", bodies, original.bodies),
     )
     return record.elements
 
@@ -375,13 +374,13 @@ def elements_of(record: MirroredArticulation) -> ArticulationElements:
 H = TypeVar("H", Actuator, Joint, Sensor, Body)
 
 
-def _named(info: ArticulationInfo, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
+def _named(record: MirroredArticulation, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
     by_name = {item.name: item for item in items}
-    aliases = {f"{prefix}_{name}": [name] for name in by_name for prefix in {info.compiled_prefix, info.prefix}}
+    aliases = own_aliases([*by_name], record.info.compiled_prefix, record.mirror.prefixes)
     for live, authored in original.items():
         if live in by_name:
             aliases.setdefault(authored, []).append(live)
-    return NameMap(by_name, aliases, kind=kind, owner=info.prefix)
+    return NameMap(by_name, aliases, kind=kind, owner=record.name)
 
 
 def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:

@@ -22,7 +22,7 @@ from urlab_client._mujoco import (
     spans,
 )
 from urlab_client.values.descriptions import JointKind, SetPointMeaning
-from urlab_client.values.names import split_prefix
+from urlab_client.values.names import NameMap, element_ids, split_prefix
 
 if TYPE_CHECKING:
     import mujoco
@@ -77,6 +77,17 @@ def articulation_layouts(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> 
         key: _layout(model, bodies[prefix], joints[prefix], actuators[prefix], sensors[prefix])
         for key, prefix in prefixes.items()
     }
+
+
+def compiled_ids(model: mujoco.MjModel, kind: str, prefixes: NameMap[str]) -> NameMap[int]:
+    """Return the ids of the elements of a kind, such as `body`, by all that users may write for them.
+
+    Args:
+        model: The compiled model.
+        kind: A kind of `model_names`.
+        prefixes: What the compiled names of each articulation's elements begin with, by key.
+    """
+    return element_ids(model_names(model, kind), prefixes, "keyframe" if kind == "key" else kind)
 
 
 def _by_owner(model: mujoco.MjModel, kind: str, keys: list[str]) -> dict[str, dict[str, int]]:

@@ -26,6 +26,7 @@ from urlab_client.aio.arguments import first_not_finite
 from urlab_client.errors import ProtocolError, URLabError, URLabVersionMismatch
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
+from urlab_client.values.names import NameMap
 from urlab_client.values.types import SimOptions
 
 if TYPE_CHECKING:
@@ -125,6 +126,7 @@ class Mirror:
         lock: Held while data change. Hold it to read several consistent values from another thread.
         model: The compiled model, or None without one.
         data: State that mirrors the server's, or None without a model.
+        prefixes: What the compiled names of each articulation's elements begin with, by key.
         approximate: True if this client compiled the model from XML because the server runs another MuJoCo build
             or is not trusted with binary models.
     """
@@ -133,6 +135,7 @@ class Mirror:
         self.lock: threading.RLock = threading.RLock()
         self.model: mujoco.MjModel | None = None
         self.data: mujoco.MjData | None = None
+        self.prefixes: NameMap[str] = NameMap(kind="articulation")
         self.approximate: bool = False
         self._stale = False
         self._dragged: int | None = None

@@ -20,7 +20,6 @@ from urlab_client.protocol.messages.runtime import (
     SetMocapPose,
     SetTwist,
 )
-from urlab_client.values.names import UnknownName, names_meant
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,9 +30,10 @@ from typing import cast
 import msgspec
 import numpy as np
 
-from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, is_array, mapping, require
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.model.layout import compiled_ids
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session.jobs import OnProgress
@@ -428,13 +428,5 @@ def as_written(reply: R, request: Request[Any]) -> R:
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
     if model is None:
         return name
-    prefixes = {
-        called: robot.compiled_prefix
-        for key, robot in objects.articulations.items()
-        for called in (key, robot.actor_id)
-        if called
-    }
-    found = names_meant(name, model_names(model, kind), prefixes)
-    if len(found) > 1:
-        raise UnknownName(kind, name, tuple(found), tuple(found), ())
-    return found[0] if found else name
+    known = compiled_ids(model, kind, compiled_prefixes(objects.articulations))
+    return known.key(name) if name in known or name in known.aliases else name

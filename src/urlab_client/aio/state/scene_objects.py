@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import mujoco
 
 import logging
-import re
 from collections import Counter
 from collections.abc import Iterable
 
@@ -36,12 +35,9 @@ from urlab_client.aio.session.session import Session
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StepOk
-from urlab_client.values.names import NameMap, UnknownName, unknown_name
+from urlab_client.values.names import NameMap, UnknownName, robot_prefixes, unknown_name
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
-
-# Unreal's actor names: class, then a number or a generated id.
-_ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 
 
 class SceneObjects:
@@ -159,7 +155,7 @@ class SceneObjects:
 
     def _bind_articulations(self, hello: HelloOk, examined: Examined, *, keep: bool) -> None:
         wrappers: dict[str, URLabArticulation] = {}
-        aliases: dict[str, list[str]] = {}
+        self._mirror.prefixes = examined.prefixes
         for info in hello.articulations:
             key = info.prefix
             layout = examined.layouts[key]
@@ -171,11 +167,8 @@ class SceneObjects:
             wrappers[key] = self.articulations.get(key) or URLabArticulation(
                 record, self._session, self._publishers, self.move
             )
-            found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
-            for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
-                aliases.setdefault(alias, []).append(key)
         self.records = {key: self.records[key] for key in wrappers}
-        self.articulations = NameMap(wrappers, aliases, kind="articulation")
+        self.articulations = examined.prefixes.over(wrappers)
         self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
 
     def _bind_entities(self, examined: Examined, *, keep: bool) -> None:
@@ -188,7 +181,7 @@ class SceneObjects:
             known = self.entities.get(name)
             plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)
         self.entity_records = records
-        self.entities = NameMap({**self.articulations, **plain}, kind="entity")
+        self.entities = NameMap({**self.articulations, **plain}, self.articulations.aliases, kind="entity")
 
     def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
         view = self.global_cameras.get(name)
@@ -205,10 +198,12 @@ class Examined(Struct, frozen=True):
     """The result of checking a handshake against its model.
 
     Attributes:
+        prefixes: What the compiled names of each articulation's elements begin with, by key.
         layouts: Layout of each articulation's values, by key; empty layouts without a model.
         entities: Plain entities by name.
     """
 
+    prefixes: NameMap[str]
     layouts: Mapping[str, ArticulationLayout]
     entities: Mapping[str, EntityInfo]
 
@@ -228,12 +223,12 @@ def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
     entities = hello.plain_entities
     for name, entity in entities.items():
         _check_entity(name, entity, model)
+    prefixes = robot_prefixes((info.prefix, info.actor_id, info.compiled_prefix) for info in hello.articulations)
     if model is None:
-        return Examined({key: ArticulationLayout() for key in keys}, entities)
-    prefixes = {info.prefix: info.compiled_prefix for info in hello.articulations}
+        return Examined(prefixes, {key: ArticulationLayout() for key in keys}, entities)
     try:
         layouts = articulation_layouts(model, prefixes)
-        return Examined(layouts, entities or _entities_of(model, frozenset(prefixes.values())))
+        return Examined(prefixes, layouts, entities or _entities_of(model, frozenset(prefixes.values())))
     except UnicodeDecodeError as error:
         raise _refused(f"a name in its model is not text: {error}") from error
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 
-from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import finite, mapping, text
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.model.articulation_state import MirroredArticulation, SentWrenches, restore_wrenches
+from urlab_client.aio.model.layout import compiled_ids
 from urlab_client.aio.model.mirror import require_local
 from urlab_client.aio.session.session import leaves_open
 from urlab_client.aio.session.turn import Turn
@@ -17,7 +18,7 @@ from urlab_client.enums import CameraTiming, StepMode
 from urlab_client.errors import StepTimeout, UnknownKeyframe, URLabError
 from urlab_client.protocol.codec import check_finite, op_of
 from urlab_client.protocol.messages.session import ArticulationCommand, Reset, ResetOk, Step, StepOk
-from urlab_client.values.names import names_meant
+from urlab_client.values.names import UnknownName
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
@@ -272,14 +273,7 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     model = state.mirror.model
     if model is None:
         return name
-    compiled = [key for key in model_names(model, "key") if key]
-    prefixes = {key: art.compiled_prefix for key, art in state.objects.articulations.items()}
-    matches = names_meant(name, compiled, prefixes)
-    if len(matches) == 1:
-        return matches[0]
-    problem = (
-        f"{name!r} could mean {', '.join(matches)}"
-        if matches
-        else f"no keyframe is called {name!r}; the keyframes are: {', '.join(compiled) or 'none'}"
-    )
-    raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
+    try:
+        return compiled_ids(model, "key", compiled_prefixes(state.objects.articulations)).key(name)
+    except UnknownName as error:
+        raise UnknownKeyframe("unknown_keyframe", f"{error} Nothing was sent.", op="reset") from None

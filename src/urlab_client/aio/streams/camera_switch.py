@@ -117,7 +117,7 @@ class CameraSwitch:
         if self._task is not None:
             await asyncio.wait((self._task,))
             if self._failure is not None:
-                raise self._failure
+                raise self._failure.with_traceback(None)  # each raise would add to it
 
     def _note_failure(self, error: URLabError) -> None:
         self._failure = error

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client._mujoco import control_counts, model_names
-from urlab_client.aio.articulation import URLabArticulation
+from urlab_client.aio.articulation import URLabArticulation, compiled_prefixes
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
@@ -24,10 +24,10 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
-from urlab_client.integrations._variation import compiled_prefixes, server_variation
+from urlab_client.integrations._variation import server_variation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
-from urlab_client.values.names import cleaned_name
+from urlab_client.values.names import NameMap, cleaned_name
 
 if TYPE_CHECKING:
     import mujoco
@@ -97,7 +97,7 @@ class FollowedScene:
     @classmethod
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
         model, arts = client.model, client.articulations
-        prefixes = compiled_prefixes(client)
+        prefixes = compiled_prefixes(arts)
         layouts = {key: ArticulationLayout() for key in arts}
         if model is not None:
             layouts = articulation_layouts(model, prefixes)
@@ -262,7 +262,7 @@ def _transform(time: Time, child: str, position: list[float], rotation: list[flo
     return FrameTransform(time, "world", child, Vector3(*position), Quaternion(x, y, z, w))
 
 
-def _camera_id(model: mujoco.MjModel | None, prefixes: Mapping[str, str], name: str) -> int:
+def _camera_id(model: mujoco.MjModel | None, prefixes: NameMap[str], name: str) -> int:
     """Return the id of `ARTICULATION/CAMERA`, or of a camera of the scene; -1 if the model does not have it."""
     if model is None:
         return -1

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import batch_class, model_names, spans
+from urlab_client._mujoco import batch_class, spans
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
@@ -29,7 +29,7 @@ from urlab_client.simulation.controllers import Actuated, Controller, PDControll
 from urlab_client.simulation.painting import VISIBLE, Visible
 from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.names import element_ids
+from urlab_client.values.names import NameMap
 from urlab_client.values.pictures import to_rgb
 
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
@@ -80,7 +80,7 @@ class URLabBatchEnv(Vectorized):
             URLabError: The scene cannot be fetched, or uses a feature that MuJoCo Warp lacks.
             RenderingUnavailable: Cameras are observed, and this machine cannot draw.
             MissingExtra: `engine` needs an extra that is not installed.
-            KeyError: A camera is unknown.
+            KeyError: A camera or a body to push is unknown.
             ValueError: An option is out of range, `warp` is combined with a varying model, or the scene has no camera
                 to render.
         """
@@ -124,9 +124,8 @@ class URLabBatchEnv(Vectorized):
             self._varied = _CopyVariation(
                 declared, model, self._batch, num_envs, self._controllers, prefixes=mapping.prefixes
             )
-        self._bodies = element_ids(model_names(model, "body"), mapping.prefixes, "body")
         for push in () if declared is None else declared.push:
-            self._body(push.body)
+            mapping.id("body", push.body)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of the current state of each copy, shape (H, W, 3), RGB; None without a render mode.
@@ -195,7 +194,7 @@ class URLabBatchEnv(Vectorized):
         pushes, n_substeps = self._arrays["xfrc_applied"], self._settings.n_substeps
         for i, pushed in applied.forces.items():
             for body, force in pushed.items():
-                pushes[i, self._body(body), :3] = force
+                pushes[i, self.mapping.id("body", body), :3] = force
         late = applied.late[indices]
         for begin, end in itertools.pairwise(np.unique([0, *late, n_substeps]).tolist()):
             waiting = (late > begin)[:, None]
@@ -257,12 +256,6 @@ class URLabBatchEnv(Vectorized):
             case "sensors":
                 return self._arrays["sensordata"][:, sensors]
 
-    def _body(self, name: str) -> int:
-        found = self._bodies.get(name)
-        if found is None:
-            raise ValueError(f"push: unknown body {name!r}; the bodies are: {', '.join(self._bodies)}")
-        return found
-
 
 class _CopyVariation:
     """What varies in the copies of a batch, equal to the variation of a server's scene."""
@@ -275,7 +268,7 @@ class _CopyVariation:
         nsim: int,
         controllers: Mapping[str, Controller],
         *,
-        prefixes: Mapping[str, str],
+        prefixes: NameMap[str],
     ) -> None:
         self._pd = {key: found for key, found in controllers.items() if isinstance(found, PDController)}
         controlled = frozenset(int(i) for found in self._pd.values() for i in found.bound_actuators)

@@ -137,7 +137,8 @@ class Disturbances:
             raise ValueError(
                 f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(mapping.fields)}"
             )
-        keys = fnmatch.filter(mapping.observed, noise.articulation)
+        meant = fnmatch.filter(mapping.prefixes.with_aliases(), noise.articulation)
+        keys = [key for key in mapping.observed if key in map(mapping.prefixes.key, meant)]
         if not keys:
             raise ValueError(f"noise on {noise.field}: no observed articulation is called {noise.articulation!r}")
         return [(key, noise.field, mapping.width(key, noise.field)) for key in keys]

@@ -10,9 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.arguments import text
-from urlab_client.aio.articulation import URLabArticulation
-from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.articulation import URLabArticulation, compiled_prefixes
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.aio.model.mirror import require_local
@@ -20,7 +18,6 @@ from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMo
 from urlab_client.errors import URLabError
 from urlab_client.integrations._variation import (
     WireVariation,
-    compiled_prefixes,
     controlled_actuators,
     server_variation,
 )
@@ -84,9 +81,7 @@ class EnvEpisode:
         minimal = set(settings.fields) <= set(LEVELS["minimal"])
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self.rendered_camera: str | None = _rendered_camera(client, settings)
-        self._cameras = {
-            name: client_camera(client, name) for name in filter(None, (*settings.cameras, self.rendered_camera))
-        }
+        self._cameras = {name: client.camera(name) for name in filter(None, (*settings.cameras, self.rendered_camera))}
         self._frames: dict[str, Pixels] = {}
         images = {
             name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
@@ -189,10 +184,12 @@ class EnvEpisode:
 
     def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
         """Return the articulation of a body, and the body's name in it."""
-        key, _, name = body.partition("/")
-        articulation = self.client.articulations[key]
-        articulation.bodies[name]
-        return articulation, name
+        meant = self.mapping.id("body", body)
+        for articulation in self.client.articulations.values():
+            for found in articulation.bodies.values():
+                if found.id == meant:
+                    return articulation, found.name
+        raise ValueError(f"push: body {body!r} belongs to no articulation")
 
     async def _delay_cameras(self, seed: int | None) -> None:
         if self._latencies:
@@ -280,7 +277,7 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
 
 def _space_mapping(client: URLabClient, model: mujoco.MjModel, settings: EpisodeSettings) -> SpaceMapping:
     """Return the articulations of a discovered client as the spaces of an environment."""
-    prefixes = compiled_prefixes(client)
+    prefixes = compiled_prefixes(client.articulations)
     controlled = {
         key: layout
         for key, layout in articulation_layouts(model, prefixes).items()
@@ -295,14 +292,6 @@ def _space_mapping(client: URLabClient, model: mujoco.MjModel, settings: Episode
         actions=settings.actions,
         targets=controlled_actuators(client, controlled),
     )
-
-
-def client_camera(client: URLabClient, name: str) -> URLabCameraView:
-    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name."""
-    key, slash, camera = text("the name of a camera", name).partition("/")
-    if slash:
-        return client.articulations[key].cameras[camera]
-    return client.global_cameras[name]
 
 
 def _rendered_camera(client: URLabClient, settings: EpisodeSettings) -> str | None:

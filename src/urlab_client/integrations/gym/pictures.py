@@ -10,11 +10,11 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
+from urlab_client._mujoco import model_names
 from urlab_client.aio.background import background_thread
 from urlab_client.aio.client import URLabClient
 from urlab_client.enums import CameraMode
 from urlab_client.errors import URLabError
-from urlab_client.integrations.gym.episode import client_camera
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.randomise.declaration import CameraLatency
@@ -176,11 +176,10 @@ class BatchPictures:
 
 def _camera(client: URLabClient, model: mujoco.MjModel, name: str) -> SceneCamera:
     """Return a camera as the server draws it."""
-    view = client_camera(client, name)
-    key, slash, _ = name.partition("/")
-    prefix = f"{client.articulations[key].compiled_prefix}_" if slash else ""
-    for i in range(model.ncam):
-        compiled = str(model.camera(i).name)
+    view = client.camera(name)
+    owners = [robot.compiled_prefix for robot in client.articulations.values() if view in robot.cameras.values()]
+    prefix = f"{owners[0]}_" if owners else ""
+    for i, compiled in enumerate(model_names(model, "camera")):
         short = compiled.removeprefix(prefix)
         if compiled.startswith(prefix) and view.name in (short, cleaned_name(short)):
             return SceneCamera(name=view.name, id=i, mode=str(view.mode), resolution=view.resolution, fovy=view.fovy)

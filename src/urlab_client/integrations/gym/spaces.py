@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
@@ -11,13 +11,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import control_counts, model_names
+from urlab_client._mujoco import control_counts
 from urlab_client.aio.arguments import collection
-from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, driven_joint
+from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, compiled_ids, driven_joint
 from urlab_client.enums import CameraMode
 from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.base import Floats
-from urlab_client.values.names import names_meant
+from urlab_client.values.names import NameMap, UnknownName
 
 if TYPE_CHECKING:
     import mujoco
@@ -96,7 +96,7 @@ class SpaceMapping:
     def __init__(
         self,
         model: mujoco.MjModel,
-        prefixes: Mapping[str, str],
+        prefixes: NameMap[str],
         fields: Sequence[Field],
         mode: SpaceMode = "flat",
         observed: Sequence[str] | None = None,
@@ -108,7 +108,7 @@ class SpaceMapping:
 
         Args:
             model: The scene.
-            prefixes: Prefix of the compiled element names of each articulation, by key.
+            prefixes: Prefix of the compiled element names of each articulation, by key, and its aliases.
             fields: Fields to observe.
             mode: `flat` or `dict`.
             observed: Keys of the articulations to observe, or None for all.
@@ -126,19 +126,17 @@ class SpaceMapping:
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
         self.keys: tuple[str, ...] = tuple(prefixes)
-        self.observed: tuple[str, ...] = self.keys if observed is None else tuple(observed)
-        if missing := set(self.observed) - set(self.keys):
-            raise ValueError(
-                f"cannot observe {', '.join(sorted(missing))}; the articulations are: {', '.join(self.keys)}"
-            )
+        self.prefixes: NameMap[str] = prefixes
+        self.observed: tuple[str, ...] = self.keys if observed is None else self._keys("cannot observe", observed)
         self.fields: tuple[Field, ...] = tuple(fields)
         self.mode: SpaceMode = mode
         self._model = model
-        self.prefixes: dict[str, str] = dict(prefixes)
         self._targets = targets
-        self._layouts = articulation_layouts(model, prefixes)
+        self._layouts = prefixes.over(articulation_layouts(model, prefixes))
+        self._ids: dict[str, NameMap[int]] = {}
         ends = list(itertools.accumulate(len(layout.ctrl_adr) for layout in self._layouts.values()))
-        self._inputs = {key: slice(a, b) for key, a, b in zip(prefixes, [0, *ends], ends, strict=False) if b > a}
+        inputs = {key: slice(a, b) for key, a, b in zip(prefixes, [0, *ends], ends, strict=False) if b > a}
+        self._inputs = prefixes.over(inputs)
         self.n_actions: int = ends[-1]
         # Of all articulations in their order, shape (n_actions,).
         self._low, self._high = np.full((2, self.n_actions), np.inf) * [[-1.0], [1.0]]
@@ -147,9 +145,7 @@ class SpaceMapping:
         for key, where in self._inputs.items():
             self._low[where], self._high[where] = self._bounds(key)
         declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else dict(actions or {})
-        if wrong := declared.keys() - prefixes.keys():
-            raise ValueError(f"actions of {', '.join(sorted(wrong))}; the articulations are: {', '.join(self.keys)}")
-        for key, each in declared.items():
+        for key, each in zip(self._keys("actions of", declared), declared.values(), strict=True):
             self._declare(key, each)
         self.action_space: Space = self._make_action_space()
         widths = [(key, field, self.width(key, field)) for key in self.observed for field in self.fields]
@@ -162,6 +158,16 @@ class SpaceMapping:
     def layout(self, key: str) -> ArticulationLayout:
         """Return the layout of an articulation's values in the compiled model."""
         return self._layouts[key]
+
+    def id(self, kind: str, name: str) -> int:
+        """Return the id of an element of the compiled model: a `body`, `site`, `geom`, `joint` or `key`.
+
+        Raises:
+            UnknownName: No element, or more than one, has this name.
+        """
+        if kind not in self._ids:
+            self._ids[kind] = compiled_ids(self._model, kind, self.prefixes)
+        return self._ids[kind][name]
 
     def width(self, key: str, field: Field) -> int:
         """Return the length of a field of an articulation."""
@@ -182,13 +188,10 @@ class SpaceMapping:
         Raises:
             UnknownKeyframe: No keyframe, or more than one, has this name.
         """
-        known = model_names(self._model, "key")
-        found = names_meant(name, known, self.prefixes)
-        if len(found) != 1:
-            raise UnknownKeyframe(
-                "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(known) or 'none'}"
-            )
-        return known.index(found[0])
+        try:
+            return self.id("key", name)
+        except UnknownName as error:
+            raise UnknownKeyframe("unknown_keyframe", str(error)) from None
 
     def held(self, keyframe: str | None) -> dict[str, Floats]:
         """Return the set-points that hold a keyframe, or the initial state, by articulation, shape (n_ctrl,).
@@ -217,14 +220,17 @@ class SpaceMapping:
             whole = np.asarray(action, dtype=np.float64)
             _check_width("the action", whole, self.n_actions)
         else:
-            if set(action) != set(self._inputs):
+            parts = {
+                self._inputs.key(name) if name in self._inputs else name: np.asarray(part, dtype=np.float64)
+                for name, part in action.items()
+            }
+            if parts.keys() != self._inputs.keys():
                 raise ValueError(
                     f"the action needs one entry for each of {', '.join(self._inputs)}, not {sorted(action)}"
                 )
-            parts = {key: np.asarray(action[key], dtype=np.float64) for key in self._inputs}
             for key, where in self._inputs.items():
                 _check_width(f"the action of {key}", parts[key], where.stop - where.start)
-            whole = np.concatenate([*parts.values()], axis=-1)
+            whole = np.concatenate([parts[key] for key in self._inputs], axis=-1)
         if not np.isfinite(whole).all():
             raise ValueError(f"the action contains NaN or infinity: {whole}")
         return whole
@@ -246,13 +252,13 @@ class SpaceMapping:
         joints = self.layout(key).joints
         return np.array([joints[name] for name in self.joint_names(key, model)], dtype=np.intp)
 
-    def set_points(self, action: Any) -> dict[str, Floats]:
+    def set_points(self, action: Any) -> NameMap[Floats]:
         """Return the set-points of each articulation, shape (…, n_ctrl), from an action.
 
         Raises:
             ValueError: The action has the wrong shape, or contains NaN or infinity.
         """
-        return self.split(self.scaled(self.flat(action)))
+        return self._inputs.over(self.split(self.scaled(self.flat(action))))
 
     def scaled(self, flat: Floats) -> Floats:
         """Return the set-points of all articulations, shape (…, n_actions), from actions likewise."""
@@ -262,6 +268,13 @@ class SpaceMapping:
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Return the part of each articulation with actuators, as a view, shape (…, n_ctrl)."""
         return {key: flat[..., where] for key, where in self._inputs.items()}
+
+    def _keys(self, problem: str, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the keys of articulations by their names."""
+        known = self.prefixes
+        if missing := {*names} - known.with_aliases().keys():
+            raise ValueError(f"{problem} {', '.join(sorted(missing))}; the articulations are: {', '.join(known)}")
+        return tuple(map(known.key, names))
 
     def _declare(self, key: str, actions: Actions) -> None:
         """Let the actions of an articulation become set-points as declared."""
@@ -297,6 +310,7 @@ class SpaceMapping:
             raise ValueError(
                 f"{field!r} is not observed: the environment was made with observations={list(self.fields)!r}"
             )
+        key = self.prefixes.key(key) if key in self.prefixes else key
         if key not in self.observed:
             raise ValueError(f"{key!r} is not observed; the observed articulations are: {', '.join(self.observed)}")
         if self.mode == "dict":

@@ -16,11 +16,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import model_names
 from urlab_client.aio.arguments import require
 from urlab_client.integrations.gym.spaces import Actions, Space, SpaceMapping, SpaceMode, dict_space, unbounded
 from urlab_client.protocol.base import Floats
-from urlab_client.values.names import NameMap, element_ids
 
 Bools = NDArray[np.bool_]
 _SKY_M: Final = 1e3
@@ -72,7 +70,6 @@ class TaskScene:
         self.model = model
         self.mapping = mapping
         self.data: mujoco.MjData = mujoco.MjData(model)
-        self._ids: dict[str, NameMap[int]] = {}
 
     def id(self, kind: str, name: str) -> int:
         """Return the id of a `body`, `site`, `geom` or `joint`.
@@ -80,9 +77,7 @@ class TaskScene:
         Raises:
             KeyError: The scene has no such element.
         """
-        if kind not in self._ids:
-            self._ids[kind] = element_ids(model_names(self.model, kind), self.mapping.prefixes, kind)
-        return self._ids[kind][name]
+        return self.mapping.id(kind, name)
 
     def geoms(self, name: str) -> NDArray[np.intp]:
         """Return the ids of the geoms of a body, without those of its children, or the id of one geom.

@@ -24,6 +24,7 @@ from urlab_client.protocol.messages.uploads import (
     MAX_ASSETS,
     MAX_BLOB_BYTES,
     MAX_MODEL_BYTES,
+    AssetDigest,
     UploadModelChunk,
     UploadModelManifest,
 )
@@ -118,6 +119,11 @@ class Uploads:
                 raise Refusal(
                     "payload_too_large", f"the size of '{asset.name}' must be 0 to {MAX_BLOB_BYTES}, not {asset.size}"
                 )
+        first: dict[str, AssetDigest] = {}
+        for asset in assets:
+            other = first.setdefault(asset.name.casefold(), asset)
+            if other.name != asset.name and other.sha256 != asset.sha256:
+                raise Refusal("bad_request", f"'{other.name}' and '{asset.name}' are one file on some systems")
         named = {asset.name: _File(asset.sha256, asset.size) for asset in assets}
         total = sum(asset.size or 0 for asset in named.values())
         if total > MAX_MODEL_BYTES:

@@ -14,6 +14,7 @@ from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.simulation.controllers import PDController
+from urlab_client.values.names import robot_prefixes
 
 
 class SceneVariation:
@@ -34,7 +35,8 @@ class SceneVariation:
         found = (control.controller for control in articulations.controls.values())
         self._controllers = [controller for controller in found if isinstance(controller, PDController)]
         controlled = frozenset(int(i) for controller in self._controllers for i in controller.bound_actuators)
-        prefixes = {name: control.index.key for name, control in articulations.controls.items()}
+        robots = [(name, control.index) for name, control in articulations.controls.items()]
+        prefixes = robot_prefixes((name, index.actor_id, index.key) for name, index in robots)
         self._variation = Variation(declaration, scene.model, controlled, prefixes)
         self._following = np.random.default_rng(0)
 

@@ -1,0 +1,123 @@
+"""Tasks come to the same bits whatever a server calls its robots, on either dialect, over the wire and in a batch.
+
+Robots are written by their actor id, `arm`. It is the robot's key and begins its compiled names (alpha), it is the key,
+but compiled names begin with `arm_C_0_` (beta), or both are `arm_C_0` (alpha with names as the plugin assigns them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from urlab_client.integrations.gym import (
+    Actions,
+    FixedReach,
+    Push,
+    Reach,
+    ResetNoise,
+    Run,
+    Start,
+    States,
+    Task,
+    URLabBatchEnv,
+    URLabEnv,
+    Walk,
+)
+from urlab_client.randomise import Delay, Noise, Randomisation, Vary
+from urlab_client.randomise import Push as Shove
+from urlab_client.server import ControllerConfig, SimulatedServer
+
+NAMINGS: list[tuple[Any, Any]] = [(dialect, naming) for dialect in ("alpha", "beta") for naming in ("model", "plugin")]
+PD = {"quadruped": ControllerConfig(kp=64.0, kv=2.0)}
+
+VARIED = Randomisation(
+    vary=(
+        Vary(what="mass", on="block/*", scale=(0.5, 2.0)),
+        Vary(what="damping", on="arm/elbow", scale=(0.5, 2.0)),
+        Vary(what="friction", on="arm_*", scale=(0.5, 1.5)),
+        Vary(what="position", on="arm/wrist*", add=(-0.1, 0.1)),
+        Vary(what="gravity", add=(-0.25, 0.25)),
+    ),
+    push=(
+        Shove(body="block/block", force=(-2.0, 2.0), every=(1, 2), lasts=2),
+        Shove(body="arm_forearm", force=(-20.0, 20.0), every=(1, 3), lasts=1),
+    ),
+    noise=(Noise(field="qpos", articulation="arm", std=0.01, bias=0.02),),
+    delay=Delay(observation=(0, 1)),
+)
+
+
+class Own(Task):
+    """Names robots and elements in each way that a task can."""
+
+    scene_address: ClassVar[str] = "sim://arm?model=block&model=floor"
+    observations: ClassVar[str | Sequence[str]] = "standard"
+    articulations: ClassVar[Sequence[str] | None] = ("block", "arm")
+    keyframe: ClassVar[str | None] = "arm/home"
+    n_observed: ClassVar[int] = 4
+    n_substeps: ClassVar[int] = 10
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        start.noise(rng, "arm", ResetNoise(hinge=0.05))
+        start.joint("arm_wrist_pitch", -1.0)
+        start.place("block", [rng.uniform(0.4, 0.5), 0.0, 0.03])
+        start.goal["target"] = rng.uniform(-1.0, 1.0, 3)
+
+    def observe(self, states: States) -> Any:
+        near = states.touching("block/block", "floor/floor")[:, None]
+        return np.concatenate([states.body_position("arm/forearm"), near], axis=1)
+
+    def reward(self, states: States, actions: Any) -> Any:
+        effort = np.sum(self.scene.mapping.set_points(actions)["arm"] ** 2, axis=1)
+        far = np.linalg.norm(states.site_position("grip") - states.body_position("block/block"), axis=1)
+        return states.positions("block")[:, 0] + states.velocities("arm")[:, 1] - far - effort
+
+
+TASKS: dict[str, tuple[type[Task], dict[str, Any], dict[str, Any]]] = {
+    "reach": (Reach, {}, {}),
+    "arm": (FixedReach, {}, {}),
+    "push": (Push, {}, {}),
+    "walk": (Walk, {"controllers": PD}, {"actions": {"quadruped": Actions(scale=0.25)}}),
+    "quadruped": (Run, {}, {}),
+    "own": (Own, {"randomise": VARIED}, {}),
+}
+MODELS = {"quadruped": ("quadruped",), "push": ("arm", "block", "floor"), "walk": ("quadruped",)}
+
+
+def rollout(env: Any, *, batch: bool) -> list[Any]:
+    """Return what an environment, or the only copy of a batch, shows and rewards."""
+    rng = np.random.default_rng(2)
+    seen: list[Any] = [env.reset(seed=[6] if batch else 6)[0]]
+    for _ in range(6):
+        action = rng.uniform(-0.5, 0.5, env.action_space.shape[-1]).astype(np.float32)
+        seen += env.step(action[None] if batch else action)[:4]
+    return [values[0] for values in seen] if batch else seen
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_comes_to_the_same_whatever_its_robots_are_called(name: str) -> None:
+    kind, served, options = TASKS[name]
+    models = MODELS.get(name, ("arm", "block", "floor"))
+    found: dict[str, list[Any]] = {}
+    for dialect, naming in NAMINGS:
+        with SimulatedServer(
+            *models, play=True, mjcf_options=True, dialect=dialect, actor_names=naming, **served
+        ) as server:
+            address = f"{server.address}:{server.step_port}"
+            with closing(URLabEnv.connect(address, task=kind(), **options)) as wire:
+                found[f"{dialect}, {naming}"] = rollout(wire, batch=False)
+            with closing(URLabBatchEnv(address, 1, task=kind(), **options)) as batch:
+                found[f"{dialect}, {naming}, batch"] = rollout(batch, batch=True)
+    expected = found["alpha, model"]
+    assert len(set(expected[2::4])) == 6, "each state is rewarded otherwise"
+    for where, seen in found.items():
+        # What a controller makes of its targets is rounded to single precision in the alpha.
+        same = partial(np.allclose, atol=1e-5) if kind is Walk and "beta" in where else np.array_equal
+        assert all(same(ours, theirs) for ours, theirs in zip(seen, expected, strict=True)), where
+    beta = [seen for where, seen in found.items() if "beta" in where]
+    assert all(np.array_equal(*pair) for seen in beta for pair in zip(seen, beta[0], strict=True))
