@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.harness import Burst, Figure, Pair, Row
+from benchmarks.machine import children, processor_s
 from benchmarks.robots import dialect, humanoid
 
 __all__ = ["ROWS"]
@@ -68,22 +69,12 @@ def _per_core(environment: Any, copies: int) -> float:
     """Return steps for each second of processor time, of this process with all its threads and of its children."""
     action = 0 * environment.action_space.sample()
     environment.reset(seed=0)
-    taken, started = 0, _processor_s()
-    while (used := _processor_s() - started) < _PROCESSOR_S:
+    taken, started = 0, processor_s()
+    while (used := processor_s() - started) < _PROCESSOR_S:
         for _ in range(20):
             environment.step(action)
         taken += 20 * copies
     return taken / used
-
-
-def _processor_s() -> float:
-    """Return the processor time of this process and of its children, seconds."""
-    total = time.process_time()
-    for child in _children():
-        with contextlib.suppress(OSError):
-            after_name = Path(f"/proc/{child}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-            total += (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
-    return total
 
 
 def _proportional(process: int | str) -> float:
@@ -95,14 +86,9 @@ def _proportional(process: int | str) -> float:
     return 0.0
 
 
-def _children() -> list[str]:
-    found = [path.read_text(encoding="ascii") for path in Path("/proc/self/task").glob("*/children")]
-    return " ".join(found).split()
-
-
 def _of_servers() -> list[Figure]:
     """Return the memory of a server, of those that run."""
-    used = [_proportional(child) for child in _children()]
+    used = [_proportional(child) for child in children()]
     return [Figure(name="MB of a server", value=sum(used) / max(len(used), 1))]
 
 
