@@ -65,6 +65,28 @@ def _against(
         )
 
 
+@contextlib.contextmanager
+def _beside_its_client() -> Iterator[Pair]:
+    """The processor time of this process for a step of an environment, and for a step of its client."""
+    with contextlib.closing(_single()) as environment:
+        action = 0 * environment.action_space.sample()
+        environment.reset(seed=0)
+
+        def processor_times(operation: Callable[[], object]) -> Burst:
+            def burst(count: int) -> list[float]:
+                busy = time.process_time()
+                for _ in range(count):
+                    operation()
+                return [(time.process_time() - busy) / count]
+
+            return burst
+
+        yield Pair(
+            ours=processor_times(lambda: environment.step(action)),
+            floor=processor_times(lambda: environment.client.step(_SUBSTEPS)),
+        )
+
+
 def _per_core(environment: Any, copies: int) -> float:
     """Return steps for each second of processor time, of this process with all its threads and of its children."""
     action = 0 * environment.action_space.sample()
@@ -144,10 +166,18 @@ def _rows() -> tuple[Row, ...]:
             count=100,
         ),
         Row(
+            name="env-client",
+            what="processor time of URLabEnv.step() in its own process",
+            floor="that of client.step() with as many substeps",
+            reach=2.5,
+            prepare=_beside_its_client,
+            count=100,
+        ),
+        Row(
             name="env-4-servers",
             what=f"the same of URLabVectorEnv with {_SERVERS} servers, together",
             floor=floor,
-            reach=0.9,
+            reach=0.5,
             kind="rate",
             prepare=lambda: _against(_vector, _SERVERS, None, _of_servers),
             count=50,
