@@ -65,6 +65,7 @@ FIELDS = (
     *("geom_friction", "geom_rgba", "body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping"),
     *("dof_frictionloss", "jnt_stiffness", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
     *("opt.gravity", "light_pos", "light_diffuse", "cam_pos", "cam_quat", "cam_fovy"),
+    *("mat_specular", "mat_shininess", "mat_reflectance"),
 )
 
 
