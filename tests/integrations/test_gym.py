@@ -369,7 +369,7 @@ def test_a_server_of_its_own_is_stepped_over_shared_memory_if_there_is_room(monk
     def requests(**options: Any) -> tuple[int, dict[str, int]]:
         with closing(URLabEnv.connect("sim://arm", observations=["qpos"], **options)) as env:
             env.reset(seed=0)
-            action = env.action_space.sample()
+            action = np.full(7, 0.1, dtype=np.float32)
             seen.append([env.step(action)[0] for _ in range(3)])
             stats = env.client.transport_stats
             return stats.over_shm, dict(stats.over_zmq)
