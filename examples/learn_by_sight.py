@@ -1,7 +1,7 @@
 """Stable-Baselines3's CNN policy learns from pictures alone to send a cart to a ball.
 
     pip install -e '.[gym,sb3]'
-    python examples/learn_by_sight.py            # about a minute on two cores, without a graphics card
+    python examples/learn_by_sight.py            # without a graphics card, too
 
 Only the camera tells where the ball is. In each episode it begins somewhere else, with another colour, under another
 light. The batch draws the pictures in this process; a server would show the same ones (docs/environments.md).
