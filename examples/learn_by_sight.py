@@ -47,6 +47,7 @@ MODEL = """
   <actuator><position name="cart" joint="cart" kp="400" ctrlrange="-1 1"/></actuator>
 </mujoco>
 """
+ACTIONS = 5  # of an episode
 LOOKS = Randomisation(
     vary=(
         Vary(what="colour", on="rail/ball", add=((-0.2, -0.1, -0.1), (0.1, 0.2, 0.2))),
@@ -63,7 +64,7 @@ class Meet(Task):
     observations = ("qpos",)
     cameras = ("rail/eye",)
     n_substeps = 80
-    max_episode_steps = 5
+    max_episode_steps = ACTIONS
 
     def reset(self, rng: np.random.Generator, start: Start) -> None:
         """Put cart and ball anywhere on their rails."""
@@ -142,7 +143,7 @@ def main(steps: int = 12_000, seed: int = 1) -> tuple[float, float]:
             if learn:
                 model.learn(learn)
             mean, _ = evaluate_policy(model, envs, n_eval_episodes=40)
-            distances.append(-float(np.mean(mean)) / Meet.max_episode_steps)
+            distances.append(-float(np.mean(mean)) / ACTIONS)
     print(f"mean distance from the ball: {distances[0]:.2f} m before, {distances[1]:.2f} m after {steps} steps")
     return distances[0], distances[1]
 
