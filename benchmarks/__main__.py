@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.harness import Result, measure
+from benchmarks.harness import Result, Row, measure
 from benchmarks.machine import commit, describe
 from benchmarks.robots import DIALECT
 from benchmarks.rows import all_rows, one_row
@@ -23,27 +23,10 @@ RELEASED = Path(__file__).parent / "released.json"
 
 def main() -> int:
     """Run the command line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="under a minute; noisier")
-    parser.add_argument("--only", action="append", metavar="NAME", help="rows whose name contains NAME; repeatable")
-    parser.add_argument("--row", metavar="NAME", help="the one row of that name")
-    parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
-    parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
-    parser.add_argument(
-        "--released", action="store_true", help=f"write {RELEASED.parent.name}/{RELEASED.name}: every row of a commit"
-    )
-    parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
-    parser.add_argument(
-        "--dialect", choices=("alpha", "beta"), default="alpha", help="what the rows' servers speak (%(default)s)"
-    )
-    parser.add_argument("--list", action="store_true", help="list the rows and stop")
+    parser = _parser()
     options = parser.parse_args()
     os.environ[DIALECT] = options.dialect
-    if options.row:
-        found = one_row(options.row)
-        rows = [] if found is None else [found]
-    else:
-        rows = [row for row in all_rows() if not options.only or any(part in row.name for part in options.only)]
+    rows = _chosen(options.row, options.only)
     if not rows:
         parser.error(f"no row is named like {' or '.join(options.only or [options.row])}")
     if options.list:
@@ -80,7 +63,37 @@ def main() -> int:
         _compare(results, options.against)  # before it may be written over
     options.json.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
     print(f"\nwritten: {options.json}")
-    return 0
+    missed = [result.row.name for result in results if result.misses]
+    if missed:
+        print(f"missed: {', '.join(missed)}")
+    return int(options.check and bool(missed))
+
+
+def _chosen(name: str | None, parts: Sequence[str] | None) -> list[Row]:
+    """Return the row of that name, or else those whose name contains one of `parts`; without parts, all."""
+    if name:
+        found = one_row(name)
+        return [] if found is None else [found]
+    return [row for row in all_rows() if not parts or any(part in row.name for part in parts)]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="under a minute; noisier")
+    parser.add_argument("--only", action="append", metavar="NAME", help="rows whose name contains NAME; repeatable")
+    parser.add_argument("--row", metavar="NAME", help="the one row of that name")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
+    parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
+    parser.add_argument("--check", action="store_true", help="exit with 1 if a row misses what it is to reach or keep")
+    parser.add_argument(
+        "--released", action="store_true", help=f"write {RELEASED.parent.name}/{RELEASED.name}: every row of a commit"
+    )
+    parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
+    parser.add_argument(
+        "--dialect", choices=("alpha", "beta"), default="alpha", help="what the rows' servers speak (%(default)s)"
+    )
+    parser.add_argument("--list", action="store_true", help="list the rows and stop")
+    return parser
 
 
 def _compare(results: Sequence[Result], against: Path) -> None:
@@ -115,7 +128,7 @@ def _print(result: Result, seconds: float) -> None:
     keep = "" if row.p99 is None else f"≤ {row.p99:.2f}"
     missed = f"  missed: {', '.join(result.misses)}" if result.misses else ""
     ours, floor = ("", "") if result.cpu_us is None else (f"{each:.1f}" for each in result.cpu_us)
-    most = "" if row.cpu_us is None else f"≤ {row.cpu_us:.0f}"
+    most = "" if row.processor is None else f"≤ {row.processor:.2f}"
     took, floor_took = (f"{1e6 * each:.1f}" for each in result.median_s)
     print(
         f"{row.name:<30}{result.ratio:>7.2f}  {spread:<18}{f'{sign} {row.reach:.2f}':>9}{p99:>7}{keep:>9}"
@@ -141,7 +154,7 @@ def _plain(result: Result) -> dict[str, object]:
         "p99": result.p99,
         "p99_to_keep": row.p99,
         "cpu_us": None if result.cpu_us is None else {"ours": result.cpu_us[0], "floor": result.cpu_us[1]},
-        "cpu_us_to_keep": row.cpu_us,
+        "processor_to_keep": row.processor,
         "rounds": result.rounds,
         "samples": result.samples,
         "median_s": {"ours": result.median_s[0], "floor": result.median_s[1]},

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from benchmarks.harness import Pair, Row
 
-__all__ = ["warm", "warmth"]
+__all__ = ["long", "warm", "warmth"]
 
 _AWAKE = """
 import os, sys, threading
@@ -38,7 +38,7 @@ def warmth() -> Iterator[None]:
         yield
 
 
-def warm(row: Row, *, reach: float, p99: float | None = None, cpu_us: float | None = None) -> Row:
+def warm(row: Row, *, reach: float, p99: float | None = None, processor: float | None = None) -> Row:
     """Return a row that measures the same where every core is kept awake."""
 
     def within(prepare: Callable[[], AbstractContextManager[Pair]]) -> AbstractContextManager[Pair]:
@@ -55,6 +55,11 @@ def warm(row: Row, *, reach: float, p99: float | None = None, cpu_us: float | No
         what=f"{row.what}; every core kept awake",
         reach=reach,
         p99=p99,
-        cpu_us=cpu_us,
+        processor=processor,
         prepare=lambda: within(row.prepare),
     )
+
+
+def long(row: Row) -> Row:
+    """Return a row that measures the same in bursts of 1,000, as users step, instead of some hundredths of a second."""
+    return replace(row, name=f"{row.name}-1000", what=f"{row.what}; in bursts of 1,000", count=1000)

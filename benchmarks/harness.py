@@ -63,7 +63,7 @@ class Row:
         prepare: Makes the pair, and takes it down.
         kind: `time`: time by the floor's time, to be at most `reach`; `rate`: rate by the floor's rate, at least it.
         p99: The ratio of 99th percentiles to keep, where bursts return single times.
-        cpu_us: Processor time to keep, microseconds each, where bursts return single times.
+        processor: The ratio of processor times to keep, where bursts return single times.
         burst_s: Seconds per burst: longer than what disturbs single times, shorter than what disturbs whole bursts.
         count: Times per burst, where `burst_s` does not tell: 1 for what takes long.
     """
@@ -75,7 +75,7 @@ class Row:
     prepare: Callable[[], AbstractContextManager[Pair]]
     kind: Literal["time", "rate"] = "time"
     p99: float | None = None
-    cpu_us: float | None = None
+    processor: float | None = None
     burst_s: float = _BURST_S
     count: int | None = None
 
@@ -116,7 +116,7 @@ class Result:
         missed = [] if reached else ["median"]
         if row.p99 is not None and self.p99 is not None and self.p99 > row.p99:
             missed.append("p99")
-        if row.cpu_us is not None and self.cpu_us is not None and self.cpu_us[0] > row.cpu_us:
+        if row.processor and self.cpu_us is not None and self.cpu_us[0] > row.processor * self.cpu_us[1]:
             missed.append("processor time")
         return [*missed, *(f.name for f in self.figures if f.at_most is not None and f.value > f.at_most)]
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -81,6 +82,19 @@ def sb3_batch() -> str:
     if lengths != {100}:
         raise AssertionError(f"episodes of {lengths} actions")
     return f"{model.num_timesteps} steps, {len(model.ep_info_buffer)} episodes of 100 actions"
+
+
+def sb3_pictures() -> str:
+    """PPO with a `CnnPolicy` learns from pictures alone: the example halves its distance from the ball."""
+    example = Path(__file__).parents[1] / "examples/learn_by_sight.py"
+    done = subprocess.run([sys.executable, example], capture_output=True, text=True, check=False)  # noqa: S603 - ours
+    found = re.search(r"ball: (\S+) m before, (\S+) m after", done.stdout)
+    if done.returncode or found is None:
+        raise AssertionError(done.stderr)
+    before, after = map(float, found.groups())
+    if after > before / 2:
+        raise AssertionError(done.stdout)
+    return done.stdout.strip()
 
 
 def warp() -> str:
@@ -330,6 +344,7 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "sb3-check-env": ("stable-baselines3", sb3_check_env),
     "sb3-ppo": ("stable-baselines3", sb3_ppo),
     "sb3-batch": ("stable-baselines3", sb3_batch),
+    "sb3-pictures": ("stable-baselines3", sb3_pictures),
     "gym-async": ("gymnasium", gym_async),
     "warp": ("mujoco-warp", warp),
     "mjx": ("mujoco-mjx", mjx),

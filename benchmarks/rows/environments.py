@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.harness import Burst, Figure, Pair, Row
+from benchmarks.machine import children, processor_s
 from benchmarks.robots import dialect, humanoid
 
 __all__ = ["ROWS"]
@@ -64,26 +65,38 @@ def _against(
         )
 
 
+@contextlib.contextmanager
+def _beside_its_client() -> Iterator[Pair]:
+    """The processor time of this process for a step of an environment, and for a step of its client."""
+    with contextlib.closing(_single()) as environment:
+        action = 0 * environment.action_space.sample()
+        environment.reset(seed=0)
+
+        def processor_times(operation: Callable[[], object]) -> Burst:
+            def burst(count: int) -> list[float]:
+                busy = time.process_time()
+                for _ in range(count):
+                    operation()
+                return [(time.process_time() - busy) / count]
+
+            return burst
+
+        yield Pair(
+            ours=processor_times(lambda: environment.step(action)),
+            floor=processor_times(lambda: environment.client.step(_SUBSTEPS)),
+        )
+
+
 def _per_core(environment: Any, copies: int) -> float:
     """Return steps for each second of processor time, of this process with all its threads and of its children."""
     action = 0 * environment.action_space.sample()
     environment.reset(seed=0)
-    taken, started = 0, _processor_s()
-    while (used := _processor_s() - started) < _PROCESSOR_S:
+    taken, started = 0, processor_s()
+    while (used := processor_s() - started) < _PROCESSOR_S:
         for _ in range(20):
             environment.step(action)
         taken += 20 * copies
     return taken / used
-
-
-def _processor_s() -> float:
-    """Return the processor time of this process and of its children, seconds."""
-    total = time.process_time()
-    for child in _children():
-        with contextlib.suppress(OSError):
-            after_name = Path(f"/proc/{child}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-            total += (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
-    return total
 
 
 def _proportional(process: int | str) -> float:
@@ -95,14 +108,9 @@ def _proportional(process: int | str) -> float:
     return 0.0
 
 
-def _children() -> list[str]:
-    found = [path.read_text(encoding="ascii") for path in Path("/proc/self/task").glob("*/children")]
-    return " ".join(found).split()
-
-
 def _of_servers() -> list[Figure]:
     """Return the memory of a server, of those that run."""
-    used = [_proportional(child) for child in _children()]
+    used = [_proportional(child) for child in children()]
     return [Figure(name="MB of a server", value=sum(used) / max(len(used), 1))]
 
 
@@ -158,10 +166,18 @@ def _rows() -> tuple[Row, ...]:
             count=100,
         ),
         Row(
+            name="env-client",
+            what="processor time of URLabEnv.step() in its own process",
+            floor="that of client.step() with as many substeps",
+            reach=2.5,
+            prepare=_beside_its_client,
+            count=100,
+        ),
+        Row(
             name="env-4-servers",
             what=f"the same of URLabVectorEnv with {_SERVERS} servers, together",
             floor=floor,
-            reach=0.9,
+            reach=0.5,
             kind="rate",
             prepare=lambda: _against(_vector, _SERVERS, None, _of_servers),
             count=50,

@@ -56,7 +56,7 @@ ROWS = (
         name="puppet",
         what="await client.step() in puppet mode, humanoid of 29 joints and a free base",
         floor="mj_step + blocking REQ round trip of the same bytes",
-        reach=1.3,
+        reach=2.0,
         prepare=_puppet,
     ),
 )

@@ -92,7 +92,7 @@ def _rows() -> tuple[Row, ...]:
             name="record-2-cameras",
             what="direct steps with two cameras of 640x480, recorded losslessly as MCAP",
             floor="the same, not recorded",
-            reach=0.9,
+            reach=0.7,
             kind="rate",
             prepare=_recording,
             count=100,

@@ -202,7 +202,7 @@ def _camera_rows(sizes: Sequence[tuple[str, int, int]]) -> list[Row]:
             name=f"camera-{name}-{mode}",
             what=f"frames() of a {width}x{height} camera, {'metres' if mode == 'depth' else 'BGRA to RGBA'} included",
             floor="raw recv_multipart(copy=False)",
-            reach=0.85 if height > 1000 else 0.7,
+            reach=0.6 if height > 1000 else 0.7,
             prepare=functools.partial(_pictures, mode, width, height),
             kind="rate",
             burst_s=0.1,

@@ -52,6 +52,7 @@ _NAME_ADDRESSES = {
     "site": "name_siteadr",
     "camera": "name_camadr",
     "light": "name_lightadr",
+    "material": "name_matadr",
     "key": "name_keyadr",
 }
 

@@ -28,6 +28,9 @@ LOOK = Randomisation(
         Vary(what="camera_rotation", on="arm/wrist", add=(-0.1, 0.1)),
         Vary(what="colour", on="*", scale=(0.5, 1.5)),
         Vary(what="light_position", on="*", add=(-0.5, 0.5)),
+        Vary(what="light_colour", on="*", scale=(0.3, 1.0)),
+        Vary(what="specular", on="*", set=(0.0, 1.0)),
+        Vary(what="shininess", on="arm/*", scale=(0.2, 1.0)),
     )
 )
 

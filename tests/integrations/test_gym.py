@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import shutil
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -360,3 +362,24 @@ def test_a_keyframe_of_the_constructor_is_where_episodes_start(make_env: MakeEnv
     for options in (None, {"keyframe": "arm_home"}):
         env.reset(options=options)
         assert env.articulations["arm"].get_qpos()["left_finger"] == pytest.approx(0.04)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/shm is Linux's")
+def test_a_server_of_its_own_is_stepped_over_shared_memory_if_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    def requests(**options: Any) -> tuple[int, dict[str, int]]:
+        with closing(URLabEnv.connect("sim://arm", observations=["qpos"], **options)) as env:
+            env.reset(seed=0)
+            action = np.full(7, 0.1, dtype=np.float32)
+            seen.append([env.step(action)[0] for _ in range(3)])
+            stats = env.client.transport_stats
+            return stats.over_shm, dict(stats.over_zmq)
+
+    seen: list[Any] = []
+    room = shutil.disk_usage("/")._replace(free=64 << 20)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: room)
+    shared, _ = requests()
+    assert shared >= 3
+    assert requests(client_options={"transport": "zmq"})[0] == 0
+    room = room._replace(free=(64 << 20) - 1)
+    assert requests()[0] == 0
+    assert all(np.array_equal(seen[0], other) for other in seen[1:])

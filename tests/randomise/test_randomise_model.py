@@ -17,6 +17,7 @@ from urlab_client.randomise.variation import Variation, field_of
 MODEL = """
 <mujoco>
   <compiler angle="radian"/>
+  <asset><material name="paint" specular="0.5" shininess="0.5" reflectance="0.5"/></asset>
   <worldbody>
     <light name="lamp" pos="0 0 3" diffuse="0.8 0.8 0.8"/>
     <camera name="eye" pos="1 0 1"/>
@@ -64,6 +65,7 @@ FIELDS = (
     *("geom_friction", "geom_rgba", "body_mass", "body_inertia", "body_ipos", "dof_armature", "dof_damping"),
     *("dof_frictionloss", "jnt_stiffness", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
     *("opt.gravity", "light_pos", "light_diffuse", "cam_pos", "cam_quat", "cam_fovy"),
+    *("mat_specular", "mat_shininess", "mat_reflectance"),
 )
 
 
@@ -114,6 +116,8 @@ def test_each_quantity_changes_what_it_says_and_nothing_else(model: mujoco.MjMod
     assert ratio["actuator_gainprm"][2, 0] == pytest.approx(drawn["motor"])
     assert list(scaled("gravity")[0]) == ["opt.gravity"]
     assert list(scaled("light_colour")[0]) == ["light_diffuse"]
+    for what in ("specular", "shininess", "reflectance"):
+        assert list(scaled(what)[0]) == [f"mat_{what}"]
     assert list(scaled("colour", on="box")[0]) == [], "red is as red as it can be, and the rest is 0"
     for what, field in (
         ("centre_of_mass", "body_ipos"),
@@ -214,3 +218,26 @@ def test_a_wrong_declaration_says_what_is_wrong_and_where(tmp_path: Path, text: 
 def test_a_name_that_fits_nothing_is_told_with_those_that_there_are(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="no body with a mass is called cup; there are: box, rod"):
         Variation(Randomisation(vary=(Vary(what="mass", on="cup", scale=(1, 2)),)), model)
+
+
+def test_the_looks_of_materials_vary_and_colours_begin_with_theirs() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><asset><material name='paint' rgba='0.8 0.4 0 0.5' specular='0.5'/></asset><worldbody>"
+        "<geom name='painted' size='1' material='paint'/><geom name='plain' size='1'/>"
+        "<geom name='own' size='1' material='paint' rgba='0 0 1 1'/></worldbody></mujoco>"
+    )
+    declared = Randomisation(
+        vary=(
+            Vary(what="colour", scale=(0.5, 0.5)),
+            Vary(what="specular", on="paint", scale=(0.5, 0.5)),
+            Vary(what="shininess", add=(5.0, 5.0)),
+            Vary(what="reflectance", set=(0.3, 0.3)),
+        )
+    )
+    variation = Variation(declared, model)
+    fields = {name: np.array(field_of(model, name)) for name in variation.fields}
+    variation.write(variation.draw(1), fields.__getitem__)
+    np.testing.assert_allclose(fields["geom_rgba"], [[0.4, 0.2, 0, 0.5], [0.25, 0.25, 0.25, 1], [0, 0, 0.5, 1]])
+    looks = [fields[f"mat_{name}"].tolist() for name in ("specular", "shininess", "reflectance")]
+    np.testing.assert_allclose(looks, [[0.25], [1], [0.3]])
+    assert set(variation.visible_fields) == set(variation.fields)

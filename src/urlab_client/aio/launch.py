@@ -20,7 +20,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Sequence
-from typing import IO, TypeVarTuple, cast
+from typing import IO, Final, TypeVarTuple, cast
 from urllib.parse import parse_qsl, urlencode
 from weakref import WeakMethod
 
@@ -44,6 +44,7 @@ log: logging.Logger = logging.getLogger("urlab_client.launch")
 Ts = TypeVarTuple("Ts")
 
 SCHEME = "sim://"
+SHARED_MEMORY: Final = "/dev/shm"  # noqa: S108 - a server creates its own directory in it, accessible to its user only
 _START_S = 60.0
 _START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
@@ -381,8 +382,7 @@ def _log_lines(pipe: IO[bytes], errors: list[str], logs: threading.Event) -> Non
 
 def _memory_directory() -> str:
     """Return the best directory for regions: in memory, if the system has one there."""
-    memory = "/dev/shm"  # noqa: S108 - the server creates its own directory in it, accessible to its user only
-    return memory if os.access(memory, os.W_OK) else tempfile.gettempdir()
+    return SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else tempfile.gettempdir()
 
 
 _DEFAULTS: Sequence[str] = (

@@ -147,7 +147,7 @@ class Op:
         if not self.method:
             object.__setattr__(self, "method", self.name.removeprefix(f"{self.ns}_"))
 
-    @property
+    @cached_property
     def reply_name(self) -> str:
         """`op` of the successful reply. Not always the op's name plus `_ok`: see `set_viewport_mode`."""
         return str(self.reply.__struct_config__.tag)

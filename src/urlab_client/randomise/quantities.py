@@ -40,6 +40,9 @@ QUANTITIES: Final[dict[Quantity, tuple[str, tuple[str, ...]]]] = {
     "light_position": ("light", ("light_pos",)),
     "light_colour": ("light", ("light_diffuse",)),
     "colour": ("geom", ("geom_rgba",)),
+    "specular": ("material", ("mat_specular",)),
+    "shininess": ("material", ("mat_shininess",)),
+    "reflectance": ("material", ("mat_reflectance",)),
     "camera_position": ("camera", ("cam_pos",)),
     "camera_rotation": ("camera", ("cam_quat",)),
     "camera_fovy": ("camera", ("cam_fovy",)),
@@ -55,6 +58,11 @@ DERIVED_FROM: Final = frozenset(
 """Fields from which `mj_setConst` computes others."""
 
 _FIXED, _AFFINE, _NO_BIAS = 0, 1, 0  # mjGAIN_FIXED, mjGAIN_AFFINE and mjBIAS_AFFINE, mjBIAS_NONE
+_ANY: Final = (-np.inf, np.inf)
+_POSITIVE: Final = (0.0, np.inf)
+_NO_COLOUR: Final = (0.5, 0.5, 0.5, 1.0)
+"""The colour of a geom for which its material's is drawn."""
+
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -99,13 +107,14 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
         case "mass":
             mass = fields("body_mass")
             before = mass[ids].copy()
-            _change(vary, mass, ids, drawn[:, 0], least=0.0)
+            _change(vary, mass, ids, drawn[:, 0], _POSITIVE)
             fields("body_inertia")[ids] *= (mass[ids] / before)[:, None]
         case "armature" | "damping" | "friction_loss":
             dofs, owners = _dofs(model, ids)
-            _change(vary, fields(names[0]), dofs, drawn[owners, 0], least=0.0)
-        case "stiffness":
-            _change(vary, fields("jnt_stiffness"), ids, drawn[:, 0], least=0.0)
+            _change(vary, fields(names[0]), dofs, drawn[owners, 0], _POSITIVE)
+        case "stiffness" | "specular" | "shininess" | "reflectance":
+            bounds = _POSITIVE if vary.what == "stiffness" else (0.0, 1.0)
+            _change(vary, fields(names[0]), ids, drawn[:, 0], bounds)
         case "kp" | "kv":
             _write_gain(vary.what, ids, drawn[:, 0], model, fields)
         case "inertia" | "strength":
@@ -115,8 +124,9 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
             gravity = fields("opt.gravity")
             gravity[:] = _changed(vary, gravity, drawn[0])
         case "colour":
-            rgba = fields("geom_rgba")
-            rgba[ids, :3] = np.clip(_changed(vary, rgba[ids, :3], drawn), 0.0, 1.0)
+            shown = _shown_colours(model, fields("geom_rgba"), ids)
+            shown[:, :3] = np.clip(_changed(vary, shown[:, :3], drawn), 0.0, 1.0)
+            fields("geom_rgba")[ids] = shown
         case "camera_rotation":
             turned = fields("cam_quat")
             for i, vector in zip(ids, drawn, strict=True):
@@ -127,8 +137,8 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
             field[ids] = _changed(vary, field[ids], values)
 
 
-def _change(vary: Vary, field: NDArray[Any], ids: Ints, drawn: Floats, least: float = -np.inf) -> None:
-    field[ids] = np.maximum(_changed(vary, field[ids], drawn), least)
+def _change(vary: Vary, field: NDArray[Any], ids: Ints, drawn: Floats, bounds: tuple[float, float] = _ANY) -> None:
+    field[ids] = np.clip(_changed(vary, field[ids], drawn), *bounds)
 
 
 def _changed(vary: Vary, values: NDArray[Any], drawn: Floats) -> NDArray[Any]:
@@ -139,6 +149,14 @@ def _changed(vary: Vary, values: NDArray[Any], drawn: Floats) -> NDArray[Any]:
             return values + drawn
         case "set":
             return np.broadcast_to(drawn, values.shape)
+
+
+def _shown_colours(model: mujoco.MjModel, rgba: NDArray[Any], ids: Ints) -> NDArray[Any]:
+    """Return a copy of the colours that are drawn: those of the material, unless a geom has one of its own."""
+    shown, material = rgba[ids], model.geom_matid[ids]
+    covered = np.flatnonzero((material >= 0) & (shown == _NO_COLOUR).all(axis=1))
+    shown[covered] = model.mat_rgba[material[covered]]
+    return shown
 
 
 def _write_gain(what: str, ids: Ints, factors: Floats, model: mujoco.MjModel, fields: Fields) -> None:

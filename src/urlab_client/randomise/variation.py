@@ -24,6 +24,9 @@ MODEL_STREAM, NOISE_STREAM, PUSH_STREAM, DELAY_STREAM, DROP_STREAM = range(5)
 _VISIBLE: Final = {
     "light_diffuse": (),
     "geom_rgba": (),
+    "mat_specular": (),
+    "mat_shininess": (),
+    "mat_reflectance": (),
     "cam_fovy": (),
     "light_pos": ("light_pos0", "light_poscom0"),
     "cam_pos": ("cam_pos0", "cam_poscom0"),

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
+import inspect
 import logging
 import os
 import selectors
@@ -101,10 +101,15 @@ class Job(Generic[T]):
 
     def __init__(self, coro: Coroutine[Any, Any, T]) -> None:
         self.coro = coro
-        self.task: asyncio.Task[T] | None = None
+        self.task: asyncio.Task[None] | None = None
         self.error: BaseException | None = None
         self.finished = False
         self._news: SimpleQueue[None] = SimpleQueue()
+
+    @property
+    def started(self) -> bool:
+        """Whether the coroutine has begun. One that has not must be closed, because cancelling has no effect on it."""
+        return inspect.getcoroutinestate(self.coro) != inspect.CORO_CREATED
 
     def wait(self, timeout: float = _WAIT_SLICE) -> None:
         """Block until the caller has something to check, at most `timeout` seconds."""
@@ -303,27 +308,29 @@ class CallerDrivenLoop:
 
     def _start_job(self, job: Job[Any]) -> None:
         if job in self._jobs:
-            job.task = asyncio.Task(job.coro, loop=self._loop, name="urlab-call")
-            job.task.add_done_callback(functools.partial(self._take_result, job))
+            job.task = asyncio.Task(self._perform(job), loop=self._loop, name="urlab-call")
 
     def _cancel_job(self, job: Job[Any]) -> None:
         if job.task is not None:
             job.task.cancel()
-        elif job in self._jobs:
+        if job in self._jobs and not job.started:  # neither this nor its task will ever run
             self._break_off(job)
 
-    def _take_result(self, job: Job[Any], task: asyncio.Task[Any]) -> None:
-        if task.cancelled():
+    async def _perform(self, job: Job[T]) -> None:
+        # Ends the job itself: a callback of the task would take another turn of the loop, a tenth of a step.
+        try:
+            job.value = await job.coro
+        except GeneratorExit:
+            raise  # the loop ended before the job
+        except asyncio.CancelledError:
             job.error = self._closed("during this call") if self._stopping else asyncio.CancelledError()
-        else:
-            job.error = task.exception()
-            if job.error is None:
-                job.value = task.result()
+        except BaseException as error:  # noqa: BLE001  # raised by the caller
+            job.error = error.with_traceback(error.__traceback__ and error.__traceback__.tb_next)  # without this frame
         self._finish_job(job)
 
     def _break_off(self, job: Job[Any]) -> None:
         job.error = self._closed("during this call")
-        if job.task is None:
+        if not job.started:
             job.coro.close()  # otherwise Python would warn that it was never awaited
         self._finish_job(job)
 

@@ -40,8 +40,8 @@ _JSON = msgspec.json.Decoder(Envelope)
 
 def envelope_of(reply: bytes, op: Op | None = None) -> Envelope:
     """Return the identifying fields of a reply, which is probably one to `op`; empty if the bytes are not a reply."""
-    if op is not None and reply.startswith(_opening_of(op), 1):
-        return Envelope(op.reply_name)  # without looking at the rest, which takes as long as it is
+    if op is not None and reply.startswith((success := _success_of(op))[0], 1):
+        return success[1]  # without looking at the rest, which takes as long as it is
     try:
         return (_JSON if reply[:1] == b"{" else _MSGPACK).decode(reply)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -49,9 +49,9 @@ def envelope_of(reply: bytes, op: Op | None = None) -> Envelope:
 
 
 @cache
-def _opening_of(op: Op) -> bytes:
-    """Return the start of a successful msgpack reply to `op`, after the bytes that encode the length of its map."""
-    return msgspec.msgpack.encode({"op": op.reply_name})[1:]
+def _success_of(op: Op) -> tuple[bytes, Envelope]:
+    """Return what identifies a successful reply to `op`, and its start after the length of its msgpack map."""
+    return msgspec.msgpack.encode({"op": op.reply_name})[1:], Envelope(op.reply_name)
 
 
 def answers(reply: bytes, op: Op) -> bool:

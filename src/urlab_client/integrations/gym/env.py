@@ -144,7 +144,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         if (declared := options.get("randomise")) is not None:
             declared = options["randomise"] = Randomisation.of(declared)
-        client = URLabClient(served_address(address, declared), **client_defaults(client_options))
+        client = URLabClient(served_address(address, declared), **client_defaults(client_options, address))
         try:
             client.discover()
             return cls(client, owns_client=True, **options)

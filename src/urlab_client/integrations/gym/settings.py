@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal, TypedDict, Unpack
 from weakref import WeakValueDictionary
@@ -9,7 +10,7 @@ from weakref import WeakValueDictionary
 import mujoco
 
 from urlab_client.aio.arguments import collection, integer, require, text
-from urlab_client.aio.launch import SCHEME, with_model_options, with_option
+from urlab_client.aio.launch import SCHEME, SHARED_MEMORY, with_model_options, with_option
 from urlab_client.integrations.gym.spaces import Actions, Field, Observation, SpaceMapping, SpaceMode, fields_of
 from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_spelling
 from urlab_client.randomise.declaration import Randomisation
@@ -19,6 +20,10 @@ RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 
 TerminationFn = Callable[[Observation, dict[str, Any]], Any]
 """`(observation, info) -> terminated`."""
+
+
+_REGIONS_BYTES: Final = 64 << 20
+"""Room for the regions of a server with cameras; containers often have as much for all their programs."""
 
 
 class EpisodeOptions(TypedDict, total=False):
@@ -146,13 +151,23 @@ class _NoTask(Task):
     max_episode_steps = None
 
 
-def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
+def client_defaults(options: Mapping[str, Any], address: str = "", servers: int = 1) -> Mapping[str, Any]:
     """Return client options with the defaults of environments filled in.
 
     Environments step physics themselves. A MuJoCo version other than the server's does not stop them; the client only
-    warns about it.
+    warns about it. Servers that are started for a `sim://` address are stepped over shared memory if there is room.
     """
-    return {"step_mode": "direct", "mujoco_version_check": False, **options}
+    shares = address.startswith(SCHEME) and _free_memory() >= servers * _REGIONS_BYTES
+    transport = {"transport": "shm"} if shares else {}
+    return {"step_mode": "direct", "mujoco_version_check": False, **transport, **options}
+
+
+def _free_memory() -> int:
+    """Return the bytes that programs can still share; 0 where the system has no such folder (measured on Linux)."""
+    try:
+        return shutil.disk_usage(SHARED_MEMORY).free
+    except OSError:
+        return 0
 
 
 def served_address(address: str, randomise: Randomisation | None) -> str:

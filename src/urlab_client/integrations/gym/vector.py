@@ -182,10 +182,15 @@ class URLabVectorEnv(OverWire):
         declared = None if randomise is None else Randomisation.of(randomise)
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
-        client_options = client_defaults(client_options)
         starts = asyncio.Semaphore(processor_count())
         self._sessions = [
-            _Session(served_address(address, declared), client_options, settings, declared, starts)
+            _Session(
+                served_address(address, declared),
+                client_defaults(client_options, address, len(addresses)),
+                settings,
+                declared,
+                starts,
+            )
             for address in (with_option(a, "start-timeout", f"{start_timeout:g}", default=True) for a in addresses)
         ]
         self._portal = Portal()
