@@ -173,18 +173,19 @@ class URLabBatchEnv(Vectorized):
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
         key = -1 if keyframe is None else self.mapping.keyframe_id(keyframe)
-        qpos, seeds, noise = self._arrays["qpos"], self.episode_seeds(), self._settings.reset_noise
+        qpos, qvel = self._arrays["qpos"], self._arrays["qvel"]
+        seeds, noise = self.episode_seeds(), self._settings.reset_noise
         if self._varied is not None:
             self._varied.begin(indices, seeds)
         self._batch.reset(indices, key)
         noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
         for i in map(int, indices):
             if self._varied is not None:
-                self._varied.start(i, qpos[i])
+                self._varied.start(i, qpos[i], qvel[i])
             for joints in noisy if noise else ():
                 noise.add(self.rngs[i], self.model, joints, qpos[i])
             if self._memory is not None:
-                qpos[i] = self._memory.begin(i, self.rngs[i], qpos[i])
+                self._memory.begin(i, self.rngs[i], qpos[i], qvel[i])
         self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
@@ -300,11 +301,11 @@ class _CopyVariation:
         if self._variation.derives:
             self._batch.set_const(indices)
 
-    def start(self, i: int, qpos: Floats) -> None:
-        """Vary the start positions of a copy's episode in place, shape (nq,)."""
+    def start(self, i: int, qpos: Floats, qvel: Floats) -> None:
+        """Vary the start of a copy's episode in place: positions, shape (nq,), and velocities, shape (nv,)."""
         draws = self.draws[i]
         if draws is not None:
-            self._variation.start(draws, qpos)
+            self._variation.start(draws, qpos, qvel)
 
     def use_factors(self, key: str, indices: Indices) -> None:
         """Set the gain factors of some copies in the controller of an articulation."""

@@ -17,7 +17,7 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMode
-from urlab_client.errors import URLabError
+from urlab_client.errors import ModeLocked, URLabError
 from urlab_client.integrations._variation import (
     WireVariation,
     compiled_prefixes,
@@ -88,6 +88,7 @@ class EnvEpisode:
             name: client_camera(client, name) for name in filter(None, (*settings.cameras, self.rendered_camera))
         }
         self._frames: dict[str, Pixels] = {}
+        self._step_before = 0
         images = {
             name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
         }
@@ -118,11 +119,12 @@ class EnvEpisode:
         rng: np.random.Generator,
         keyframe: str | None = None,
         seed: int | None = None,
-        begin: Callable[[np.random.Generator, Floats], Floats] | None = None,
+        begin: Callable[[np.random.Generator, Floats, Floats], None] | None = None,
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        `seed` determines what varies; `begin` lets a task choose the start, by positions of the shape (nq,).
+        `seed` determines what varies; `begin` lets a task change the start in place: positions, shape (nq,), and
+        velocities, shape (nv,).
         """
         client = self.client
         keyframe = self.settings.keyframe if keyframe is None else keyframe
@@ -133,19 +135,34 @@ class EnvEpisode:
             if self.over_wire is not None:
                 await self.over_wire.apply(self._draws)
         await client.reset(keyframe, seed)
-        qpos = np.array(self.state()[0])
+        qpos, qvel = map(np.array, self.state()[:2])
         if self.over_wire is not None and self._draws is not None:
-            self.over_wire.variation.start(self._draws, qpos)
+            self.over_wire.variation.start(self._draws, qpos, qvel)
         if self.settings.reset_noise:
             for key in self.mapping.keys:
                 self.settings.reset_noise.add(rng, self.model, self.mapping.scalar_joints(key, self.model), qpos)
         if begin is not None:
-            qpos = begin(rng, qpos)
-        await self._place(qpos)
-        if self._cameras:
-            await self._delay_cameras(seed)
+            begin(rng, qpos, qvel)
+        await self._delay_cameras(seed)
+        looks = bool(self._cameras) or any(observer.step_cameras(0) for observer in client.observers)
+        if not np.array_equal(qvel, self.state()[1]):
+            try:
+                await self._push(qpos, qvel)
+            except ModeLocked as locked:
+                locked.hint = "Start velocities are set in puppet mode: unpin the mode, or start at rest."
+                raise
+        elif looks:
+            await self._place(qpos)
             await self._look(keyframe, seed, qpos)
+        else:
+            await self._place(qpos)
+        self._step_before = client.step_count
         return self._observe()
+
+    @property
+    def step_count(self) -> int:
+        """Physics steps since the reset."""
+        return self.client.step_count - self._step_before
 
     async def close(self) -> None:
         """Undo the variation by ops. If the server is gone, do nothing."""
@@ -203,20 +220,37 @@ class EnvEpisode:
             await self.client.runtime.set_camera_delay(delays)
 
     async def _look(self, keyframe: str | None, seed: int | None, qpos: Floats) -> None:
-        """Take the frames of the current state. Only a puppet step draws without integrating.
+        """Take the frames of the current state, also for a recording.
 
         A puppet step changes the solver's warm start. The reset is therefore repeated, so that rollouts with and
         without cameras are the same.
         """
+        try:
+            await self._push(*self.state()[:2])
+        except ModeLocked:
+            if self._cameras:
+                raise
+            return  # the recording has no picture of the start, and conversions say so
+        if self.client.step_mode is not StepMode.PUPPET:
+            await self.client.reset(keyframe, seed)
+            await self._place(qpos)
+
+    async def _push(self, qpos: Floats, qvel: Floats) -> None:
+        """Set positions and velocities of the whole scene, and take the frames of that state.
+
+        Only a puppet step sets velocities, and only it draws without integrating.
+        """
         client, mode = self.client, self.client.step_mode
+        data = require_local(client.data, "The state of the scene")
         if mode is not StepMode.PUPPET:
             await client.runtime.set_mode(StepMode.PUPPET)
-        await client.step(0, include_cameras=dict.fromkeys(self._cameras, "sync"))
-        self._take_frames()
-        if mode is not StepMode.PUPPET:
-            await client.runtime.set_mode(mode)
-            await client.reset(keyframe, seed)
-            await self._place(qpos)
+        try:
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            await client.step(0, include_cameras=dict.fromkeys(self._cameras, "sync") or False)
+            self._take_frames()
+        finally:
+            if mode is not StepMode.PUPPET:
+                await client.runtime.set_mode(mode)
 
     def _take_frames(self) -> None:
         for name, view in self._cameras.items():

@@ -107,31 +107,51 @@ class Start:
     Attributes:
         scene: The scene.
         qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write in place.
+        qvel: Velocities of the whole scene, shape (nv,), likewise.
         goal: Goal of the episode, by name: numbers or arrays whose shape is the same in all episodes.
         index: Index of the environment.
         memory: What the task keeps of the environment, by name, initially zeros. Write in place.
     """
 
     def __init__(
-        self, scene: TaskScene, qpos: Floats, index: int = 0, memory: Mapping[str, Floats] = MappingProxyType({})
+        self,
+        scene: TaskScene,
+        qpos: Floats,
+        qvel: Floats,
+        index: int = 0,
+        memory: Mapping[str, Floats] = MappingProxyType({}),
     ) -> None:
         self.scene = scene
         self.qpos = qpos
+        self.qvel = qvel
         self.index = index
         self.memory = memory
         self.goal: dict[str, Floats] = {}
 
-    def joint(self, name: str, position: float) -> None:
-        """Set the position of a hinge joint (radians) or slide joint (metres)."""
-        self.qpos[self.scene.model.jnt_qposadr[self.scene.id("joint", name)]] = position
+    def joint(self, name: str, position: float, velocity: float | None = None) -> None:
+        """Set the position of a hinge joint (radians) or slide joint (metres), and its velocity, per second, if given.
+        """
+        joint = self.scene.id("joint", name)
+        self.qpos[self.scene.model.jnt_qposadr[joint]] = position
+        if velocity is not None:
+            self.qvel[self.scene.model.jnt_dofadr[joint]] = velocity
 
-    def place(self, body: str, position: Sequence[float] | Floats, quaternion: Sequence[float] = (1, 0, 0, 0)) -> None:
+    def place(
+        self,
+        body: str,
+        position: Sequence[float] | Floats,
+        quaternion: Sequence[float] = (1, 0, 0, 0),
+        velocity: Sequence[float] | Floats | None = None,
+        spin: Sequence[float] | Floats | None = None,
+    ) -> None:
         """Place a body that has a free joint.
 
         Args:
             body: Name of the body.
             position: Position, metres, world frame, shape (3,).
             quaternion: Orientation, (w, x, y, z), world frame.
+            velocity: Velocity, m/s, world frame, shape (3,); None leaves it as it is.
+            spin: Angular velocity, rad/s, about the axes of the body, shape (3,); None leaves it as it is.
 
         Raises:
             ValueError: The body has no free joint.
@@ -140,9 +160,11 @@ class Start:
         joint = int(model.body_jntadr[body_id])
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError(f"body {body!r} has no free joint, so it cannot be placed")
-        address = int(model.jnt_qposadr[joint])
-        self.qpos[address : address + 3] = position
-        self.qpos[address + 3 : address + 7] = quaternion
+        address, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self.qpos[address : address + 7] = [*position, *quaternion]
+        for at, speed in ((dof, velocity), (dof + 3, spin)):
+            if speed is not None:
+                self.qvel[at : at + 3] = speed
 
     def ground(self, x: float, y: float) -> float:
         """Return the height of the ground at a place, metres: the highest plane, height field or other fixed geom.
@@ -303,14 +325,17 @@ class Memory:
         self._kept = {name: np.zeros((n, *shape)) for name, shape in task.memory.items()}
         self._actions = np.zeros((2, n, scene.mapping.n_actions))
 
-    def begin(self, i: int, rng: np.random.Generator, qpos: Floats) -> Floats:
-        """Let the task choose the start of an episode; return its positions, shape (nq,)."""
+    def begin(self, i: int, rng: np.random.Generator, qpos: Floats, qvel: Floats) -> None:
+        """Let the task change the start of an episode in place: positions, shape (nq,), velocities, shape (nv,)."""
         for values in (*self._kept.values(), *self._actions):
             values[i] = 0.0
-        start = Start(self._scene, qpos.copy(), i, {name: values[i, ...] for name, values in self._kept.items()})
+        start = Start(self._scene, qpos, qvel, i, {name: values[i, ...] for name, values in self._kept.items()})
         self._task.reset(rng, start)
         self._goals[i] = start.goal
-        return start.qpos
+
+    def goal(self, i: int) -> Mapping[str, Floats]:
+        """Return the goal of an environment's episode, by name."""
+        return self._goals[i]
 
     def updated(self, rows: NDArray[np.intp], actions: Floats, qpos: Floats, qvel: Floats, time: Floats) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""

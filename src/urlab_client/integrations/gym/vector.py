@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -21,6 +21,8 @@ from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_option
 from urlab_client.errors import URLabError, refused_for_good
+from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
@@ -36,6 +38,7 @@ class OverWire(Vectorized):
         self._qpos = np.tile(first.model.qpos0, (num_envs, 1))
         self._qvel = np.zeros((num_envs, first.model.nv))
         self._time = np.zeros(num_envs)
+        self._clients: dict[int, URLabClient] = {}
 
     @abstractmethod
     async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
@@ -51,12 +54,19 @@ class OverWire(Vectorized):
         else:
             now, before, late, forces = applied
             observation = await episode.step(now[i], forces.get(i, {}), before[i], int(late[i]))
+        self._clients[i] = episode.client
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
-        self._step_count[i] = episode.client.step_count
+        self._step_count[i] = episode.step_count
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         return self._qpos, self._qvel, self._time
+
+    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
+        for i in indices.tolist():
+            for observer in self._clients[i].observers:
+                if isinstance(observer, Follower) and observer.note is not None:
+                    observer.note(told(i))
 
 
 @dataclass(eq=False)

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from urlab_client.errors import refused_for_good
+from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
@@ -207,12 +208,33 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             truncated[list(errors)] = True
         self._ended = terminated | truncated
         self._totals += rewards
+        self._note(
+            acting if not errors else np.setdiff1d(acting, [*errors]),
+            lambda i: self._transition(i, flat, rewards, terminated, truncated),
+        )
         if self._ended.any():
             if self.task is not None:
                 self._tell_ends(self.task, terminated, errors, infos)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
+
+    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
+        """Tell who records some environments what led to their states. Nobody records a batch, which has no client."""
+
+    def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
+        """Return the start of an environment's episode, or its action with reward, termination and truncation."""
+        goal = {} if self._memory is None else self._memory.goal(i)
+        told: dict[str, Any] = {} if self._success is None else {"success": bool(self._success[i])}
+        told["goal"] = {name: np.ravel(values).tolist() for name, values in goal.items()}
+        if actions is None:
+            return Transition(actions=0, **told)
+        if self.randomise is not None and self.randomise.delays_actions:
+            meant = self.mapping.split(self.mapping.scaled(actions[i]))
+            told["chosen"] = {key: values.tolist() for key, values in meant.items()}
+        reward, terminated, truncated = (values[i].item() for values in judged)
+        told |= {"reward": reward, "terminated": terminated, "truncated": truncated}
+        return Transition(actions=int(self._elapsed[i]), action=actions[i].tolist(), **told)
 
     @property
     def max_episode_steps(self) -> int | None:
@@ -254,6 +276,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
             self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
+            self._note(fresh if not errors else np.setdiff1d(fresh, [*errors]), self._transition)
         if errors:
             self._ended[list(errors)] = True
         return errors
