@@ -71,9 +71,7 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _writer(
-    kind: str, recording: Run, arguments: Namespace, left_out: Counter[str]
-) -> tuple[Callable[..., int], str]:
+def _writer(kind: str, recording: Run, arguments: Namespace, left_out: Counter[str]) -> tuple[Callable[..., int], str]:
     from urlab_client.integrations.record import export
 
     cameras = arguments.camera

@@ -129,8 +129,7 @@ class Start:
         self.goal: dict[str, Floats] = {}
 
     def joint(self, name: str, position: float, velocity: float | None = None) -> None:
-        """Set the position of a hinge joint (radians) or slide joint (metres), and its velocity, per second, if given.
-        """
+        """Set the position of a hinge (radians) or slide joint (metres) and, if given, its velocity, per second."""
         joint = self.scene.id("joint", name)
         self.qpos[self.scene.model.jnt_qposadr[joint]] = position
         if velocity is not None:

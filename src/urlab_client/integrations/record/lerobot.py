@@ -110,7 +110,7 @@ def write_lerobot(
         work, outcomes = Path(temporary), run.outcomes()
         pairs = selected_pairs(table, outcomes, episodes, left_out)
         rate = _rate(run, [*times.values()] or [table.time[pairs.rows]]) if fps is None else fps
-        frames = pairs.part(_resampled(run, table, pairs, rate, [*times.values()], left_out))
+        frames = pairs.part(_resampled(run, table, pairs, rate, pictures=[*times.values()], left_out=left_out))
         if not len(frames.rows):
             raise RecordingError(f"{run.path}: it contains nothing for a dataset.")
         episode, when = table.episode[frames.rows], table.time[frames.rows]
@@ -292,7 +292,7 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
 
 
 def _resampled(
-    run: Run, table: Table, pairs: Pairs, fps: int, pictures: list[NDArray[np.float64]], left_out: Counter[str]
+    run: Run, table: Table, pairs: Pairs, fps: int, *, pictures: list[NDArray[np.float64]], left_out: Counter[str]
 ) -> NDArray[np.intp]:
     """Return the number of the newest pair at each 1/fps seconds of each episode, from its first pictures on."""
     chosen = [np.zeros(0, dtype=np.intp)]
