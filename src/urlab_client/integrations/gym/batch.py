@@ -17,7 +17,7 @@ from urlab_client._mujoco import batch_class, model_names, spans
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
 from urlab_client.integrations.gym.pictures import BatchPictures, PictureScene
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.spaces import Field, Observation
@@ -116,6 +116,8 @@ class URLabBatchEnv(Vectorized):
         )
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
+        if first.measures:
+            self._measured = {name: self._arrays[name] for name in MEASURED}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
         sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
         self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import spans
 from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
@@ -40,6 +41,9 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
+MEASURED: Final = ("sensordata", "ctrl", "act")
+"""What `EnvEpisode.measured` returns."""
+
 
 class EnvEpisode:
     """One client that is reset and stepped as an environment.
@@ -53,6 +57,7 @@ class EnvEpisode:
         rendered_camera: The camera that `render` shows, or None.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
+        measures: Whether the task asks for what `measured` returns.
     """
 
     def __init__(
@@ -81,7 +86,8 @@ class EnvEpisode:
         self.mapping: SpaceMapping = _space_mapping(client, model, settings)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._sensors = {key: [*layout.sensors] for key, layout in layouts.items()}
-        minimal = set(settings.fields) <= set(LEVELS["minimal"])
+        self.measures: bool = settings.task is not None and settings.task.measured
+        minimal = set(settings.fields) <= set(LEVELS["minimal"]) and not self.measures
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self.rendered_camera: str | None = _rendered_camera(client, settings)
         self._cameras = {
@@ -109,6 +115,17 @@ class EnvEpisode:
         """Return the positions and velocities of the whole scene, and the simulation time."""
         data = require_local(self.client.data, "The state of the scene")
         return data.qpos, data.qvel, data.time
+
+    def measured(self) -> dict[str, Floats]:
+        """Return `sensordata`, `ctrl` and `act` of the whole scene if the task asks for them; see `States.measured`."""
+        if not self.measures:
+            return {}
+        data, model = require_local(self.client.data, "The state of the scene"), self.model
+        sensordata = np.zeros(model.nsensordata)
+        for key in self.mapping.keys:
+            ids = [*self.mapping.layout(key).sensors.values()]
+            sensordata[spans(model.sensor_adr[ids], model.sensor_dim[ids])] = self._read(key, "sensors")
+        return dict(zip(MEASURED, (sensordata, data.ctrl, data.act), strict=True))
 
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""

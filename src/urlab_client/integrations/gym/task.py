@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -191,6 +191,15 @@ class Start:
         noise.add(rng, model, self.scene.mapping.scalar_joints(key, model), self.qpos)
 
 
+class Now(NamedTuple):
+    """Positions, velocities, times and what is measured of n environments; see `States`."""
+
+    qpos: Floats
+    qvel: Floats
+    time: Floats
+    measured: Mapping[str, Floats]
+
+
 class States:
     """The states of n environments, as passed to a task. Arrays have a leading axis of n.
 
@@ -207,34 +216,30 @@ class States:
             all articulations are concatenated.
         previous_action: Actions before those, likewise.
         memory: What the task keeps, by name, each with a leading axis. Only `Task.update` may write it.
+        measured: `sensordata`, `ctrl` and `act` of MuJoCo, with a leading axis, if `Task.measured` asks for them.
     """
 
     def __init__(
         self,
         scene: TaskScene,
-        qpos: Floats,
-        qvel: Floats,
-        time: Floats,
+        now: Now,
         goals: Sequence[Mapping[str, Floats]],
         *,
-        index: NDArray[np.intp] | None = None,
-        last_action: Floats | None = None,
-        previous_action: Floats | None = None,
+        index: NDArray[np.intp],
+        last_action: Floats,
+        previous_action: Floats,
         memory: Mapping[str, Floats] = MappingProxyType({}),
     ):
         self.scene = scene
-        self.qpos = qpos
-        self.qvel = qvel
-        self.time = time
+        self.qpos, self.qvel, self.time, self.measured = now
         # An environment without an episode so far has no goal: its row repeats another environment's.
         known = next(filter(None, goals), dict[str, Floats]())
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
-        self.index: NDArray[np.intp] = np.arange(len(qpos)) if index is None else index
-        still = np.zeros((len(qpos), scene.mapping.n_actions))
-        self.last_action: Floats = still if last_action is None else last_action
-        self.previous_action: Floats = still if previous_action is None else previous_action
+        self.index = index
+        self.last_action = last_action
+        self.previous_action = previous_action
         self.memory = memory
 
     def __len__(self) -> int:
@@ -271,16 +276,57 @@ class States:
             one: Name of a body or geom, as in `TaskScene.geoms`, or several, such as the feet.
             other: What they touch: a name, or several of which one suffices; anything by default.
         """
+        owner, pairs, _ = self._contacts
+        return self._summed(one, other, owner, pairs, np.ones(len(owner))) > 0
+
+    def contact_force(self, one: str | Sequence[str], other: str | Sequence[str] | None = None) -> Floats:
+        """Return the sum of the normal forces where bodies or geoms touch, newtons, with the arguments of `touching`.
+
+        This process computes them for the state after the step, from positions, velocities, controls and activations.
+        They leave out pushes, and what `randomise` varies of the model.
+
+        Raises:
+            ValueError: The task does not set `measured`.
+        """
+        owner, pairs, forces = self._forces
+        return self._summed(one, other, owner, pairs, forces)
+
+    def sensor(self, name: str) -> Floats:
+        """Return the readings of a sensor, shape (n, length), as MuJoCo leaves them in the last physics step.
+
+        Raises:
+            KeyError: There is no such sensor, or it belongs to no articulation, so that servers do not send it.
+            ValueError: The task does not set `measured`.
+        """
+        model, layouts = self.scene.model, map(self.scene.mapping.layout, self.scene.mapping.keys)
+        sensor = self.scene.id("sensor", name)
+        if not any(sensor in layout.sensors.values() for layout in layouts):
+            raise KeyError(f"sensor {name!r} belongs to no articulation, so servers do not send it")
+        start = int(model.sensor_adr[sensor])
+        return self._measured("sensordata")[:, start : start + int(model.sensor_dim[sensor])]
+
+    def _measured(self, name: str) -> Floats:
+        if name not in self.measured:
+            raise ValueError("sensors and contact forces are there only if the task sets measured = True")
+        return self.measured[name]
+
+    def _summed(
+        self,
+        one: str | Sequence[str],
+        other: str | Sequence[str] | None,
+        owner: NDArray[np.intp],
+        pairs: NDArray[np.int32],
+        values: Floats,
+    ) -> Floats:
+        """Return the sum of the values of the contacts between geoms, shape (n,), or (n, k) for k names in `one`."""
         if not isinstance(one, str):
-            return np.stack([self.touching(name, other) for name in one], axis=-1)
-        owner, pairs = self._contacts
+            return np.stack([self._summed(name, other, owner, pairs, values) for name in one], axis=-1)
         first, second = self._marked([one]), np.ones(self.scene.model.ngeom, dtype=bool)
         if other is not None:
             second = self._marked([other] if isinstance(other, str) else other)
         a, b = pairs.T
-        found = np.zeros(len(self), dtype=bool)
-        found[owner[(first[a] & second[b]) | (first[b] & second[a])]] = True
-        return found
+        which = (first[a] & second[b]) | (first[b] & second[a])
+        return np.bincount(owner[which], values[which], len(self)).astype(np.float64)
 
     def _marked(self, names: Sequence[str]) -> Bools:
         """Return which geoms of the model have one of these names, shape (ngeom,)."""
@@ -301,17 +347,44 @@ class States:
         return found
 
     @cached_property
-    def _contacts(self) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-        """The state of each contact, shape (contacts,), and its two geoms, shape (contacts, 2)."""
-        model, data = self.scene.model, self.scene.data
-        found: list[NDArray[np.int32]] = []
-        for qpos in self.qpos:
-            data.qpos[:] = qpos
+    def _contacts(self) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
+        """The state of each contact, shape (contacts,), its two geoms, shape (contacts, 2), and zeros."""
+
+        def collide(i: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_collision(model, data)
-            found.append(np.array(data.contact.geom).reshape(-1, 2))
-        return np.repeat(np.arange(len(self)), [len(pairs) for pairs in found]), np.concatenate(found)
+
+        return self._found(collide)
+
+    @cached_property
+    def _forces(self) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
+        """The same, with the normal force of each contact, newtons."""
+        ctrl, act = self._measured("ctrl"), self._measured("act")
+
+        def solve(i: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            data.qvel[:], data.ctrl[:], data.act[:], data.qacc_warmstart[:] = self.qvel[i], ctrl[i], act[i], 0.0
+            mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
+
+        return self._found(solve, forces=True)
+
+    def _found(
+        self, compute: Callable[[int, mujoco.MjModel, mujoco.MjData], None], *, forces: bool = False
+    ) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
+        model, data, wrench = self.scene.model, self.scene.data, np.zeros(6)
+        counts: list[int] = []
+        pairs: list[NDArray[np.int32]] = []
+        normal: list[float] = []
+        for i, qpos in enumerate(self.qpos):
+            data.qpos[:] = qpos
+            compute(i, model, data)
+            counts.append(data.ncon)
+            pairs.append(np.array(data.contact.geom).reshape(-1, 2))
+            for contact in range(data.ncon):
+                if forces:
+                    mujoco.mj_contactForce(model, data, contact, wrench)
+                normal.append(float(wrench[0]))
+        return np.repeat(np.arange(len(self)), counts), np.concatenate(pairs), np.array(normal)
 
 
 class Memory:
@@ -336,10 +409,10 @@ class Memory:
         """Return the goal of an environment's episode, by name."""
         return self._goals[i]
 
-    def updated(self, rows: NDArray[np.intp], actions: Floats, qpos: Floats, qvel: Floats, time: Floats) -> States:
+    def updated(self, rows: NDArray[np.intp], actions: Floats, now: Now) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
         self._actions[1, rows], self._actions[0, rows] = self._actions[0, rows], actions
-        states = self.states(rows, qpos, qvel, time)
+        states = self.states(rows, now)
         if self._kept:
             _set_writeable(states.memory, True)
             self._task.update(states)
@@ -348,16 +421,14 @@ class Memory:
             _set_writeable(states.memory, False)
         return states
 
-    def states(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats, time: Floats) -> States:
+    def states(self, rows: NDArray[np.intp], now: Now) -> States:
         """Return the states of some environments, in the form that is passed to the task."""
         last, previous = self._actions[:, rows]
         memory = {name: values[rows] for name, values in self._kept.items()}
         _set_writeable(memory, False)  # a write would be lost, except in `update`
         return States(
             self._scene,
-            qpos,
-            qvel,
-            time,
+            now,
             [self._goals[int(i)] for i in rows],
             index=rows,
             last_action=last,
@@ -476,6 +547,8 @@ class Task:
         actions: How actions become set-points, for all articulations or by key. None: actions are set-points.
         memory: Shape of each array that the task keeps of an environment, such as a phase, air times or contact
             timers, by name: `{"air_time": (4,), "phase": ()}`. They are zeros at a reset; `update` advances them.
+        measured: Whether methods ask for `States.sensor` or `States.contact_force`. Servers then send with each step
+            the readings, controls and activations.
         n_substeps: Physics steps per action.
         max_episode_steps: Actions per episode, or None for no limit.
         keyframe: Keyframe in which episodes start before `reset` changes the start, or None for the initial state.
@@ -491,6 +564,7 @@ class Task:
     n_observed: ClassVar[int] = 0
     actions: ClassVar[Actions | Mapping[str, Actions] | None] = None
     memory: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
+    measured: ClassVar[bool] = False
     n_substeps: ClassVar[int] = 10
     max_episode_steps: ClassVar[int | None] = 200
     keyframe: ClassVar[str | None] = None

@@ -23,7 +23,7 @@ from urlab_client.aio.launch import SCHEME, with_option
 from urlab_client.errors import URLabError, refused_for_good
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import Transition
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
@@ -39,6 +39,9 @@ class OverWire(Vectorized):
         self._qvel = np.zeros((num_envs, first.model.nv))
         self._time = np.zeros(num_envs)
         self._clients: dict[int, URLabClient] = {}
+        if first.measures:
+            widths = first.model.nsensordata, first.model.nu, first.model.na
+            self._measured = {name: np.zeros((num_envs, width)) for name, width in zip(MEASURED, widths, strict=True)}
 
     @abstractmethod
     async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
@@ -57,6 +60,8 @@ class OverWire(Vectorized):
         self._clients[i] = episode.client
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
+        for name, values in episode.measured().items():
+            self._measured[name][i] = values
         self._step_count[i] = episode.step_count
 
     def _state(self) -> tuple[Floats, Floats, Floats]:

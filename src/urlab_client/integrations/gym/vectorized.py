@@ -18,7 +18,7 @@ from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
-from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, observed, succeeded, with_task
+from urlab_client.integrations.gym.task import EpisodeEnd, Now, States, Task, judged, observed, succeeded, with_task
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
@@ -121,6 +121,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._all.flags.writeable = False
         self.rngs: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
         self._recent: States | None = None
+        self._measured: Mapping[str, Floats] = {}  # of all environments, as in `States`
         self._memory = settings.memory(first.model, mapping, num_envs)
 
     @abstractmethod
@@ -224,7 +225,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
         """Return the start of an environment's episode, or its action with reward, termination and truncation."""
-        goal = {} if self._memory is None else self._memory.goal(i)
+        goal: Mapping[str, Floats] = {} if self._memory is None else self._memory.goal(i)
         told: dict[str, Any] = {} if self._success is None else {"success": bool(self._success[i])}
         told["goal"] = {name: np.ravel(values).tolist() for name, values in goal.items()}
         if actions is None:
@@ -285,8 +286,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Let the task update what it keeps after actions; ask what it observes, and for success, after all moves."""
         self._recent = None
         if self._memory is not None and actions is not None and len(acted):
-            rows = (values[acted] for values in self._state())
-            self._recent = self._memory.updated(acted, actions[acted], *rows)
+            self._recent = self._memory.updated(acted, actions[acted], self._now(acted))
         states = self._states(moved)
         found, success = observed(task, states), succeeded(task, states)
         if self._of_task is not None:
@@ -301,8 +301,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self._memory is None:
             raise ValueError("this environment has no task")
         if self._recent is None or self._recent.index is not indices:
-            self._recent = self._memory.states(indices, *(values[indices] for values in self._state()))
+            self._recent = self._memory.states(indices, self._now(indices))
         return self._recent
+
+    def _now(self, indices: Indices) -> Now:
+        measured = {name: values[indices] for name, values in self._measured.items()}
+        qpos, qvel, time = (values[indices] for values in self._state())
+        return Now(qpos, qvel, time, measured)
 
     def _judged(
         self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
