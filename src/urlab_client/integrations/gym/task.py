@@ -411,7 +411,9 @@ class Memory:
 
     def updated(self, rows: NDArray[np.intp], actions: Floats, now: Now) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
-        self._actions[1, rows], self._actions[0, rows] = self._actions[0, rows], actions
+        last, previous = self._actions
+        previous[rows] = taken(last, rows)
+        last[rows] = actions
         states = self.states(rows, now)
         if self._kept:
             _set_writeable(states.memory, True)
@@ -423,8 +425,8 @@ class Memory:
 
     def states(self, rows: NDArray[np.intp], now: Now) -> States:
         """Return the states of some environments, in the form that is passed to the task."""
-        last, previous = self._actions[:, rows]
-        memory = {name: values[rows] for name, values in self._kept.items()}
+        last, previous = (taken(actions, rows) for actions in self._actions)
+        memory = {name: taken(values, rows) for name, values in self._kept.items()}
         _set_writeable(memory, False)  # a write would be lost, except in `update`
         return States(
             self._scene,
@@ -435,6 +437,11 @@ class Memory:
             previous_action=previous,
             memory=memory,
         )
+
+
+def taken(values: Floats, rows: NDArray[np.intp]) -> Floats:
+    """Return a copy of different rows; copying all of them takes a third of the time that indexing takes."""
+    return values.copy() if len(rows) == len(values) else values[rows]
 
 
 def _set_writeable(arrays: Mapping[str, Floats], writeable: bool) -> None:

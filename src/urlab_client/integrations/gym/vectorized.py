@@ -18,7 +18,17 @@ from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
-from urlab_client.integrations.gym.task import EpisodeEnd, Now, States, Task, judged, observed, succeeded, with_task
+from urlab_client.integrations.gym.task import (
+    EpisodeEnd,
+    Now,
+    States,
+    Task,
+    judged,
+    observed,
+    succeeded,
+    taken,
+    with_task,
+)
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
@@ -305,9 +315,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return self._recent
 
     def _now(self, indices: Indices) -> Now:
-        measured = {name: values[indices] for name, values in self._measured.items()}
-        qpos, qvel, time = (values[indices] for values in self._state())
-        return Now(qpos, qvel, time, measured)
+        measured = {name: taken(values, indices) for name, values in self._measured.items()}
+        qpos, qvel, time = self._state()
+        return Now(taken(qpos, indices), taken(qvel, indices), taken(time, indices), measured)
 
     def _judged(
         self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
@@ -347,9 +357,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
         """Return what is known about each environment, and below `_NAME` of which ones it is."""
-        infos: dict[str, Any] = {}
+        infos, everyone = dict[str, Any](), np.ones(self.num_envs, dtype=bool)
         for name, values in self._clocks().items():
-            infos[name], infos[f"_{name}"] = values, np.ones(self.num_envs, dtype=bool)
+            infos[name], infos[f"_{name}"] = values, everyone
         if self._success is not None:
             known = self._begun.copy()
             known[list(errors)] = False
