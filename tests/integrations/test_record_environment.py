@@ -12,7 +12,7 @@ import pytest
 
 import urlab_client
 from tests.integrations.test_record_export import lerobot, run  # noqa: F401  # a fixture
-from urlab_client.integrations.gym import Reach, States, URLabEnv
+from urlab_client.integrations.gym import Reach, States, URLabEnv, URLabVectorEnv
 from urlab_client.integrations.record import read_run, record, transitions_of
 from urlab_client.integrations.record.export import write_lerobot
 from urlab_client.randomise import Delay, Randomisation
@@ -178,6 +178,21 @@ def test_a_recording_has_a_picture_of_each_start(
     pairs, times = transitions_of(whole), whole.picture_times("arm/wrist")
     assert len(pairs) == len(told)
     assert np.isin(pairs.time.round(6), times.round(6)).all(), "each pair has its own picture"
+
+
+def test_servers_in_lockstep_are_recorded_each_into_a_file(tmp_path: Path) -> None:
+    servers = URLabVectorEnv(Brief.scene_address, 2, task=Brief())
+    with servers.recording(tmp_path / "runs", pose_hz=0) as files:
+        servers.reset(seed=5)
+        rewards = [servers.step(np.full((2, 7), 0.1, dtype=np.float32))[1].tolist() for _ in range(5)]
+    with pytest.raises(FileExistsError), servers.recording(tmp_path / "runs"):
+        pass
+    servers.close()
+    for number, file in enumerate(files):
+        pairs = transitions_of(read_run(file))
+        told = [each[number] for i, each in enumerate(rewards) if i != 3]  # the fourth step begins an episode
+        assert pairs.columns["task/reward"].values[:, 0].tolist() == told
+        assert pairs.episode.tolist() == [0, 0, 0, 1]
 
 
 def test_record_runs_episodes_of_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -146,7 +146,7 @@ class SpaceMapping:
         self._clip = self._low.copy(), self._high.copy()
         for key, where in self._inputs.items():
             self._low[where], self._high[where] = self._bounds(key)
-        declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else dict(actions or {})
+        declared = dict.fromkeys(self._inputs, actions) if isinstance(actions, Actions) else dict(actions or {})
         if wrong := declared.keys() - prefixes.keys():
             raise ValueError(f"actions of {', '.join(sorted(wrong))}; the articulations are: {', '.join(self.keys)}")
         for key, each in declared.items():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Unpack
 
@@ -228,6 +230,34 @@ class URLabVectorEnv(OverWire):
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         black = np.zeros_like(next(iter(self._pictures.values())))
         return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
+
+    @contextlib.contextmanager
+    def recording(self, folder: str | os.PathLike[str], **options: Any) -> Generator[list[Path]]:
+        """Record environment i into `folder/i.mcap` while the block runs; yield the files.
+
+        An environment that loses its client is recorded until then.
+
+        Args:
+            folder: The folder, which is made if necessary.
+            options: Options of `urlab_client.integrations.record.record`.
+
+        Raises:
+            FileExistsError: A file exists, and `overwrite` was not given.
+            RecordingError: Writing failed.
+        """
+        from urlab_client.integrations.record import record
+
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        files: list[Path] = []
+        stack = contextlib.AsyncExitStack()
+        try:
+            for i, session in enumerate(self._sessions):
+                episode = self._portal.call(session.ready)
+                files.append(Path(folder) / f"{i}.mcap")
+                self._portal.call(stack.enter_async_context, record(episode.client, files[-1], **options))
+            yield files
+        finally:
+            self._portal.call(stack.aclose)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients and the servers that they started, and let the task serve another environment."""
