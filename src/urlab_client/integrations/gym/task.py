@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -276,8 +276,7 @@ class States:
             one: Name of a body or geom, as in `TaskScene.geoms`, or several, such as the feet.
             other: What they touch: a name, or several of which one suffices; anything by default.
         """
-        owner, pairs, _ = self._contacts
-        return self._summed(one, other, owner, pairs, np.ones(len(owner))) > 0
+        return self._summed(one, other, self._contacts) > 0
 
     def contact_force(self, one: str | Sequence[str], other: str | Sequence[str] | None = None) -> Floats:
         """Return the sum of the normal forces where bodies or geoms touch, newtons, with the arguments of `touching`.
@@ -288,8 +287,7 @@ class States:
         Raises:
             ValueError: The task does not set `measured`.
         """
-        owner, pairs, forces = self._forces
-        return self._summed(one, other, owner, pairs, forces)
+        return self._summed(one, other, self._forces)
 
     def sensor(self, name: str) -> Floats:
         """Return the readings of a sensor, shape (n, length), as MuJoCo leaves them in the last physics step.
@@ -310,23 +308,16 @@ class States:
             raise ValueError("sensors and contact forces are there only if the task sets measured = True")
         return self.measured[name]
 
-    def _summed(
-        self,
-        one: str | Sequence[str],
-        other: str | Sequence[str] | None,
-        owner: NDArray[np.intp],
-        pairs: NDArray[np.int32],
-        values: Floats,
-    ) -> Floats:
-        """Return the sum of the values of the contacts between geoms, shape (n,), or (n, k) for k names in `one`."""
+    def _summed(self, one: str | Sequence[str], other: str | Sequence[str] | None, contacts: _Contacts) -> Floats:
+        """Return the sum of the forces of the contacts between geoms, shape (n,), or (n, k) for k names in `one`."""
         if not isinstance(one, str):
-            return np.stack([self._summed(name, other, owner, pairs, values) for name in one], axis=-1)
+            return np.stack([self._summed(name, other, contacts) for name in one], axis=-1)
         first, second = self._marked([one]), np.ones(self.scene.model.ngeom, dtype=bool)
         if other is not None:
             second = self._marked([other] if isinstance(other, str) else other)
-        a, b = pairs.T
+        a, b = contacts.geoms.T
         which = (first[a] & second[b]) | (first[b] & second[a])
-        return np.bincount(owner[which], values[which], len(self)).astype(np.float64)
+        return np.bincount(contacts.owner[which], contacts.force[which], len(self)).astype(np.float64)
 
     def _marked(self, names: Sequence[str]) -> Bools:
         """Return which geoms of the model have one of these names, shape (ngeom,)."""
@@ -347,44 +338,44 @@ class States:
         return found
 
     @cached_property
-    def _contacts(self) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
-        """The state of each contact, shape (contacts,), its two geoms, shape (contacts, 2), and zeros."""
-
-        def collide(i: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_collision(model, data)
-
-        return self._found(collide)
+    def _contacts(self) -> _Contacts:
+        return self._found(forces=False)
 
     @cached_property
-    def _forces(self) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
-        """The same, with the normal force of each contact, newtons."""
-        ctrl, act = self._measured("ctrl"), self._measured("act")
+    def _forces(self) -> _Contacts:
+        return self._found(forces=True)
 
-        def solve(i: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-            data.qvel[:], data.ctrl[:], data.act[:], data.qacc_warmstart[:] = self.qvel[i], ctrl[i], act[i], 0.0
-            mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
-
-        return self._found(solve, forces=True)
-
-    def _found(
-        self, compute: Callable[[int, mujoco.MjModel, mujoco.MjData], None], *, forces: bool = False
-    ) -> tuple[NDArray[np.intp], NDArray[np.int32], Floats]:
-        model, data, wrench = self.scene.model, self.scene.data, np.zeros(6)
+    def _found(self, *, forces: bool) -> _Contacts:
+        model, data = self.scene.model, self.scene.data
         counts: list[int] = []
-        pairs: list[NDArray[np.int32]] = []
+        geoms: list[NDArray[np.int32]] = []
         normal: list[float] = []
+        wrench = np.ones(6)
         for i, qpos in enumerate(self.qpos):
             data.qpos[:] = qpos
-            compute(i, model, data)
+            if forces:
+                data.qvel[:], data.qacc_warmstart[:] = self.qvel[i], 0.0
+                data.ctrl[:], data.act[:] = self._measured("ctrl")[i], self._measured("act")[i]
+                mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
+            else:
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_collision(model, data)
             counts.append(data.ncon)
-            pairs.append(np.array(data.contact.geom).reshape(-1, 2))
+            geoms.append(np.array(data.contact.geom).reshape(-1, 2))
             for contact in range(data.ncon):
                 if forces:
                     mujoco.mj_contactForce(model, data, contact, wrench)
                 normal.append(float(wrench[0]))
-        return np.repeat(np.arange(len(self)), counts), np.concatenate(pairs), np.array(normal)
+        return _Contacts(np.repeat(np.arange(len(self)), counts), np.concatenate(geoms), np.array(normal))
+
+
+class _Contacts(NamedTuple):
+    """The state of each contact, shape (c,), its geoms, shape (c, 2), and its normal force, newtons, or else 1."""
+
+    owner: NDArray[np.intp]
+    geoms: NDArray[np.int32]
+    force: Floats
 
 
 class Memory:

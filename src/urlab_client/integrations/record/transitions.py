@@ -108,9 +108,9 @@ def _judged(table: Table) -> dict[int, str]:
         return {}
     success = column.values[:, 0]
     told = np.flatnonzero(np.isfinite(success))
-    episodes = table.episode[told]
-    last = told[np.append(np.diff(episodes) > 0, True)]
-    return {int(table.episode[row]): "success" if success[row] else "failure" for row in last.tolist()}
+    episodes, last = np.unique(table.episode[told][::-1], return_index=True)
+    outcomes = np.where(success[told[::-1][last]] > 0, "success", "failure")
+    return dict(zip(episodes.tolist(), outcomes.tolist(), strict=True))
 
 
 def pairs_at(table: Table, pairs: Pairs) -> Table:
