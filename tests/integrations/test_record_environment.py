@@ -169,6 +169,7 @@ def test_a_recording_has_a_picture_of_each_start(
     env = URLabEnv(client, task=Brief())
     before = drive(env, ELBOW)
     with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50):
+        env.reset()
         told = drive(env, ELBOW)
     env.close()
     for ours, theirs in zip(told, before, strict=True):
@@ -177,6 +178,7 @@ def test_a_recording_has_a_picture_of_each_start(
     whole = read_run(tmp_path / "run.mcap")
     pairs, times = transitions_of(whole), whole.picture_times("arm/wrist")
     assert len(pairs) == len(told)
+    assert len(times) == 1 + len(ELBOW) + len(told), "one of every reset, also of two without a step in between"
     assert np.isin(pairs.time.round(6), times.round(6)).all(), "each pair has its own picture"
 
 
