@@ -222,24 +222,31 @@ class States:
     def __init__(
         self,
         scene: TaskScene,
-        now: Now,
+        qpos: Floats,
+        qvel: Floats,
+        time: Floats,
         goals: Sequence[Mapping[str, Floats]],
         *,
-        index: NDArray[np.intp],
-        last_action: Floats,
-        previous_action: Floats,
+        index: NDArray[np.intp] | None = None,
+        last_action: Floats | None = None,
+        previous_action: Floats | None = None,
         memory: Mapping[str, Floats] = MappingProxyType({}),
+        measured: Mapping[str, Floats] = MappingProxyType({}),
     ):
         self.scene = scene
-        self.qpos, self.qvel, self.time, self.measured = now
+        self.qpos = qpos
+        self.qvel = qvel
+        self.time = time
+        self.measured = measured
         # An environment without an episode so far has no goal: its row repeats another environment's.
         known = next(filter(None, goals), dict[str, Floats]())
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
-        self.index = index
-        self.last_action = last_action
-        self.previous_action = previous_action
+        self.index: NDArray[np.intp] = np.arange(len(qpos)) if index is None else index
+        shape = len(qpos), scene.mapping.n_actions
+        self.last_action: Floats = np.zeros(shape) if last_action is None else last_action
+        self.previous_action: Floats = np.zeros(shape) if previous_action is None else previous_action
         self.memory = memory
 
     def __len__(self) -> int:
@@ -421,12 +428,15 @@ class Memory:
         _set_writeable(memory, False)  # a write would be lost, except in `update`
         return States(
             self._scene,
-            now,
+            now.qpos,
+            now.qvel,
+            now.time,
             [self._goals[int(i)] for i in rows],
             index=rows,
             last_action=last,
             previous_action=previous,
             memory=memory,
+            measured=now.measured,
         )
 
 
