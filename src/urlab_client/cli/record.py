@@ -77,14 +77,15 @@ def run(arguments: Namespace) -> int:
 
 def _record_task(arguments: Namespace) -> Recorder:
     """Run episodes of a task with actions of zero, or the nearest that the action space allows."""
-    from gymnasium.spaces import flatten_space, unflatten
+    import gymnasium
 
     from urlab_client.integrations.record import record
 
     with task_environment(arguments) as env:
         recorder = record(env.client, arguments.output, **recording_options(arguments))
-        space: Any = flatten_space(env.action_space)
-        still = unflatten(env.action_space, np.clip(np.zeros(space.shape, space.dtype), space.low, space.high))
+        spaces: Any = gymnasium.spaces
+        space = spaces.flatten_space(env.action_space)
+        still = spaces.unflatten(env.action_space, np.clip(np.zeros(space.shape, space.dtype), space.low, space.high))
         seed, done, over = arguments.seed, 0.0, True
         with (
             contextlib.suppress(KeyboardInterrupt),
