@@ -228,9 +228,9 @@ def rllib() -> str:
 
 
 def lerobot(python: str) -> str:
-    """LeRobot reads back what was driven: each observation with the action taken at it, and its picture."""
+    """LeRobot reads back what was driven: each observation with the action taken at it, its picture and its reward."""
     rng = np.random.default_rng(1)
-    driven: list[tuple[int, Any, Any, Any]] = []
+    driven: list[tuple[int, Any, Any, Any, float, bool]] = []
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         env = gymnasium.make(
@@ -240,10 +240,14 @@ def lerobot(python: str) -> str:
         with record(client, work / "run.mcap", cameras=["arm/overview"], camera_hz=50, image_format="png"):
             for episode, steps in enumerate((30, 20)):
                 seen, _ = env.reset(seed=episode)
-                for _ in range(steps):
+                for step in range(steps):
                     action = {"arm": rng.uniform(-0.3, 0.3, 7).astype(np.float32)}
-                    driven.append((episode, seen["arm"]["qpos"], action["arm"], seen["cameras"]["arm/overview"]))
-                    seen, *_ = env.step(action)
+                    after, reward, *_ = env.step(action)
+                    # The second episode is broken off, and no other follows.
+                    done = (episode, step) == (0, steps - 1)
+                    before = seen["arm"]["qpos"], action["arm"], seen["cameras"]["arm/overview"]
+                    driven.append((episode, *before, float(reward), done))
+                    seen = after
         env.close()
         run = read_run(work / "run.mcap")
         for video in (True, False):
@@ -256,7 +260,7 @@ def lerobot(python: str) -> str:
                 about = json.loads(str(back["about"]))
                 if about["fps"] != 50 or about["robot_type"] != "arm" or set(about["tasks"]) != {"wave"}:
                     raise AssertionError(about)
-                for name, column in (("episode", 0), ("state", 1), ("action", 2)):
+                for name, column in (("episode", 0), ("state", 1), ("action", 2), ("reward", 4), ("done", 5)):
                     if not np.array_equal(back[name], np.array([row[column] for row in driven], back[name].dtype)):
                         raise AssertionError(f"{name} differs from what was driven")
                 pictures = np.array([row[3][..., :3] for row in driven])
@@ -323,6 +327,8 @@ np.savez(
     episode=np.array([int(row["episode_index"]) for row in rows]),
     state=np.array([row["observation.state"].numpy() for row in rows]),
     action=np.array([row["action"].numpy() for row in rows]),
+    reward=np.array([row["next.reward"].item() for row in rows], np.float32),
+    done=np.array([row["next.done"].item() for row in rows]),
     pictures=np.array(
         [
             np.rint(row["observation.images.arm.overview"].numpy() * 255).transpose(1, 2, 0).astype(np.uint8)

@@ -246,7 +246,7 @@ def test_poses_and_contacts_are_those_of_the_state(naming: Any, made: list[Any])
     with pytest.raises(KeyError, match=r"^no body 'quadruped/tail'\. .*quadruped_"):
         states.body_position("quadruped/tail")
     with pytest.raises(ValueError, match="has no free joint"):
-        Start(states.scene, states.qpos[0]).place("quadruped/FL_calf", [0, 0, 0])
+        Start(states.scene, states.qpos[0], states.qvel[0]).place("quadruped/FL_calf", [0, 0, 0])
 
 
 def test_an_argument_wins_over_the_task_and_what_is_judged_needs_not_be_observed(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from urlab_client.errors import UnknownKeyframe
+from urlab_client.errors import ModeLocked, UnknownKeyframe
 from urlab_client.integrations.gym import (
     Actions,
     EpisodeEnd,
@@ -23,7 +23,7 @@ from urlab_client.integrations.gym import (
     URLabVectorEnv,
     Walk,
 )
-from urlab_client.randomise.declaration import Delay, Randomisation
+from urlab_client.randomise.declaration import Delay, Randomisation, Vary
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 LEVER = """
@@ -355,7 +355,8 @@ HILLS = """
 """
 
 
-def test_episodes_start_on_slopes_and_height_fields(tmp_path: Path, made: list[Any]) -> None:
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_episodes_start_on_slopes_and_height_fields(tmp_path: Path, made: list[Any], dialect: Any) -> None:
     """The same place on a server and in a batch, whatever moves above it."""
 
     class Settle(Task):
@@ -374,7 +375,7 @@ def test_episodes_start_on_slopes_and_height_fields(tmp_path: Path, made: list[A
 
     model = tmp_path / "hills.xml"
     model.write_text(HILLS)
-    with SimulatedServer(model, play=True, step_mode="direct") as server:
+    with SimulatedServer(model, play=True, step_mode="direct", dialect=dialect) as server:
         address = f"{server.address}:{server.step_port}"
         batch = URLabBatchEnv(address, 1, task=Settle())
         env = URLabEnv.connect(address, task=Settle())
@@ -385,3 +386,116 @@ def test_episodes_start_on_slopes_and_height_fields(tmp_path: Path, made: list[A
     assert Settle.seen[:12:2] == Settle.seen[1:12:2]
     found = {round(height, 3) for height in Settle.seen}
     assert found == {0.25, 0.5, 0.558}, "the slope, the summit and the ramp"
+
+
+CRATE = LEVER.replace(
+    "</worldbody>",
+    """<body name="crate" pos="0 0.5 0.099"><freejoint/><geom name="crate" type="box" size=".1 .1 .1" mass="1"/></body>
+    </worldbody><sensor><jointvel name="speed" joint="hinge"/><actuatorfrc name="push" actuator="servo"/></sensor>""",
+).replace('qpos="0.5"', 'qpos="0.5 0 0.5 0.099 1 0 0 0"')
+
+
+class Thrown(Task):
+    """The lever and the crate are moving when an episode starts."""
+
+    observations: ClassVar[Any] = "standard"
+    keyframe: ClassVar[str | None] = "raised"
+    measured: ClassVar[bool] = True
+    n_observed: ClassVar[int] = 4
+    n_substeps: ClassVar[int] = 5
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        start.joint("lever/hinge", 0.3, velocity=rng.uniform(1, 2))
+        start.place("lever/crate", [0, 0.5, 0.3], velocity=[0.5, 0.0, -1.0], spin=rng.uniform(-1, 1, 3))
+
+    def observe(self, states: States) -> Any:
+        force = states.contact_force(["lever/crate", "lever/lever"], "lever/floor")
+        return np.concatenate([force, states.sensor("lever/speed"), states.sensor("lever/push")], axis=1)
+
+    def reward(self, states: States, actions: Any) -> Any:
+        return states.qvel[:, 0]
+
+
+@pytest.fixture(scope="module", params=["alpha", "beta"])
+def crates(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a server whose step mode may change."""
+    model = tmp_path_factory.mktemp("crate") / "lever.xml"
+    model.write_text(CRATE)
+    with SimulatedServer(model, play=True, dialect=request.param) as server:
+        yield f"{server.address}:{server.step_port}"
+
+
+SPEEDS = Randomisation(
+    vary=(
+        Vary(what="velocity", add=(-1.0, 1.0)),
+        Vary(what="base_velocity", set=((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0))),
+        Vary(what="base_spin", add=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))),
+    )
+)
+
+
+@pytest.mark.parametrize("randomise", [None, SPEEDS])
+def test_episodes_start_with_velocities(crates: str, made: list[Any], randomise: Randomisation | None) -> None:
+    """The same in a batch and over both dialects, whose protocols set velocities in puppet mode alone."""
+    batch = URLabBatchEnv(crates, 1, task=Thrown(), randomise=randomise)
+    env = URLabEnv.connect(crates, task=Thrown(), randomise=randomise)
+    made += [batch, env]
+    starts: list[Any] = []
+    for seed in (0, 1, 0):
+        theirs, (ours, info) = batch.reset(seed=seed)[0][0], env.reset(seed=seed)
+        assert np.array_equal(ours, theirs)
+        assert (info["step_count"], info["sim_time"]) == (0, 0.0)
+        starts.append(ours)
+        qvel = env.mapping.field(ours, "lever", "qvel")
+        if randomise is None:
+            assert 1.0 < qvel[0] < 2.0
+            assert qvel[1:4].tolist() == [0.5, 0.0, -1.0]
+        action = np.array([0.2], dtype=np.float32)
+        for _ in range(3):
+            theirs, (ours, reward, *_, info) = batch.step(action[None]), env.step(action)
+            assert np.array_equal(ours, theirs[0][0])
+            assert reward == theirs[1][0]
+        assert info["step_count"] == 15
+    assert np.array_equal(starts[0], starts[2])
+    assert not np.array_equal(starts[0], starts[1])
+
+
+def test_start_velocities_that_a_pinned_server_cannot_set_are_refused(tmp_path: Path, made: list[Any]) -> None:
+    model = tmp_path / "lever.xml"
+    model.write_text(CRATE)
+    with SimulatedServer(model, play=True, step_mode="direct") as server:
+        env = URLabEnv.connect(f"{server.address}:{server.step_port}", task=Thrown())
+        with pytest.raises(ModeLocked, match="Start velocities are set in puppet mode"):
+            env.reset()
+        env.close()
+
+
+def test_contact_forces_and_sensors_are_those_of_the_state(crates: str, made: list[Any]) -> None:
+    class Rest(Thrown):
+        seen: ClassVar[list[States]] = []
+
+        def reset(self, rng: np.random.Generator, start: Start) -> None:
+            start.goal["none"] = np.zeros(1)
+
+        def success(self, states: States) -> Any:
+            self.seen.append(states)
+            return np.zeros(len(states), dtype=bool)
+
+    env = URLabBatchEnv(crates, 2, task=Rest())
+    made.append(env)
+    env.reset()
+    for _ in range(100):
+        observation = env.step(np.full((2, 1), 0.4375, dtype=np.float32))[0]
+    states = Rest.seen[-1]
+    weight = 9.81
+    assert np.allclose(states.contact_force("lever/crate"), weight, rtol=1e-3)
+    assert np.allclose(states.contact_force("geom:lever/floor", "lever/crate"), weight, rtol=1e-3)
+    assert states.contact_force(["lever/lever", "lever/crate"])[:, 0].tolist() == [0.0, 0.0]
+    assert np.array_equal(states.sensor("lever/push"), observation[:, -1:])
+    with pytest.raises(KeyError, match="puhs"):
+        states.sensor("lever/puhs")
+    assert states.sensor("lever/speed").shape == (2, 1)
+    bare = URLabBatchEnv(crates, 1, task=type("Bare", (Rest,), {"measured": False})())
+    made.append(bare)
+    with pytest.raises(ValueError, match="only if the task sets measured = True"):
+        bare.reset()

@@ -11,14 +11,17 @@ from argparse import Namespace
 from collections.abc import AsyncGenerator, Callable, Generator
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.cli._arguments import cameras
+from urlab_client.aio.launch import with_model_options
+from urlab_client.cli._arguments import cameras, make_client, task_named
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
 from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
+from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
+    from urlab_client.integrations.gym import URLabEnv
     from urlab_client.integrations.record import AsyncRecorder
 
 _LOOK_S = 0.05
@@ -95,6 +98,12 @@ async def run_session(
                 lost_at = _lost_at(events, lost_at)
 
 
+def recording_options(arguments: Namespace) -> dict[str, Any]:
+    """Return the options of a recording that the arguments give."""
+    names = {"camera_hz", "contacts", "overwrite"} & vars(arguments).keys()
+    return {"cameras": cameras(arguments.camera), **{name: getattr(arguments, name) for name in names}}
+
+
 @contextlib.asynccontextmanager
 async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[AsyncRecorder | None]:
     """Record while the block runs, if `--record` was given."""
@@ -103,12 +112,24 @@ async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[
         return
     from urlab_client.integrations.record import record
 
-    options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
-    recorder = record(client, arguments.record, cameras=cameras(arguments.camera), **options)
+    recorder = record(client, arguments.record, **recording_options(arguments))
     async with contextlib.AsyncExitStack() as stack:
         with refusing(KeyError, option="--camera"):
             await stack.enter_async_context(recorder)
         yield recorder
+
+
+@contextlib.contextmanager
+def task_environment(arguments: Namespace, **options: Any) -> Generator[URLabEnv]:
+    """Yield an environment of `--task`, over the server that the arguments name or else a simulated one."""
+    kind = task_named(arguments.task)
+    from urlab_client.integrations.gym import URLabEnv
+
+    address = arguments.address or with_model_options(kind.scene_address)
+    with make_client(BlockingClient, address, arguments, step_mode="direct") as client:
+        client.discover()
+        with contextlib.closing(URLabEnv(client, task=kind(), **options)) as env:
+            yield env
 
 
 async def _step(client: URLabClient) -> None:

@@ -8,9 +8,10 @@ also 'video'.
 from __future__ import annotations
 
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from urlab_client.cli._arguments import RECORDING
 from urlab_client.cli._common import CommandError, progress_bar, refusing, sigterm_interrupts
@@ -28,7 +29,7 @@ OUTPUT  the file to write; its ending selects the format
     repeated
 --episodes kept|success|all=kept  which marked episodes to write to tables and LeRobot datasets: those that were not
     discarded, successes, or all
---overwrite  replace OUTPUT if it exists
+--overwrite  replace OUTPUT if it exists; a folder only if it is empty or a LeRobot dataset
 LeRobot datasets:
 --fps N  frames per second (default: the rate of the pictures or states)
 --task TEXT=  what the robot does
@@ -48,18 +49,21 @@ def run(arguments: Namespace) -> int:
     kind = arguments.format or arguments.output.suffix[1:].lower()
     if kind not in _FORMATS:
         raise CommandError(f"{arguments.output}: name the format with --format {'|'.join(_FORMATS)}, or by the ending")
-    if arguments.output.exists() and (kind == "lerobot" or not arguments.overwrite):
-        advice = "name a folder that does not" if kind == "lerobot" else "--overwrite replaces it"
-        raise CommandError(f"{arguments.output} exists; {advice}")
+    if arguments.output.exists() and not arguments.overwrite:
+        raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     from urlab_client.integrations.record import read_run
 
-    with refusing(KeyError):
+    left_out: Counter[str] = Counter()
+    with refusing(KeyError, FileExistsError):
         recording = read_run(arguments.recording)
-        write, what = _writer(kind, recording, arguments)
+        write, what = _writer(kind, recording, arguments, left_out)
         shown = progress_bar(f"{arguments.recording.name} → {kind}", recording.path.stat().st_size)
         with sigterm_interrupts(), shown as progress:
             written = write(arguments.output, progress=progress)
     print(f"{arguments.output}  {written} {what}")
+    for reason, count in left_out.items():
+        if count:
+            print(f"left out: {count} {'pair' if count == 1 else 'pairs'} of a state and an action {reason}")
     if recording.damage:
         print(
             f"{arguments.recording} is unfinished or damaged; everything before that was written ({recording.damage})"
@@ -67,15 +71,16 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _writer(kind: str, recording: Run, arguments: Namespace) -> tuple[Callable[..., int], str]:
+def _writer(kind: str, recording: Run, arguments: Namespace, left_out: Counter[str]) -> tuple[Callable[..., int], str]:
     from urlab_client.integrations.record import export
 
     cameras = arguments.camera
+    pairs: dict[str, Any] = {"episodes": arguments.episodes, "left_out": left_out}
     match kind:
         case "csv":
-            return partial(export.write_csv, recording, episodes=arguments.episodes), "rows"
+            return partial(export.write_csv, recording, **pairs), "rows"
         case "parquet":
-            return partial(export.write_parquet, recording, episodes=arguments.episodes), "rows"
+            return partial(export.write_parquet, recording, **pairs), "rows"
         case "npz":
             return partial(export.write_npz, recording, cameras=cameras), "states"
         case "mp4":
@@ -101,6 +106,7 @@ def _writer(kind: str, recording: Run, arguments: Namespace) -> tuple[Callable[.
                 robot_type=arguments.robot_type,
                 video=not arguments.images,
                 max_picture_age=arguments.max_picture_age,
-                episodes=arguments.episodes,
+                overwrite=arguments.overwrite,
                 cameras=cameras or None,
+                **pairs,
             ), "frames"

@@ -22,7 +22,7 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, task_named
+from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, make_client
 from urlab_client.cli._common import (
     CommandError,
     aligned,
@@ -32,9 +32,8 @@ from urlab_client.cli._common import (
     progress_bar,
     refusing,
 )
-from urlab_client.cli._watching import recorded
+from urlab_client.cli._watching import recorded, recording_options, task_environment
 from urlab_client.enums import StepMode
-from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.integrations.policy import Policy, PolicyRun
@@ -93,22 +92,19 @@ def _in_task(arguments: Namespace) -> int:
     for name in ("declaration", "robot", "command", "goal", "step_mode", "compare"):
         if getattr(arguments, name):
             raise CommandError(f"--{name.replace('_', '-')} cannot be combined with --task, which determines it")
-    kind = task_named(arguments.task)
-    from urlab_client.integrations.gym import URLabEnv
     from urlab_client.integrations.policy import task_network
-    from urlab_client.integrations.record import record
 
-    address = arguments.address or with_model_options(kind.scene_address)
-    client = make_client(BlockingClient, address, arguments, step_mode="direct")
-    with client, contextlib.ExitStack() as stack:
-        client.discover()
-        env = stack.enter_context(contextlib.closing(URLabEnv(client, task=kind(), max_episode_steps=sys.maxsize)))
-        network: Any = task_network(arguments.policy, env.observation_space, env.action_space)
+    with (
+        task_environment(arguments, max_episode_steps=sys.maxsize) as env,
+        contextlib.ExitStack() as stack,
+        progress_bar(arguments.task, arguments.seconds) as progress,
+    ):
         if arguments.record is not None:
-            options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "overwrite": arguments.overwrite}
+            from urlab_client.integrations.record import record
+
             with refusing(KeyError, option="--camera"):
-                stack.enter_context(record(client, arguments.record, cameras=cameras(arguments.camera), **options))
-        progress = stack.enter_context(progress_bar(arguments.task, arguments.seconds))
+                stack.enter_context(record(env.client, arguments.record, **recording_options(arguments)))
+        network: Any = task_network(arguments.policy, env.observation_space, env.action_space)
         observation, info = env.reset(seed=_SEED)
         total, actions, terminated = 0.0, 0, False
         while not terminated and info["sim_time"] < arguments.seconds - _ROUNDING_S:

@@ -43,6 +43,9 @@ Quantity = Literal[
     "position",
     "base_position",
     "base_yaw",
+    "velocity",
+    "base_velocity",
+    "base_spin",
     "light_position",
     "light_colour",
     "colour",
@@ -54,12 +57,23 @@ Quantity = Literal[
     "camera_fovy",
 ]
 
+_START: Final = ("position", "base_position", "base_yaw", "velocity", "base_velocity", "base_spin")
 _VECTORS: Final = frozenset(
-    {"centre_of_mass", "gravity", "base_position", "light_position", "camera_position", "camera_rotation", "colour"}
+    {
+        "centre_of_mass",
+        "gravity",
+        "base_position",
+        "base_velocity",
+        "base_spin",
+        "light_position",
+        "camera_position",
+        "camera_rotation",
+        "colour",
+    }
 )
 _WAYS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys(("inertia", "kp", "kv", "strength"), ("scale",)),
-    **dict.fromkeys(("position", "base_position", "base_yaw", "light_position", "camera_position"), ("add", "set")),
+    **dict.fromkeys((*_START, "light_position", "camera_position"), ("add", "set")),
     "camera_rotation": ("add",),
 }
 """How quantities can vary that cannot vary in all ways."""
@@ -93,7 +107,7 @@ class UnsupportedRandomisation(URLabError):
             f"The server at {address} does not vary its scene, and no op of its protocol changes "
             f"{', '.join(quantities)} during play.",
             hint=(
-                "Over the wire, gravity, position, base_position, base_yaw, and kp and kv of PD controllers can vary. "
+                f"Over the wire, gravity, {', '.join(_START)}, and kp and kv of PD controllers can vary. "
                 "For the rest, use a sim:// address, or start the server with `urlab serve --randomise FILE`."
             ),
         )

@@ -37,6 +37,9 @@ QUANTITIES: Final[dict[Quantity, tuple[str, tuple[str, ...]]]] = {
     "position": ("joint", ()),
     "base_position": ("free joint", ()),
     "base_yaw": ("free joint", ()),
+    "velocity": ("joint", ()),
+    "base_velocity": ("free joint", ()),
+    "base_spin": ("free joint", ()),
     "light_position": ("light", ("light_pos",)),
     "light_colour": ("light", ("light_diffuse",)),
     "colour": ("geom", ("geom_rgba",)),
@@ -178,9 +181,9 @@ def _has(what: Quantity, model: mujoco.MjModel, i: int, controlled: frozenset[in
     match what:
         case "mass" | "inertia" | "centre_of_mass":
             return bool(model.body_mass[i] > 0.0)
-        case "base_position" | "base_yaw":
+        case "base_position" | "base_yaw" | "base_velocity" | "base_spin":
             return bool(model.jnt_type[i] == _FREE)
-        case "position":
+        case "position" | "velocity":
             return bool(model.jnt_type[i] in _SCALAR)
         case "kp" | "kv":
             affine = model.actuator_gaintype[i] == _FIXED and model.actuator_biastype[i] == _AFFINE

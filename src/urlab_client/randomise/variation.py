@@ -158,11 +158,16 @@ class Variation:
         for name, values in self._nominal.items():
             fields(name)[...] = values
 
-    def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
-        """Vary the positions of the whole scene after a reset, shape (nq,), in place. Joints stay in their ranges."""
+    def start(self, draws: EpisodeDraws, qpos: Floats, qvel: Floats) -> None:
+        """Vary positions, shape (nq,), and velocities, shape (nv,), of the whole scene after a reset, in place.
+
+        Joints stay in their ranges.
+        """
         model = self._model
         for vary, elements, drawn in draws.varied:
-            address = model.jnt_qposadr[elements.ids] if vary.what in START else np.zeros(0, dtype=np.intp)
+            if vary.what not in START:
+                continue
+            address, dof = model.jnt_qposadr[elements.ids], model.jnt_dofadr[elements.ids, None]
             if vary.what == "position":
                 wanted = drawn[:, 0] if vary.by == "set" else qpos[address] + drawn[:, 0]
                 limited = model.jnt_limited[elements.ids].astype(bool)
@@ -174,6 +179,9 @@ class Variation:
             elif vary.what == "base_yaw":
                 for at, yaw in zip(address, drawn[:, 0], strict=True):
                     _turn(qpos[at + 3 : at + 7], float(yaw), afresh=vary.by == "set")
+            else:
+                where = dof + {"velocity": [0], "base_velocity": [0, 1, 2], "base_spin": [3, 4, 5]}[vary.what]
+                qvel[where] = drawn if vary.by == "set" else qvel[where] + drawn
 
     def gain_factors(self, draws: EpisodeDraws, actuators: NDArray[np.intp]) -> Mapping[str, NDArray[np.float32]]:
         """Return the factors of the gains `kp` and `kv` of controllers, shape (n actuators,)."""

@@ -19,6 +19,7 @@ from urlab_client.aio.client_types import ClientObserver
 from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import StepMode
 from urlab_client.errors import ClientClosed, StreamOverflow, URLabError
+from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.integrations._variation import wire_variation
@@ -43,6 +44,9 @@ class Follower(ClientObserver):
         camera_hz: Maximum number of pictures per second of simulation time.
         needs_model: Hint for the error if there is no local model; None if none is needed.
         buffer: Number of published states that may wait so that none is missed; 0 for only the newest.
+
+    Attributes:
+        note: Called by an environment over this client with what led to the state before, if anybody wants to know.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class Follower(ClientObserver):
         self._room: Callable[[], Awaitable[None]] | None = None
         self._lost: Callable[[int], None] | None = None
         self._failed: Callable[[URLabError], None] = lambda _: None
+        self.note: Callable[[Transition], None] | None = None
         self._scene: FollowedScene | None = None
         self._described: object = None
         self._due_at: int | None = None
@@ -94,6 +99,7 @@ class Follower(ClientObserver):
         room: Callable[[], Awaitable[None]] | None = None,
         lost: Callable[[int], None] | None = None,
         failed: Callable[[URLabError], None],
+        note: Callable[[Transition], None] | None = None,
     ) -> None:
         """Start passing on items.
 
@@ -102,8 +108,9 @@ class Follower(ClientObserver):
             room: Returns when there is space for the items of another step, or after a limit.
             lost: Called with the number of pictures that were due but missing in a step.
             failed: Called with an unexpected error, after which states or pictures are missing.
+            note: See `note` of the class.
         """
-        self._put, self._room, self._lost, self._failed = put, room, lost, failed
+        self._put, self._room, self._lost, self._failed, self.note = put, room, lost, failed, note
         self._client.add_observer(self)
         if self._client.step_mode is StepMode.LIVE:
             self._listen()
@@ -116,7 +123,7 @@ class Follower(ClientObserver):
     def forget(self) -> None:
         """Stop if the client's loop has already ended. Idempotent."""
         self._client.remove_observer(self)
-        self._put = None
+        self._put = self.note = None
 
     async def ended(self) -> None:
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -139,7 +146,7 @@ class Follower(ClientObserver):
         if client.step_mode is StepMode.LIVE or not self._wanted_cameras:
             return {}
         timestep = 0.0 if client.model is None else client.model.opt.timestep
-        then = round((client.sim_time + max(n_steps, 1) * timestep) * _NS)
+        then = round((client.sim_time + max(n_steps, client.step_mode is not StepMode.PUPPET) * timestep) * _NS)
         # The period counts as used only after the step: it may be refused, or never answered.
         self._due_at = then if self._pictures.is_due(then) else None
         if self._due_at is None:
@@ -194,6 +201,8 @@ class Follower(ClientObserver):
         wall_ns = client.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
         restarts = isinstance(reply, ResetOk)
+        if restarts:
+            self._pictures = Schedule(self._camera_ns)  # one of the start is due
         seed = client.reset_seed if restarts else None
         varied = wire_variation(client) if restarts else None
         # A reset of somebody else has another seed, or none.

@@ -300,6 +300,38 @@ class OutcomeMessage(Struct, frozen=True):
     goal: dict[str, list[float]]
 
 
+class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An action of an environment and what came of it, or the start of an episode.
+
+    Attributes:
+        actions: Number of actions of the episode so far; 0 at its start.
+        action: The action as given to the environment, of all articulations together.
+        chosen: Set-points that the action means, by articulation, if it takes effect late. Those applied are in the
+            state.
+        reward: Reward.
+        terminated: Whether it ended the episode.
+        truncated: Whether the episode ended for another reason.
+        success: Whether the state is a success; None if the task defines none.
+        goal: Goal of the episode, by name.
+    """
+
+    actions: Count
+    action: list[float] = []
+    chosen: dict[str, list[float]] = {}
+    reward: float = 0.0
+    terminated: bool = False
+    truncated: bool = False
+    success: bool | None = None
+    goal: dict[str, list[float]] = {}
+
+
+class TransitionMessage(Transition, frozen=True, kw_only=True, omit_defaults=True):
+    """A transition, and the number of the sample that has the state to which it led."""
+
+    timestamp: Time
+    sample: Count
+
+
 class GapMessage(Struct, frozen=True):
     """Losses since the previous message of this kind, because the file could not be written fast enough."""
 
@@ -316,6 +348,7 @@ _URLAB: dict[type[Struct], str] = {
     EpisodeMessage: "urlab.Episode",
     GapMessage: "urlab.Gap",
     OutcomeMessage: "urlab.EpisodeOutcome",
+    TransitionMessage: "urlab.Transition",
 }
 
 

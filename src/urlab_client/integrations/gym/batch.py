@@ -17,7 +17,7 @@ from urlab_client._mujoco import batch_class, spans
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
 from urlab_client.integrations.gym.pictures import BatchPictures, PictureScene
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.spaces import Field, Observation
@@ -116,6 +116,8 @@ class URLabBatchEnv(Vectorized):
         )
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
+        if first.measures:
+            self._measured = {name: self._arrays[name] for name in MEASURED}
         self._visible = [self._batch.bind(name) for name in VISIBLE]
         sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
         self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}
@@ -172,18 +174,19 @@ class URLabBatchEnv(Vectorized):
 
     def _start(self, indices: Indices, keyframe: str | None) -> None:
         key = -1 if keyframe is None else self.mapping.keyframe_id(keyframe)
-        qpos, seeds, noise = self._arrays["qpos"], self.episode_seeds(), self._settings.reset_noise
+        qpos, qvel = self._arrays["qpos"], self._arrays["qvel"]
+        seeds, noise = self.episode_seeds(), self._settings.reset_noise
         if self._varied is not None:
             self._varied.begin(indices, seeds)
         self._batch.reset(indices, key)
         noisy = [self.mapping.scalar_joints(articulation, self.model) for articulation in self.mapping.keys]
         for i in map(int, indices):
             if self._varied is not None:
-                self._varied.start(i, qpos[i])
+                self._varied.start(i, qpos[i], qvel[i])
             for joints in noisy if noise else ():
                 noise.add(self.rngs[i], self.model, joints, qpos[i])
             if self._memory is not None:
-                qpos[i] = self._memory.begin(i, self.rngs[i], qpos[i])
+                self._memory.begin(i, self.rngs[i], qpos[i], qvel[i])
         self._batch.forward(indices)
         self._step_count[indices] = 0
         if self._pictures.delays:
@@ -293,11 +296,11 @@ class _CopyVariation:
         if self._variation.derives:
             self._batch.set_const(indices)
 
-    def start(self, i: int, qpos: Floats) -> None:
-        """Vary the start positions of a copy's episode in place, shape (nq,)."""
+    def start(self, i: int, qpos: Floats, qvel: Floats) -> None:
+        """Vary the start of a copy's episode in place: positions, shape (nq,), and velocities, shape (nv,)."""
         draws = self.draws[i]
         if draws is not None:
-            self._variation.start(draws, qpos)
+            self._variation.start(draws, qpos, qvel)
 
     def use_factors(self, key: str, indices: Indices) -> None:
         """Set the gain factors of some copies in the controller of an articulation."""

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import spans
 from urlab_client.aio.articulation import URLabArticulation, compiled_prefixes
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.aio.model.mirror import require_local
 from urlab_client.enums import CameraMode, ControlMode, ObservationLevel, StepMode
-from urlab_client.errors import URLabError
+from urlab_client.errors import ModeLocked, URLabError
 from urlab_client.integrations._variation import (
     WireVariation,
     controlled_actuators,
@@ -37,6 +38,9 @@ from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.values.pictures import Pixels, observed_pixels, to_rgb
 
+MEASURED: Final = ("sensordata", "ctrl", "act")
+"""What `EnvEpisode.measured` returns."""
+
 
 class EnvEpisode:
     """One client that is reset and stepped as an environment.
@@ -50,6 +54,7 @@ class EnvEpisode:
         rendered_camera: The camera that `render` shows, or None.
         randomise: What varies from episode to episode, or None.
         over_wire: Variation by ops, for a server that varies nothing itself, or None.
+        measures: Whether the task asks for what `measured` returns.
     """
 
     def __init__(
@@ -78,11 +83,13 @@ class EnvEpisode:
         self.mapping: SpaceMapping = _space_mapping(client, model, settings)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._sensors = {key: [*layout.sensors] for key, layout in layouts.items()}
-        minimal = set(settings.fields) <= set(LEVELS["minimal"])
+        self.measures: bool = settings.task is not None and settings.task.measured
+        minimal = set(settings.fields) <= set(LEVELS["minimal"]) and not self.measures
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self.rendered_camera: str | None = _rendered_camera(client, settings)
         self._cameras = {name: client.camera(name) for name in filter(None, (*settings.cameras, self.rendered_camera))}
         self._frames: dict[str, Pixels] = {}
+        self._step_before = 0
         images = {
             name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in settings.cameras
         }
@@ -104,6 +111,17 @@ class EnvEpisode:
         data = require_local(self.client.data, "The state of the scene")
         return data.qpos, data.qvel, data.time
 
+    def measured(self) -> dict[str, Floats]:
+        """Return `sensordata`, `ctrl` and `act` of the whole scene if the task asks for them; see `States.measured`."""
+        if not self.measures:
+            return {}
+        data, model = require_local(self.client.data, "The state of the scene"), self.model
+        sensordata = np.zeros(model.nsensordata)
+        for key in self.mapping.keys:
+            ids = [*self.mapping.layout(key).sensors.values()]
+            sensordata[spans(model.sensor_adr[ids], model.sensor_dim[ids])] = self._read(key, "sensors")
+        return dict(zip(MEASURED, (sensordata, data.ctrl, data.act), strict=True))
+
     def draws(self) -> dict[str, Any] | None:
         """Return the values drawn for the episode, as in `EpisodeDraws.to_dict`; None if nothing was drawn."""
         return None if self._draws is None else self._draws.to_dict()
@@ -113,11 +131,12 @@ class EnvEpisode:
         rng: np.random.Generator,
         keyframe: str | None = None,
         seed: int | None = None,
-        begin: Callable[[np.random.Generator, Floats], Floats] | None = None,
+        begin: Callable[[np.random.Generator, Floats, Floats], None] | None = None,
     ) -> Observation:
         """Reset the simulation, set the set-points to zero and return the first observation.
 
-        `seed` determines what varies; `begin` lets a task choose the start, by positions of the shape (nq,).
+        `seed` determines what varies; `begin` lets a task change the start in place: positions, shape (nq,), and
+        velocities, shape (nv,).
         """
         client = self.client
         keyframe = self.settings.keyframe if keyframe is None else keyframe
@@ -128,19 +147,34 @@ class EnvEpisode:
             if self.over_wire is not None:
                 await self.over_wire.apply(self._draws)
         await client.reset(keyframe, seed)
-        qpos = np.array(self.state()[0])
+        qpos, qvel = map(np.array, self.state()[:2])
         if self.over_wire is not None and self._draws is not None:
-            self.over_wire.variation.start(self._draws, qpos)
+            self.over_wire.variation.start(self._draws, qpos, qvel)
         if self.settings.reset_noise:
             for key in self.mapping.keys:
                 self.settings.reset_noise.add(rng, self.model, self.mapping.scalar_joints(key, self.model), qpos)
         if begin is not None:
-            qpos = begin(rng, qpos)
-        await self._place(qpos)
-        if self._cameras:
-            await self._delay_cameras(seed)
+            begin(rng, qpos, qvel)
+        await self._delay_cameras(seed)
+        looks = bool(self._cameras) or any(observer.step_cameras(0) for observer in client.observers)
+        if not np.array_equal(qvel, self.state()[1]):
+            try:
+                await self._push(qpos, qvel)
+            except ModeLocked as locked:
+                locked.hint = "Start velocities are set in puppet mode: unpin the mode, or start at rest."
+                raise
+        elif looks:
+            await self._place(qpos)
             await self._look(keyframe, seed, qpos)
+        else:
+            await self._place(qpos)
+        self._step_before = client.step_count
         return self._observe()
+
+    @property
+    def step_count(self) -> int:
+        """Physics steps since the reset."""
+        return self.client.step_count - self._step_before
 
     async def close(self) -> None:
         """Undo the variation by ops. If the server is gone, do nothing."""
@@ -200,20 +234,37 @@ class EnvEpisode:
             await self.client.runtime.set_camera_delay(delays)
 
     async def _look(self, keyframe: str | None, seed: int | None, qpos: Floats) -> None:
-        """Take the frames of the current state. Only a puppet step draws without integrating.
+        """Take the frames of the current state, also for a recording.
 
         A puppet step changes the solver's warm start. The reset is therefore repeated, so that rollouts with and
         without cameras are the same.
         """
+        try:
+            await self._push(*self.state()[:2])
+        except ModeLocked:
+            if self._cameras:
+                raise
+            return  # the recording has no picture of the start, and conversions say so
+        if self.client.step_mode is not StepMode.PUPPET:
+            await self.client.reset(keyframe, seed)
+            await self._place(qpos)
+
+    async def _push(self, qpos: Floats, qvel: Floats) -> None:
+        """Set positions and velocities of the whole scene, and take the frames of that state.
+
+        Only a puppet step sets velocities, and only it draws without integrating.
+        """
         client, mode = self.client, self.client.step_mode
+        data = require_local(client.data, "The state of the scene")
         if mode is not StepMode.PUPPET:
             await client.runtime.set_mode(StepMode.PUPPET)
-        await client.step(0, include_cameras=dict.fromkeys(self._cameras, "sync"))
-        self._take_frames()
-        if mode is not StepMode.PUPPET:
-            await client.runtime.set_mode(mode)
-            await client.reset(keyframe, seed)
-            await self._place(qpos)
+        try:
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            await client.step(0, include_cameras=dict.fromkeys(self._cameras, "sync") or False)
+            self._take_frames()
+        finally:
+            if mode is not StepMode.PUPPET:
+                await client.runtime.set_mode(mode)
 
     def _take_frames(self) -> None:
         for name, view in self._cameras.items():

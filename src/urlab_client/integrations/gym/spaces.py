@@ -144,7 +144,7 @@ class SpaceMapping:
         self._clip = self._low.copy(), self._high.copy()
         for key, where in self._inputs.items():
             self._low[where], self._high[where] = self._bounds(key)
-        declared = dict.fromkeys(self.keys, actions) if isinstance(actions, Actions) else dict(actions or {})
+        declared = dict.fromkeys(self._inputs, actions) if isinstance(actions, Actions) else dict(actions or {})
         for key, each in zip(self._keys("actions of", declared), declared.values(), strict=True):
             self._declare(key, each)
         self.action_space: Space = self._make_action_space()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -102,31 +102,50 @@ class Start:
     Attributes:
         scene: The scene.
         qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write in place.
+        qvel: Velocities of the whole scene, shape (nv,), likewise.
         goal: Goal of the episode, by name: numbers or arrays whose shape is the same in all episodes.
         index: Index of the environment.
         memory: What the task keeps of the environment, by name, initially zeros. Write in place.
     """
 
     def __init__(
-        self, scene: TaskScene, qpos: Floats, index: int = 0, memory: Mapping[str, Floats] = MappingProxyType({})
+        self,
+        scene: TaskScene,
+        qpos: Floats,
+        qvel: Floats,
+        index: int = 0,
+        memory: Mapping[str, Floats] = MappingProxyType({}),
     ) -> None:
         self.scene = scene
         self.qpos = qpos
+        self.qvel = qvel
         self.index = index
         self.memory = memory
         self.goal: dict[str, Floats] = {}
 
-    def joint(self, name: str, position: float) -> None:
-        """Set the position of a hinge joint (radians) or slide joint (metres)."""
-        self.qpos[self.scene.model.jnt_qposadr[self.scene.id("joint", name)]] = position
+    def joint(self, name: str, position: float, velocity: float | None = None) -> None:
+        """Set the position of a hinge (radians) or slide joint (metres) and, if given, its velocity, per second."""
+        joint = self.scene.id("joint", name)
+        self.qpos[self.scene.model.jnt_qposadr[joint]] = position
+        if velocity is not None:
+            self.qvel[self.scene.model.jnt_dofadr[joint]] = velocity
 
-    def place(self, body: str, position: Sequence[float] | Floats, quaternion: Sequence[float] = (1, 0, 0, 0)) -> None:
+    def place(
+        self,
+        body: str,
+        position: Sequence[float] | Floats,
+        quaternion: Sequence[float] = (1, 0, 0, 0),
+        velocity: Sequence[float] | Floats | None = None,
+        spin: Sequence[float] | Floats | None = None,
+    ) -> None:
         """Place a body that has a free joint.
 
         Args:
             body: Name of the body.
             position: Position, metres, world frame, shape (3,).
             quaternion: Orientation, (w, x, y, z), world frame.
+            velocity: Velocity, m/s, world frame, shape (3,); None leaves it as it is.
+            spin: Angular velocity, rad/s, about the axes of the body, shape (3,); None leaves it as it is.
 
         Raises:
             ValueError: The body has no free joint.
@@ -135,9 +154,11 @@ class Start:
         joint = int(model.body_jntadr[body_id])
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError(f"body {body!r} has no free joint, so it cannot be placed")
-        address = int(model.jnt_qposadr[joint])
-        self.qpos[address : address + 3] = position
-        self.qpos[address + 3 : address + 7] = quaternion
+        address, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self.qpos[address : address + 7] = [*position, *quaternion]
+        for at, speed in ((dof, velocity), (dof + 3, spin)):
+            if speed is not None:
+                self.qvel[at : at + 3] = speed
 
     def ground(self, x: float, y: float) -> float:
         """Return the height of the ground at a place, metres: the highest plane, height field or other fixed geom.
@@ -165,6 +186,15 @@ class Start:
         noise.add(rng, model, self.scene.mapping.scalar_joints(key, model), self.qpos)
 
 
+class Now(NamedTuple):
+    """Positions, velocities, times and what is measured of n environments; see `States`."""
+
+    qpos: Floats
+    qvel: Floats
+    time: Floats
+    measured: Mapping[str, Floats]
+
+
 class States:
     """The states of n environments, as passed to a task. Arrays have a leading axis of n.
 
@@ -181,6 +211,7 @@ class States:
             all articulations are concatenated.
         previous_action: Actions before those, likewise.
         memory: What the task keeps, by name, each with a leading axis. Only `Task.update` may write it.
+        measured: `sensordata`, `ctrl` and `act` of MuJoCo, with a leading axis, if `Task.measured` asks for them.
     """
 
     def __init__(
@@ -195,20 +226,22 @@ class States:
         last_action: Floats | None = None,
         previous_action: Floats | None = None,
         memory: Mapping[str, Floats] = MappingProxyType({}),
+        measured: Mapping[str, Floats] = MappingProxyType({}),
     ):
         self.scene = scene
         self.qpos = qpos
         self.qvel = qvel
         self.time = time
+        self.measured = measured
         # An environment without an episode so far has no goal: its row repeats another environment's.
         known = next(filter(None, goals), dict[str, Floats]())
         self.goal: dict[str, NDArray[np.float64]] = {
             name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
         self.index: NDArray[np.intp] = np.arange(len(qpos)) if index is None else index
-        still = np.zeros((len(qpos), scene.mapping.n_actions))
-        self.last_action: Floats = still if last_action is None else last_action
-        self.previous_action: Floats = still if previous_action is None else previous_action
+        shape = len(qpos), scene.mapping.n_actions
+        self.last_action: Floats = np.zeros(shape) if last_action is None else last_action
+        self.previous_action: Floats = np.zeros(shape) if previous_action is None else previous_action
         self.memory = memory
 
     def __len__(self) -> int:
@@ -245,16 +278,48 @@ class States:
             one: Name of a body or geom, as in `TaskScene.geoms`, or several, such as the feet.
             other: What they touch: a name, or several of which one suffices; anything by default.
         """
+        return self._summed(one, other, self._contacts) > 0
+
+    def contact_force(self, one: str | Sequence[str], other: str | Sequence[str] | None = None) -> Floats:
+        """Return the sum of the normal forces where bodies or geoms touch, newtons, with the arguments of `touching`.
+
+        This process computes them for the state after the step, from positions, velocities, controls and activations.
+        They leave out pushes, and what `randomise` varies of the model.
+
+        Raises:
+            ValueError: The task does not set `measured`.
+        """
+        return self._summed(one, other, self._forces)
+
+    def sensor(self, name: str) -> Floats:
+        """Return the readings of a sensor, shape (n, length), as MuJoCo leaves them in the last physics step.
+
+        Raises:
+            KeyError: There is no such sensor, or it belongs to no articulation, so that servers do not send it.
+            ValueError: The task does not set `measured`.
+        """
+        model, layouts = self.scene.model, map(self.scene.mapping.layout, self.scene.mapping.keys)
+        sensor = self.scene.id("sensor", name)
+        if not any(sensor in layout.sensors.values() for layout in layouts):
+            raise KeyError(f"sensor {name!r} belongs to no articulation, so servers do not send it")
+        start = int(model.sensor_adr[sensor])
+        return self._measured("sensordata")[:, start : start + int(model.sensor_dim[sensor])]
+
+    def _measured(self, name: str) -> Floats:
+        if name not in self.measured:
+            raise ValueError("sensors and contact forces are there only if the task sets measured = True")
+        return self.measured[name]
+
+    def _summed(self, one: str | Sequence[str], other: str | Sequence[str] | None, contacts: _Contacts) -> Floats:
+        """Return the sum of the forces of the contacts between geoms, shape (n,), or (n, k) for k names in `one`."""
         if not isinstance(one, str):
-            return np.stack([self.touching(name, other) for name in one], axis=-1)
-        owner, pairs = self._contacts
+            return np.stack([self._summed(name, other, contacts) for name in one], axis=-1)
         first, second = self._marked([one]), np.ones(self.scene.model.ngeom, dtype=bool)
         if other is not None:
             second = self._marked([other] if isinstance(other, str) else other)
-        a, b = pairs.T
-        found = np.zeros(len(self), dtype=bool)
-        found[owner[(first[a] & second[b]) | (first[b] & second[a])]] = True
-        return found
+        a, b = contacts.geoms.T
+        which = (first[a] & second[b]) | (first[b] & second[a])
+        return np.bincount(contacts.owner[which], contacts.force[which], len(self)).astype(np.float64)
 
     def _marked(self, names: Sequence[str]) -> Bools:
         """Return which geoms of the model have one of these names, shape (ngeom,)."""
@@ -275,17 +340,44 @@ class States:
         return found
 
     @cached_property
-    def _contacts(self) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-        """The state of each contact, shape (contacts,), and its two geoms, shape (contacts, 2)."""
+    def _contacts(self) -> _Contacts:
+        return self._found(forces=False)
+
+    @cached_property
+    def _forces(self) -> _Contacts:
+        return self._found(forces=True)
+
+    def _found(self, *, forces: bool) -> _Contacts:
         model, data = self.scene.model, self.scene.data
-        found: list[NDArray[np.int32]] = []
-        for qpos in self.qpos:
+        counts: list[int] = []
+        geoms: list[NDArray[np.int32]] = []
+        normal: list[float] = []
+        wrench = np.ones(6)
+        for i, qpos in enumerate(self.qpos):
             data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_collision(model, data)
-            found.append(np.array(data.contact.geom).reshape(-1, 2))
-        return np.repeat(np.arange(len(self)), [len(pairs) for pairs in found]), np.concatenate(found)
+            if forces:
+                data.qvel[:], data.qacc_warmstart[:] = self.qvel[i], 0.0
+                data.ctrl[:], data.act[:] = self._measured("ctrl")[i], self._measured("act")[i]
+                mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_NONE, 1)
+            else:
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_collision(model, data)
+            counts.append(data.ncon)
+            geoms.append(np.array(data.contact.geom).reshape(-1, 2))
+            for contact in range(data.ncon):
+                if forces:
+                    mujoco.mj_contactForce(model, data, contact, wrench)
+                normal.append(float(wrench[0]))
+        return _Contacts(np.repeat(np.arange(len(self)), counts), np.concatenate(geoms), np.array(normal))
+
+
+class _Contacts(NamedTuple):
+    """The state of each contact, shape (c,), its geoms, shape (c, 2), and its normal force, newtons, or else 1."""
+
+    owner: NDArray[np.intp]
+    geoms: NDArray[np.int32]
+    force: Floats
 
 
 class Memory:
@@ -298,19 +390,24 @@ class Memory:
         self._kept = {name: np.zeros((n, *shape)) for name, shape in task.memory.items()}
         self._actions = np.zeros((2, n, scene.mapping.n_actions))
 
-    def begin(self, i: int, rng: np.random.Generator, qpos: Floats) -> Floats:
-        """Let the task choose the start of an episode; return its positions, shape (nq,)."""
+    def begin(self, i: int, rng: np.random.Generator, qpos: Floats, qvel: Floats) -> None:
+        """Let the task change the start of an episode in place: positions, shape (nq,), velocities, shape (nv,)."""
         for values in (*self._kept.values(), *self._actions):
             values[i] = 0.0
-        start = Start(self._scene, qpos.copy(), i, {name: values[i, ...] for name, values in self._kept.items()})
+        start = Start(self._scene, qpos, qvel, i, {name: values[i, ...] for name, values in self._kept.items()})
         self._task.reset(rng, start)
         self._goals[i] = start.goal
-        return start.qpos
 
-    def updated(self, rows: NDArray[np.intp], actions: Floats, qpos: Floats, qvel: Floats, time: Floats) -> States:
+    def goal(self, i: int) -> Mapping[str, Floats]:
+        """Return the goal of an environment's episode, by name."""
+        return self._goals[i]
+
+    def updated(self, rows: NDArray[np.intp], actions: Floats, now: Now) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
-        self._actions[1, rows], self._actions[0, rows] = self._actions[0, rows], actions
-        states = self.states(rows, qpos, qvel, time)
+        last, previous = self._actions
+        previous[rows] = taken(last, rows)
+        last[rows] = actions
+        states = self.states(rows, now)
         if self._kept:
             _set_writeable(states.memory, True)
             self._task.update(states)
@@ -319,22 +416,28 @@ class Memory:
             _set_writeable(states.memory, False)
         return states
 
-    def states(self, rows: NDArray[np.intp], qpos: Floats, qvel: Floats, time: Floats) -> States:
+    def states(self, rows: NDArray[np.intp], now: Now) -> States:
         """Return the states of some environments, in the form that is passed to the task."""
-        last, previous = self._actions[:, rows]
-        memory = {name: values[rows] for name, values in self._kept.items()}
+        last, previous = (taken(actions, rows) for actions in self._actions)
+        memory = {name: taken(values, rows) for name, values in self._kept.items()}
         _set_writeable(memory, False)  # a write would be lost, except in `update`
         return States(
             self._scene,
-            qpos,
-            qvel,
-            time,
+            now.qpos,
+            now.qvel,
+            now.time,
             [self._goals[int(i)] for i in rows],
             index=rows,
             last_action=last,
             previous_action=previous,
             memory=memory,
+            measured=now.measured,
         )
+
+
+def taken(values: Floats, rows: NDArray[np.intp]) -> Floats:
+    """Return a copy of different rows; copying all of them takes a third of the time that indexing takes."""
+    return values.copy() if len(rows) == len(values) else values[rows]
 
 
 def _set_writeable(arrays: Mapping[str, Floats], writeable: bool) -> None:
@@ -447,6 +550,8 @@ class Task:
         actions: How actions become set-points, for all articulations or by key. None: actions are set-points.
         memory: Shape of each array that the task keeps of an environment, such as a phase, air times or contact
             timers, by name: `{"air_time": (4,), "phase": ()}`. They are zeros at a reset; `update` advances them.
+        measured: Whether methods ask for `States.sensor` or `States.contact_force`. Servers then send with each step
+            the readings, controls and activations.
         n_substeps: Physics steps per action.
         max_episode_steps: Actions per episode, or None for no limit.
         keyframe: Keyframe in which episodes start before `reset` changes the start, or None for the initial state.
@@ -462,6 +567,7 @@ class Task:
     n_observed: ClassVar[int] = 0
     actions: ClassVar[Actions | Mapping[str, Actions] | None] = None
     memory: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
+    measured: ClassVar[bool] = False
     n_substeps: ClassVar[int] = 10
     max_episode_steps: ClassVar[int | None] = 200
     keyframe: ClassVar[str | None] = None

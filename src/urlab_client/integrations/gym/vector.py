@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Unpack
 
@@ -21,7 +23,9 @@ from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_option
 from urlab_client.errors import URLabError, refused_for_good
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.messages import Transition
+from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
 from urlab_client.randomise.declaration import Randomisation
@@ -36,6 +40,10 @@ class OverWire(Vectorized):
         self._qpos = np.tile(first.model.qpos0, (num_envs, 1))
         self._qvel = np.zeros((num_envs, first.model.nv))
         self._time = np.zeros(num_envs)
+        self._clients: dict[int, URLabClient] = {}
+        if first.measures:
+            widths = first.model.nsensordata, first.model.nu, first.model.na
+            self._measured = {name: np.zeros((num_envs, width)) for name, width in zip(MEASURED, widths, strict=True)}
 
     @abstractmethod
     async def _episode(self, i: int, *, starting: bool) -> EnvEpisode:
@@ -51,12 +59,21 @@ class OverWire(Vectorized):
         else:
             now, before, late, forces = applied
             observation = await episode.step(now[i], forces.get(i, {}), before[i], int(late[i]))
+        self._clients[i] = episode.client
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
-        self._step_count[i] = episode.client.step_count
+        for name, values in episode.measured().items():
+            self._measured[name][i] = values
+        self._step_count[i] = episode.step_count
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         return self._qpos, self._qvel, self._time
+
+    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
+        for i in indices.tolist():
+            for observer in self._clients[i].observers:
+                if isinstance(observer, Follower) and observer.note is not None:
+                    observer.note(told(i))
 
 
 @dataclass(eq=False)
@@ -218,6 +235,34 @@ class URLabVectorEnv(OverWire):
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         black = np.zeros_like(next(iter(self._pictures.values())))
         return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
+
+    @contextlib.contextmanager
+    def recording(self, folder: str | os.PathLike[str], **options: Any) -> Generator[list[Path]]:
+        """Record environment i into `folder/i.mcap` while the block runs; yield the files.
+
+        An environment that loses its client is recorded until then.
+
+        Args:
+            folder: The folder, which is made if necessary.
+            options: Options of `urlab_client.integrations.record.record`.
+
+        Raises:
+            FileExistsError: A file exists, and `overwrite` was not given.
+            RecordingError: Writing failed.
+        """
+        from urlab_client.integrations.record import record
+
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        files: list[Path] = []
+        stack = contextlib.AsyncExitStack()
+        try:
+            for i, session in enumerate(self._sessions):
+                episode = self._portal.call(session.ready)
+                files.append(Path(folder) / f"{i}.mcap")
+                self._portal.call(stack.enter_async_context, record(episode.client, files[-1], **options))
+            yield files
+        finally:
+            self._portal.call(stack.aclose)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients and the servers that they started, and let the task serve another environment."""

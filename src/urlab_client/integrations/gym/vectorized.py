@@ -13,11 +13,22 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from urlab_client.errors import refused_for_good
+from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.settings import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, mapped
-from urlab_client.integrations.gym.task import EpisodeEnd, States, Task, judged, observed, succeeded, with_task
+from urlab_client.integrations.gym.task import (
+    EpisodeEnd,
+    Now,
+    States,
+    Task,
+    judged,
+    observed,
+    succeeded,
+    taken,
+    with_task,
+)
 from urlab_client.randomise.declaration import Randomisation
 
 Bools = NDArray[np.bool_]
@@ -120,6 +131,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._all.flags.writeable = False
         self.rngs: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
         self._recent: States | None = None
+        self._measured: Mapping[str, Floats] = {}  # of all environments, as in `States`
         self._memory = settings.memory(first.model, mapping, num_envs)
 
     @abstractmethod
@@ -207,12 +219,33 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             truncated[list(errors)] = True
         self._ended = terminated | truncated
         self._totals += rewards
+        self._note(
+            acting if not errors else np.setdiff1d(acting, [*errors]),
+            lambda i: self._transition(i, flat, rewards, terminated, truncated),
+        )
         if self._ended.any():
             if self.task is not None:
                 self._tell_ends(self.task, terminated, errors, infos)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
+
+    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
+        """Tell who records some environments what led to their states. Nobody records a batch, which has no client."""
+
+    def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
+        """Return the start of an environment's episode, or its action with reward, termination and truncation."""
+        goal: Mapping[str, Floats] = {} if self._memory is None else self._memory.goal(i)
+        told: dict[str, Any] = {} if self._success is None else {"success": bool(self._success[i])}
+        told["goal"] = {name: np.ravel(values).tolist() for name, values in goal.items()}
+        if actions is None:
+            return Transition(actions=0, **told)
+        if self.randomise is not None and self.randomise.delays_actions:
+            meant = self.mapping.split(self.mapping.scaled(actions[i]))
+            told["chosen"] = {key: values.tolist() for key, values in meant.items()}
+        reward, terminated, truncated = (values[i].item() for values in judged)
+        told |= {"reward": reward, "terminated": terminated, "truncated": truncated}
+        return Transition(actions=int(self._elapsed[i]), action=actions[i].tolist(), **told)
 
     @property
     def max_episode_steps(self) -> int | None:
@@ -254,6 +287,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
             self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
+            self._note(fresh if not errors else np.setdiff1d(fresh, [*errors]), self._transition)
         if errors:
             self._ended[list(errors)] = True
         return errors
@@ -262,8 +296,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Let the task update what it keeps after actions; ask what it observes, and for success, after all moves."""
         self._recent = None
         if self._memory is not None and actions is not None and len(acted):
-            rows = (values[acted] for values in self._state())
-            self._recent = self._memory.updated(acted, actions[acted], *rows)
+            self._recent = self._memory.updated(acted, actions[acted], self._now(acted))
         states = self._states(moved)
         found, success = observed(task, states), succeeded(task, states)
         if self._of_task is not None:
@@ -278,8 +311,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self._memory is None:
             raise ValueError("this environment has no task")
         if self._recent is None or self._recent.index is not indices:
-            self._recent = self._memory.states(indices, *(values[indices] for values in self._state()))
+            self._recent = self._memory.states(indices, self._now(indices))
         return self._recent
+
+    def _now(self, indices: Indices) -> Now:
+        measured = {name: taken(values, indices) for name, values in self._measured.items()}
+        qpos, qvel, time = self._state()
+        return Now(taken(qpos, indices), taken(qvel, indices), taken(time, indices), measured)
 
     def _judged(
         self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
@@ -319,9 +357,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
         """Return what is known about each environment, and below `_NAME` of which ones it is."""
-        infos: dict[str, Any] = {}
+        infos, everyone = dict[str, Any](), np.ones(self.num_envs, dtype=bool)
         for name, values in self._clocks().items():
-            infos[name], infos[f"_{name}"] = values, np.ones(self.num_envs, dtype=bool)
+            infos[name], infos[f"_{name}"] = values, everyone
         if self._success is not None:
             known = self._begun.copy()
             known[list(errors)] = False

@@ -43,6 +43,7 @@ def _create(plan: dict[str, Any], frames: dict[str, Any]) -> Any:
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in vectors.items()
     }
+    features |= {f"next.{name}": {"dtype": kind, "shape": (1,), "names": None} for name, kind in plan["next"].items()}
     for i, name in enumerate(plan["cameras"]):
         features[f"observation.images.{name}"] = {
             "dtype": "video" if plan["video"] else "image",
@@ -65,6 +66,7 @@ def _add(dataset: Any, plan: dict[str, Any], frames: dict[str, Any]) -> None:
             "observation.state": frames["state"][row],
             "action": frames["action"][row],
             "task": plan["task"],
+            **{f"next.{name}": frames[name][row : row + 1] for name in plan["next"]},
         }
         if plan["goal"]:
             frame["observation.environment_state"] = frames["goal"][row]

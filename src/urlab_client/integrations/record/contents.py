@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -18,6 +18,15 @@ from urlab_client.integrations._feed.messages import CompressedImage, EpisodeMes
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.values.pictures import Pixels, shown_png, without_alpha
+
+TASK: Final = "task"
+"""First part of the names of the columns with what an environment told about a state."""
+
+CHOSEN: Final = "chosen"
+"""Name of the column, `task/chosen/ARTICULATION`, with the set-points that an action meant if it took effect late."""
+
+GOAL: Final = "goal"
+"""First part of the names of the columns with an episode's goal: `goal/NAME`."""
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
@@ -106,7 +115,8 @@ class Table:
         step: Step counter.
         episode: Number of preceding resets.
         columns: Columns by `ARTICULATION/FIELD`, with fields as in `client.articulations`: `qpos`, `qvel`, `ctrl`,
-            `set_points`, `act`, `sensors`; plain entities have `pose` and `qvel`.
+            `set_points`, `act`, `sensors`; plain entities have `pose` and `qvel`. What an environment told about a
+            state is in `task/actions`, `action`, `reward`, `terminated`, `truncated`, `success` and `goal/NAME`.
     """
 
     time: Floats

@@ -11,6 +11,7 @@ import contextlib
 import csv
 import importlib
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
 from fractions import Fraction
 from itertools import islice
@@ -27,7 +28,7 @@ from urlab_client.integrations.record.contents import Table, even, farthest, vis
 from urlab_client.integrations.record.index import Progress
 from urlab_client.integrations.record.lerobot import write_lerobot
 from urlab_client.integrations.record.reader import Run, phases
-from urlab_client.integrations.record.transitions import Episodes, check_episodes, pair_rows, pairs_at, with_goals
+from urlab_client.integrations.record.transitions import Episodes, check_episodes, pairs_at, selected_pairs, with_goals
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
@@ -38,15 +39,23 @@ _CODECS = {"libx264": 90_000, "mpeg4": 60_000}
 """Ticks per second of MP4 timestamps by codec; MPEG-4 allows at most 65,535."""
 
 
-def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
+def write_csv(
+    run: Run,
+    path: Path,
+    progress: Progress | None = None,
+    *,
+    episodes: Episodes = "kept",
+    left_out: Counter[str] | None = None,
+) -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
     Numbers are written without loss of precision. See `transitions` for the rows, and `transitions_of` for `episodes`.
+    The number of pairs that are not written is counted in `left_out`, by reason.
     """
     count = 0
     with (
         replaced(path) as temporary,
-        contextlib.closing(_transitions(run, path.parent, episodes, progress)) as pieces,
+        contextlib.closing(_transitions(run, path.parent, episodes, left_out, progress)) as pieces,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
@@ -94,10 +103,17 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
         return len(table)
 
 
-def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
+def write_parquet(
+    run: Run,
+    path: Path,
+    progress: Progress | None = None,
+    *,
+    episodes: Episodes = "kept",
+    left_out: Counter[str] | None = None,
+) -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
-    See `transitions` for the rows, and `transitions_of` for `episodes`.
+    See `write_csv`.
 
     Raises:
         ImportError: The extra `dataset` is not installed.
@@ -109,7 +125,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
     count = 0
     with (
         replaced(path) as temporary,
-        contextlib.closing(_transitions(run, path.parent, episodes, progress)) as pieces,
+        contextlib.closing(_transitions(run, path.parent, episodes, left_out, progress)) as pieces,
         contextlib.ExitStack() as stack,
     ):
         writer: Any = None
@@ -165,20 +181,22 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
     return count
 
 
-def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress | None) -> Generator[Table]:
+def _transitions(
+    run: Run, folder: Path, episodes: Episodes, left_out: Counter[str] | None, progress: Progress | None
+) -> Generator[Table]:
     """Yield the pairs of a recording in pieces, each of which counts as written when the next one is taken."""
     check_episodes(episodes)
     size = run.path.stat().st_size
     reading, writing = phases(size, progress, 2)
     with run.stored_table(folder, reading) as table:
         outcomes = run.outcomes()
-        rows = pair_rows(table, outcomes, episodes)
-        width = sum(column.values.shape[1] for column in table.columns.values()) + 1
+        pairs = selected_pairs(table, outcomes, episodes, left_out)
+        total, width = len(pairs.rows), sum(column.values.shape[1] for column in table.columns.values()) + 1
         count = 0
-        for part in np.array_split(rows, 1 + len(rows) * width // tables.PIECE_VALUES):
-            yield with_goals(pairs_at(table, part), outcomes)
+        for part in np.array_split(np.arange(total), 1 + total * width // tables.PIECE_VALUES):
+            yield with_goals(pairs_at(table, pairs.part(part)), outcomes)
             count += len(part)
-            writing(size * count // max(1, len(rows)))
+            writing(size * count // max(1, total))
 
 
 def _save_table(run: Run, archive: zipfile.ZipFile, table: Table, report: Callable[[float], None]) -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from urlab_client._platform.children import APART
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations.record.contents import Column, Table, even, farthest, visible
+from urlab_client.integrations.record.contents import GOAL, TASK, Column, Table, even, farthest, visible
 from urlab_client.integrations.record.index import Progress
 from urlab_client.integrations.record.reader import Run, phases
-from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, pair_rows, pairs_at, with_goals
+from urlab_client.integrations.record.transitions import (
+    Episodes,
+    Pairs,
+    check_episodes,
+    pairs_at,
+    selected_pairs,
+    with_goals,
+)
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 
@@ -53,6 +60,8 @@ def write_lerobot(
     video: bool = True,
     max_picture_age: float | None = None,
     episodes: Episodes = "kept",
+    overwrite: bool = False,
+    left_out: Counter[str] | None = None,
     progress: Progress | None = None,
 ) -> int:
     """Write a LeRobot dataset with LeRobot itself, in an interpreter that has it; return the number of frames.
@@ -62,9 +71,12 @@ def write_lerobot(
     slashes. An episode ends at each reset; its last state, which no action follows, is not a frame. Every 1/fps
     seconds of an episode, starting with its first picture, the newest state and picture become a frame.
 
+    What an environment told is in `next.reward`, the sum of the rewards until the next frame, and in `next.done` and
+    `next.success`, as they are then. An episode is done if the environment says so or another one follows.
+
     Args:
         run: The recording.
-        folder: Folder of the dataset, which must not exist.
+        folder: Folder of the dataset.
         python: Interpreter that can import `lerobot` 0.6.
         task: Description of the task.
         fps: Frames per second; by default the rate of the pictures, or of the states if there are none.
@@ -73,17 +85,19 @@ def write_lerobot(
         video: Store pictures as lossy video instead of PNG files.
         max_picture_age: Largest age of a picture relative to its state, seconds; one frame by default.
         episodes: Selection of episodes; see `transitions_of`. Goals are in `observation.environment_state`.
+        overwrite: Replace a LeRobot dataset, or an empty folder, once the new dataset is complete.
+        left_out: Counts the pairs of states and actions that became no frame, by reason.
         progress: Called occasionally with the number of bytes read so far.
 
     Raises:
-        FileExistsError: The folder exists.
+        FileExistsError: The folder exists, and is not to be overwritten or is not a dataset.
         RecordingError: The interpreter has no LeRobot, there is nothing to write, pictures are missing so that a frame
             would show an older state, the rate is not an integer, or LeRobot failed.
         KeyError: The recording has no pictures of a camera.
     """
-    if folder.exists():
-        raise FileExistsError(f"{folder} exists: LeRobot makes the folder itself")
+    _check_folder(folder, overwrite)
     check_episodes(episodes)
+    left_out = Counter() if left_out is None else left_out
     _check(python)
     names = run.cameras() if cameras is None else list(cameras)
     steps = iter(phases(run.path.stat().st_size, progress, 1 + 2 * len(names)))
@@ -94,17 +108,18 @@ def write_lerobot(
         tempfile.TemporaryDirectory(prefix=".urlab-", dir=folder.parent, ignore_cleanup_errors=True) as temporary,
     ):
         work, outcomes = Path(temporary), run.outcomes()
-        pairs = pair_rows(table, outcomes, episodes)
-        rate = _rate(run, [*times.values()] or [table.time]) if fps is None else fps
-        rows = _resampled(run, table, pairs, rate, [*times.values()])
-        if not len(rows):
+        pairs = selected_pairs(table, outcomes, episodes, left_out)
+        rate = _rate(run, [*times.values()] or [table.time[pairs.rows]]) if fps is None else fps
+        frames = pairs.part(_resampled(run, table, pairs, rate, pictures=[*times.values()], left_out=left_out))
+        if not len(frames.rows):
             raise RecordingError(f"{run.path}: it contains nothing for a dataset.")
-        episode, when = table.episode[rows], table.time[rows]
+        episode, when = table.episode[frames.rows], table.time[frames.rows]
         limit = 1 / rate if max_picture_age is None else max_picture_age
         chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
-        vectors = _vectors(table, rows[np.unique(episode, return_index=True)[1]], outcomes)
+        vectors = _vectors(table, frames.part(np.unique(episode, return_index=True)[1]), outcomes)
         if not np.isfinite(vectors["goal"].values).all():
             raise RecordingError(f"{run.path}: the goals of some of its episodes are unknown.")
+        after = _after(run, table, pairs, frames)
         plan = {
             "folder": str((work / "dataset").absolute()),
             "name": folder.name,
@@ -112,6 +127,7 @@ def write_lerobot(
             "task": task,
             "robot_type": "+".join(vectors["action"].owners) if robot_type is None else robot_type,
             **{what: vector.names for what, vector in vectors.items()},
+            "next": {name: str(values.dtype) for name, values in after.items()},
             "cameras": [name.replace("/", ".") for name in names],
             "video": video,
         }
@@ -121,14 +137,32 @@ def write_lerobot(
             for part, ends_episode in _batches(episode):
                 arrays: dict[str, NDArray[Any]] = {
                     what: vector.values.astype(np.float32)
-                    for what, vector in _vectors(table, rows[part], outcomes).items()
+                    for what, vector in _vectors(table, frames.part(part), outcomes).items()
                 }
+                arrays |= {name: values[part] for name, values in after.items()}
                 for i, (one, which) in enumerate(zip(pictures, chosen, strict=True)):
                     arrays[f"pictures{i}"], arrays[f"picture{i}"] = one.take(which[part])
                 writer.add(arrays, ends_episode=ends_episode)
             writer.finish()
-        (work / "dataset").rename(folder)
-    return len(rows)
+        before = work / "replaced"
+        try:
+            if folder.exists():
+                folder.rename(before)
+            (work / "dataset").rename(folder)
+        except BaseException:
+            if before.exists() and not folder.exists():
+                before.rename(folder)
+            raise
+    return len(frames.rows)
+
+
+def _check_folder(folder: Path, overwrite: bool) -> None:
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise FileExistsError(f"{folder} exists, and is replaced only on request")
+    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / "meta" / "info.json").is_file()):
+        raise FileExistsError(f"{folder} exists and is not a LeRobot dataset, so it is not replaced")
 
 
 class _Vector(NamedTuple):
@@ -139,22 +173,51 @@ class _Vector(NamedTuple):
     values: Floats
 
 
-def _vectors(table: Table, rows: NDArray[np.intp], outcomes: Sequence[OutcomeMessage]) -> dict[str, _Vector]:
-    """Return state, action and goal at some rows of a table."""
-    columns = with_goals(pairs_at(table, rows), outcomes).columns
+def _vectors(table: Table, pairs: Pairs, outcomes: Sequence[OutcomeMessage]) -> dict[str, _Vector]:
+    """Return state, action and goal of some pairs."""
+    columns = with_goals(pairs_at(table, pairs), outcomes).columns
     chosen: dict[str, dict[str, Column]] = {
         "state": {key.removesuffix("/qpos"): one for key, one in columns.items() if key.endswith("/qpos")},
-        "action": {key.removesuffix("/action"): one for key, one in columns.items() if key.endswith("/action")},
+        "action": {
+            key.removesuffix("/action"): one
+            for key, one in columns.items()
+            if key.endswith("/action") and key.removesuffix("/action") != TASK
+        },
         "goal": {key.partition("/")[2]: one for key, one in columns.items() if key.startswith(f"{GOAL}/")},
     }
     return {
         what: _Vector(
             owners=[*found],
             names=[f"{key}.{name}" for key, one in found.items() for name in one.names],
-            values=np.concatenate([np.zeros((len(rows), 0)), *(one.values for one in found.values())], axis=1),
+            values=np.concatenate([np.zeros((len(pairs.rows), 0)), *(one.values for one in found.values())], axis=1),
         )
         for what, found in chosen.items()
     }
+
+
+def _after(run: Run, table: Table, pairs: Pairs, frames: Pairs) -> dict[str, NDArray[Any]]:
+    """Return what an environment told about the time from each frame to the next one; nothing if it told nothing."""
+    if f"{TASK}/reward" not in table.columns:
+        return {}
+    # The row that each frame leads to: that of the next frame, or what the last action of the episode led to.
+    episode = table.episode[frames.rows]
+    final = np.append(np.diff(episode) != 0, True)
+    last = pairs.led[np.searchsorted(table.episode[pairs.rows], episode, side="right") - 1]
+    until = np.where(final, last, np.append(frames.rows[1:], 0))
+    told = {name: table.columns[f"{TASK}/{name}"].values[until, 0] for name in ("reward", "terminated", "truncated")}
+    if np.isnan(told["reward"]).all():
+        return {}
+    if np.isnan(told["reward"]).any():
+        raise RecordingError(f"{run.path}: the rewards of some of its episodes are unknown.")
+    rewards = np.append(np.nan_to_num(table.columns[f"{TASK}/reward"].values[:, 0]), 0.0)
+    ends = np.column_stack([frames.rows, until]).ravel() + 1
+    found = np.where(until > frames.rows, np.add.reduceat(rewards, ends)[::2], 0.0)
+    over = (told["terminated"] + told["truncated"] > 0) | (final & (episode != table.episode[-1]))
+    after: dict[str, NDArray[Any]] = {"reward": found.astype(np.float32), "done": over}
+    success = table.columns.get(f"{TASK}/success")
+    if success is not None and np.isfinite(success.values[until, 0]).all():
+        after["success"] = success.values[until, 0] > 0
+    return after
 
 
 def _batches(episodes: NDArray[np.int64]) -> Iterator[tuple[slice, bool]]:
@@ -229,11 +292,11 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
 
 
 def _resampled(
-    run: Run, table: Table, pairs: NDArray[np.intp], fps: int, pictures: list[NDArray[np.float64]]
+    run: Run, table: Table, pairs: Pairs, fps: int, *, pictures: list[NDArray[np.float64]], left_out: Counter[str]
 ) -> NDArray[np.intp]:
-    """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
-    rows: list[NDArray[np.intp]] = []
-    time, episodes = table.time[pairs], table.episode[pairs]
+    """Return the number of the newest pair at each 1/fps seconds of each episode, from its first pictures on."""
+    chosen = [np.zeros(0, dtype=np.intp)]
+    time, episodes = table.time[pairs.rows], table.episode[pairs.rows]
     for episode in np.unique(episodes).tolist():
         own = np.flatnonzero(episodes == episode)
         first, last = float(time[own[0]]), float(time[own[-1]])
@@ -241,6 +304,7 @@ def _resampled(
         for times in pictures:
             later = times[times >= began - _SLACK_S]
             first = max(first, float(later[0]) if len(later) else np.inf)
+        left_out["before the first picture of their episode"] += int((time[own] < first - _SLACK_S).sum())
         if first <= last + _SLACK_S:
             if (last - first) * fps > _MOST_FRAMES:
                 raise RecordingError(
@@ -248,8 +312,10 @@ def _resampled(
                 )
             grid = first + np.arange(int((last - first) * fps + _SLACK_S) + 1) / fps
             found = np.searchsorted(time[own], grid + _SLACK_S, side="right") - 1
-            rows.append(pairs[own[np.maximum(found, 0)]])
-    return np.sort(np.concatenate(rows)) if rows else np.zeros(0, dtype=np.intp)
+            chosen.append(own[np.maximum(found, 0)])
+            seen = int((time[own] >= first - _SLACK_S).sum())
+            left_out[f"between frames at {fps} per second"] += max(0, seen - len(np.unique(chosen[-1])))
+    return np.sort(np.concatenate(chosen))
 
 
 def _newest(

@@ -31,9 +31,14 @@ from urlab_client.integrations._feed.messages import (
     GapMessage,
     OutcomeMessage,
     RawImage,
+    TransitionMessage,
     schema_name,
 )
+from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import (
+    CHOSEN,
+    GOAL,
+    TASK,
     Camera,
     RecordedArticulation,
     RecordedEntity,
@@ -56,6 +61,7 @@ if TYPE_CHECKING:
 _NS = 1e9
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _STATES, _ENTITIES = schema_name(ArticulationMessage), schema_name(EntityMessage)
+_TRANSITIONS = schema_name(TransitionMessage)
 _PICTURES = schema_name(CompressedImage), schema_name(RawImage)
 _CAMERA, _ARTICULATION, _ENTITY = "/camera/", "/state/", "/entity/"
 _MESSAGE_BYTES = 32 << 20
@@ -73,6 +79,7 @@ _DECODERS: Final = {
     schema_name(kind): msgspec.json.Decoder(kind, strict=False).decode
     for kind in (
         ArticulationMessage, CompressedImage, EntityMessage, EpisodeMessage, GapMessage, OutcomeMessage, RawImage,
+        TransitionMessage,
     )
 }  # fmt: skip
 
@@ -140,7 +147,7 @@ class Run:
         Raises:
             RecordingError: The file contains two scenes, which do not fit into one table.
         """
-        return self._read_states(self._builder(None, fields), progress)
+        return self._read_states(self._builder(None), fields, progress)
 
     @contextlib.contextmanager
     def stored_table(
@@ -157,8 +164,8 @@ class Run:
             OSError: The temporary file cannot be written.
             RecordingError: The file contains two scenes, which do not fit into one table.
         """
-        with contextlib.closing(self._builder(folder, fields)) as builder:
-            yield self._read_states(builder, progress)
+        with contextlib.closing(self._builder(folder)) as builder:
+            yield self._read_states(builder, fields, progress)
 
     def outcomes(self) -> tuple[OutcomeMessage, ...]:
         """Return the marked outcomes of episodes; if an episode has several marks, the last one."""
@@ -366,15 +373,20 @@ class Run:
             found.append(_decoded(index, message, kind))
         return found
 
-    def _builder(self, folder: Path | None, fields: Collection[str] | None) -> TableBuilder:
-        most = max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size)
-        return TableBuilder(folder, fields, most=most)
+    def _builder(self, folder: Path | None) -> TableBuilder:
+        return TableBuilder(folder, most=max(_MOST_VALUES, _VALUES_PER_BYTE * self.path.stat().st_size))
 
-    def _read_states(self, builder: TableBuilder, progress: Progress | None) -> Table:
+    def _read_states(self, builder: TableBuilder, only: Collection[str] | None, progress: Progress | None) -> Table:
         index = self._index(progress)
-        channels = [channel.id for channel in index.channels_of(_STATES, _ENTITIES)]
+        channels = [channel.id for channel in index.channels_of(_STATES, _ENTITIES, _TRANSITIONS)]
         for message in self._messages(index, channels, progress):
-            state = _decoded(index, message, ArticulationMessage, EntityMessage)
+            state = _decoded(index, message, ArticulationMessage, EntityMessage, TransitionMessage)
+            if isinstance(state, TransitionMessage):
+                try:
+                    _add_transition(builder, message.channel.layout, state)
+                except ValueError as error:
+                    raise index.unreadable(message, error) from None
+                continue
             prefix = _ARTICULATION if isinstance(state, ArticulationMessage) else _ENTITY
             key = message.channel.topic.removeprefix(prefix)
             source = builder.source(key, message.channel.layout)
@@ -385,10 +397,24 @@ class Run:
                 )
             times = SampleTimes(message.log_time, state.sim_time, message.publish_time, state.step, state.episode)
             try:
-                builder.add(source, state.sample, times, **_fields(source, state))
+                own = {name: found for name, found in _fields(source, state).items() if only is None or name in only}
+                builder.add(source, state.sample, times, **own)
             except ValueError as error:  # it does not fit those before it
                 raise index.unreadable(message, error) from None
         return builder.finish(broken_off=bool(self.damage))
+
+
+def _add_transition(builder: TableBuilder, layout: SceneLayout, led: TransitionMessage) -> None:
+    """Add what an environment tells about a state to its sample, which must be the last one."""
+    if led.sample != builder.sample:
+        raise ValueError(f"it is about sample {led.sample} and follows sample {builder.sample}")
+    success = [] if led.success is None else [float(led.success)]
+    numbers = {"actions": [float(led.actions)], "action": led.action, "success": success}
+    if led.actions:
+        ends = {"terminated": [float(led.terminated)], "truncated": [float(led.truncated)]}
+        numbers |= {"reward": [led.reward], **ends, **{f"{CHOSEN}/{key}": each for key, each in led.chosen.items()}}
+    builder.add_to_last(Source(TASK, layout), **numbers)
+    builder.add_to_last(Source(GOAL, layout), **led.goal)
 
 
 def _fields(source: Source, state: ArticulationMessage | EntityMessage) -> dict[str, list[float]]:

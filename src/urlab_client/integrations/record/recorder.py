@@ -98,7 +98,9 @@ class Recording(Block):
         about = _about(self._client)
         writer = await anyio.to_thread.run_sync(WriterThread, self._path, self._options, about)
         self._writer = writer
-        self._follower.start(writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up)
+        self._follower.start(
+            writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up, note=writer.note
+        )
 
     async def _end(self, error: BaseException | None) -> None:
         self._follower.detach()

@@ -9,7 +9,7 @@ import io
 import math
 import tempfile
 from array import array
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -119,13 +119,11 @@ class TableBuilder:
     Args:
         folder: Folder of a temporary file for the values, which the table then maps; None keeps them in memory. If the
             system supports it, the file has no name, so a crash leaves nothing behind.
-        only: Fields to keep, such as `qpos`; None keeps all.
         most: Largest number of values of the whole table, missing ones included.
     """
 
-    def __init__(self, folder: Path | None, only: Collection[str] | None = None, *, most: int) -> None:
+    def __init__(self, folder: Path | None, *, most: int) -> None:
         self._folder = folder
-        self._only = only
         self._most = most
         self._file = self._opened()
         self._row = array("d")
@@ -133,7 +131,7 @@ class TableBuilder:
         self._rows: list[tuple[int, int]] = []  # widths, each with the number of successive rows
         self._fields: dict[str, _Field] = {}
         self._sources: dict[str, Source] = {}
-        self._sample = -1
+        self.sample: int = -1
         self._count = 0
         self._present = set[str]()
         self._present_before = set[str]()
@@ -144,26 +142,39 @@ class TableBuilder:
 
     def add(self, source: Source, sample: int, times: SampleTimes, **fields: Sequence[float]) -> None:
         """Add a part of a sample."""
-        if sample < self._sample or (sample == self._sample and source.key in self._present):
-            raise ValueError(f"sample {sample} comes after sample {self._sample}")
-        kept = {
-            name: values for name, values in fields.items() if values and (self._only is None or name in self._only)
-        }
-        known = {name: self._fields.get(f"{source.key}/{name}") or _Field(source, name) for name in kept}
-        width = self._width + sum(max(0, len(values) - known[name].width) for name, values in kept.items())
-        count = self._count + (sample > self._sample)
-        if width > _MOST_COLUMNS or count * width > self._most:
-            raise ValueError(f"{count} samples of {width} values are too many for the size of the file")
-        if sample > self._sample:
+        if sample < self.sample or (sample == self.sample and source.key in self._present):
+            raise ValueError(f"sample {sample} comes after sample {self.sample}")
+        known = self._known(source, fields, new=sample > self.sample)
+        if sample > self.sample:
             self._write_row()
-            self._sample, self._present_before, self._present = sample, self._present, set[str]()
+            self.sample, self._present_before, self._present = sample, self._present, set[str]()
             self._row = array("d", (times.log_ns / _NS, times.sim_time))
             self._row.frombytes(array("q", times[2:]).tobytes())  # the bits of integers
             self._row.extend([math.nan] * (self._width - _TIMES))
-            self._count = count
+            self._count += 1
         self._present.add(source.key)
-        for name, values in kept.items():
-            self._put(known[name], values)
+        for into, values in known:
+            self._put(into, values)
+
+    def add_to_last(self, source: Source, **fields: Sequence[float]) -> None:
+        """Add to the last sample what may be missing from it."""
+        for into, values in self._known(source, fields, new=False):
+            self._put(into, values)
+
+    def _known(
+        self, source: Source, fields: Mapping[str, Sequence[float]], *, new: bool
+    ) -> list[tuple[_Field, Sequence[float]]]:
+        """Return the fields that have values, which must fit; `new` means that they begin a sample."""
+        known = [
+            (self._fields.get(f"{source.key}/{name}") or _Field(source, name), values)
+            for name, values in fields.items()
+            if values
+        ]
+        width = self._width + sum(max(0, len(values) - into.width) for into, values in known)
+        count = self._count + new
+        if width > _MOST_COLUMNS or count * width > self._most:
+            raise ValueError(f"{count} samples of {width} values are too many for the size of the file")
+        return known
 
     def _put(self, into: _Field, values: Sequence[float]) -> None:
         more = len(values) - into.width

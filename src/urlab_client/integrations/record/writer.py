@@ -20,6 +20,7 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from urlab_client._mujoco import saved_model
 from urlab_client.aio.background import background_thread
@@ -31,6 +32,8 @@ from urlab_client.integrations._feed.messages import (
     GapMessage,
     OutcomeMessage,
     Time,
+    Transition,
+    TransitionMessage,
     VariedQuantity,
     encode,
     schema_name,
@@ -119,11 +122,11 @@ class WriterThread:
         self.path = path
         self.error: OSError | RecordingError | None = None
         self._options = options
-        self._queue: deque[tuple[State | CameraPicture | EpisodeMark, int]] = deque()
+        self._queue: deque[tuple[State | CameraPicture | EpisodeMark | Transition, int]] = deque()
         # No lock needed, because each counter has one writer.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
-        self._stalled = False
+        self._stalled = self._dropped_last = False
         self._stop = threading.Event()
         self._file = _McapFile(path, "wb" if options.overwrite else "xb")
         try:
@@ -162,7 +165,8 @@ class WriterThread:
         limit, waiting = self._options.buffer_bytes, self._put_bytes - self._taken_bytes
         kept = self._options.lossless and item.waits and not self._stalled
         if isinstance(item, State):
-            if self.error is not None or (not kept and waiting + size > limit):
+            self._dropped_last = self.error is not None or (not kept and waiting + size > limit)
+            if self._dropped_last:
                 self._dropped_states += 1
                 return
         elif self.error is not None or (not kept and waiting + size > limit // 2):
@@ -174,6 +178,11 @@ class WriterThread:
     def mark(self, item: EpisodeMark) -> None:
         """Queue the outcome of the episode, which is never dropped."""
         self._queue.append((item, 0))
+
+    def note(self, item: Transition) -> None:
+        """Queue what led to the last state, unless that was dropped."""
+        if not self._dropped_last:
+            self._queue.append((item, 0))
 
     def lose_frames(self, count: int) -> None:
         """Count pictures that did not arrive. Call from the thread that calls `put`."""
@@ -301,12 +310,13 @@ class _Sink:
         self._reported = 0, 0
         self._dirty_since: float | None = None
         self._varied: tuple[int, int] | None = None
+        self._noted = -1
         self._writer = Writer(cast("IO[bytes]", file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"urlab-client {version('urlab-client')}")
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **about})
 
-    def write(self, item: State | CameraPicture | EpisodeMark) -> None:
+    def write(self, item: State | CameraPicture | EpisodeMark | Transition) -> None:
         match item:
             case State():
                 self._write_state(item)
@@ -316,6 +326,12 @@ class _Sink:
                 now = self._clock.last or 0
                 outcome = OutcomeMessage(Time.of(now), self._clock.episode, item.outcome, item.goal)
                 self._add("/recording/outcomes", outcome, now, item.wall_ns)
+            case Transition() if self.states - 1 > self._noted:
+                now, self._noted = self._clock.last or 0, self.states - 1
+                led = TransitionMessage(timestamp=Time.of(now), sample=self._noted, **asdict(item))
+                self._add("/recording/transitions", led, now, time.time_ns())
+            case _:
+                pass  # of a state that is not in the file, or has one already
 
     def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
         """Write the chunk if its oldest message is old enough, which limits the loss in a crash."""

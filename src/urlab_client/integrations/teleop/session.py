@@ -257,7 +257,11 @@ class _Session:
         """Return the goal of the episode, and whether the current state is a success."""
         if self._starts is None or self._memory is None or self.task is None:
             return {}, None
+        from urlab_client.integrations.gym.task import Now
+
         qpos, qvel, time = self._starts.state()
-        states = self._memory.states(np.zeros(1, dtype=np.intp), qpos[None].copy(), qvel[None].copy(), np.array([time]))
+        measured = {name: values[None] for name, values in self._starts.measured().items()}
+        now = Now(qpos[None].copy(), qvel[None].copy(), np.array([time]), measured)
+        states = self._memory.states(np.zeros(1, dtype=np.intp), now)
         found = self.task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])

@@ -64,7 +64,7 @@ class SceneVariation:
 
     def start(self) -> None:
         if self.draws is not None:
-            self._variation.start(self.draws, self._scene.data.qpos)
+            self._variation.start(self.draws, self._scene.data.qpos, self._scene.data.qvel)
 
     def restore(self) -> None:
         if self.draws is not None:
