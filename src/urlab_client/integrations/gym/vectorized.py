@@ -219,6 +219,11 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Actions after which an episode is truncated, or None."""
         return self._settings.max_episode_steps
 
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps per action."""
+        return self._settings.n_substeps
+
     def episode_seeds(self) -> NDArray[np.int64]:
         """Return the seed of each environment's episode, from which all variation follows; -1 if nothing varies."""
         found = np.full(self.num_envs, -1, dtype=np.int64)

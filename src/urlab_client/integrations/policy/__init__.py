@@ -12,6 +12,7 @@ from urlab_client.integrations.policy.evaluation import (
     evaluate_on,
     wilson,
 )
+from urlab_client.integrations.policy.export import PolicyExportError, export_policy
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.network import (
     Network,
@@ -35,6 +36,7 @@ __all__ = [
     "Outcome",
     "PicturesNetwork",
     "Policy",
+    "PolicyExportError",
     "PolicyFileError",
     "PolicyMapping",
     "PolicyMismatch",
@@ -44,6 +46,7 @@ __all__ = [
     "bootstrap_mean",
     "evaluate_in",
     "evaluate_on",
+    "export_policy",
     "load",
     "parse_spec",
     "read_spec",
