@@ -259,7 +259,8 @@ def _robot(served: URLabEnv, task: Task, given: Any) -> URLabArticulation:
 
     env = getattr(given, "unwrapped", None)
     if env is not None and (
-        (env.n_substeps, env.mapping.mode, env.mapping.fields) != (served.n_substeps, "flat", fields_of(task.observations))
+        (env.n_substeps, env.mapping.mode, env.mapping.fields)
+        != (served.n_substeps, "flat", fields_of(task.observations))
         or any(env.mapping.actions(key) != served.mapping.actions(key) for key in served.mapping.keys)
     ):
         raise PolicyExportError(
@@ -421,7 +422,7 @@ def _layers(module: Any, outputs: int = 0) -> Iterator[Layer]:
     elif kind == "_FirstSliceDeterministicOutput":  # the means, which stand before the deviations
         yield "Slice", [np.array([0]), np.array([outputs]), np.array([1])], {}
     elif "Sequential" in _ancestors(module):
-        for child in module.children():
+        for child in module:  # children() would leave out activations that are used twice
             yield from _layers(child, outputs)
     elif hasattr(module, "mean") and hasattr(module, "std") and hasattr(module, "eps"):
         yield "Sub", [_array(module.mean)], {}
