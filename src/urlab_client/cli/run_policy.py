@@ -3,9 +3,10 @@
 Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network observes and what its
 outputs mean. Refuses to start if the robot, step mode, timestep or controller is not the one that the policy requires.
 Without an address it starts a simulated server; with one it opens a session, which takes the server over from the
-client that drives it. With --task, or if the declaration names a task, the network maps observations of the task to
-actions, as for evaluate, and one episode runs; options about the robot then drive the robot instead. Exit code 1 if the robot fell, or the episode of the task was terminated without success. Needs the extra
-'urlab-client[onnx]', and with --task also 'urlab-client[gym]'.
+client that drives it. With --task, or if the declaration names a task, the network maps observations of the task
+to actions, as for evaluate, and one episode runs. With --robot, --command, --goal, --step-mode or --compare, the
+declaration's terms drive the robot instead. Exit code 1 if the robot fell, or the episode of the task was terminated
+without success. Needs the extra 'urlab-client[onnx]', and for tasks also 'urlab-client[gym]'.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, policy_task
 from urlab_client.cli._common import (
-    CommandError,
     aligned,
     check_recording,
     import_mujoco,

@@ -16,7 +16,7 @@ from contextlib import closing
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -39,6 +39,7 @@ from urlab_client.integrations.policy.spec import (
     Numbers,
     NumberTerm,
     PolicySpec,
+    Term,
 )
 from urlab_client.protocol.base import Floats
 from urlab_client.sync._facade import aio_of
@@ -47,13 +48,15 @@ from urlab_client.sync.articulation import URLabArticulation
 if TYPE_CHECKING:
     from urlab_client.integrations.gym import Start, Task, URLabBatchEnv, URLabEnv, URLabVectorEnv
 
-EPISODES: Final = 8
-STEPS: Final = 40
+EPISODES: Final = 4
+STEPS: Final = 25
 DRAWN: Final = 256
 """Number of starts that are drawn for the limits of the goal, and of random observations."""
 
 Layer: TypeAlias = tuple[str, Sequence[Any], Mapping[str, Any]]
 """An ONNX operator, the constants that it takes after the value, and its attributes."""
+
+AnyGoal = TypeVar("AnyGoal", bound=Goal)
 
 _Act = Callable[[Floats], Floats]
 
@@ -150,21 +153,19 @@ def export_policy(
 
     path, own = Path(path), _own_task(task)
     goals = _noted_goals(own)
-    # Of all fields, because terms may refer to those that the task does not observe.
     connected = URLabEnv.connect(own.scene_address, task=own, observations="standard")
     with closing(connected) as served, tempfile.TemporaryDirectory() as folder:
-        robot = _robot(served, own, task)
-        size = len(_observed(served, own, served.reset(seed=0)[0]))
-        trained = _trained(model, env, size, served.action_space)
-        network = Path(folder) / path.name
-        network.write_bytes(onnx_network(trained.layers, size * trained.history))
-        loaded = OnnxNetwork(network)
-        moments = _episodes(served, robot, own, trained, goals)
-        _check_network(loaded, trained, np.array([moment.seen for moment in moments]), tolerance)
-        observation = _observation(served, own, moments, terms)
-        spec = _declaration(served, robot, own, trained.history, observation, _limits_of_goal(own, observation, goals))
-        _check_declaration(served, robot, Policy(spec, loaded, source=str(path)), moments, tolerance)
-        path.write_bytes(network.read_bytes())
+        rehearsal = _Rehearsal(served, own, goals)
+        if (given := getattr(task, "unwrapped", None)) is not None:
+            rehearsal.require_same(given)
+        trained = _trained(model, env, rehearsal.size, served.action_space)
+        written = Path(folder) / path.name
+        written.write_bytes(onnx_network(trained.layers, rehearsal.size * trained.history))
+        network, moments = OnnxNetwork(written), rehearsal.moments(trained)
+        _check_network(network, trained, np.array([moment.seen for moment in moments]), tolerance)
+        spec = rehearsal.declared(trained.history, rehearsal.terms(moments, terms))
+        rehearsal.check(Policy(spec, network, source=path.with_suffix(".toml").name), moments, tolerance)
+        path.write_bytes(written.read_bytes())
     path.with_suffix(".toml").write_text(f"# Inputs and outputs of {path.name}.\n\n{spec.to_toml()}", encoding="utf-8")
     return spec
 
@@ -242,43 +243,137 @@ def _noted_goals(task: Task) -> list[Floats]:
     return goals
 
 
-def _robot(served: URLabEnv, task: Task, given: Any) -> URLabArticulation:
-    """Return the articulation that a policy for this task drives.
+class _Rehearsal:
+    """A task in an environment of its own, in which a model acts.
 
-    Raises:
-        PolicyExportError: A policy cannot be exported for this task, or the environment overrides it.
+    Attributes:
+        size: Length of an observation of the task.
     """
-    from urlab_client.integrations.gym.spaces import fields_of
 
-    driven = [*served.mapping.split(np.zeros(served.mapping.n_actions))]
-    if task.space_mode == "dict" or len(driven) != 1:
-        raise PolicyExportError(
-            f"{_name(task)} must have flat observations, and actions of one articulation.",
-            hint="Other networks can be exported with torch.onnx.export: see task_network().",
+    def __init__(self, env: URLabEnv, task: Task, goals: list[Floats]) -> None:
+        """Take an environment that observes all fields: terms may refer to those that the task does not observe."""
+        from urlab_client.integrations.gym.spaces import fields_of
+
+        self._env, self._mapping, self._task, self._goals = env, env.mapping, task, goals
+        self._fields: tuple[Any, ...] = fields_of(task.observations)
+        driven = [*self._mapping.split(np.zeros(self._mapping.n_actions))]
+        if task.space_mode == "dict" or len(driven) != 1:
+            raise PolicyExportError(
+                f"{_name(task)} must have flat observations, and actions of one articulation.",
+                hint="Other networks can be exported with torch.onnx.export: see task_network().",
+            )
+        self._robot: URLabArticulation = env.articulations[driven[0]]
+        self.size: int = len(self._observed(env.reset(seed=0)[0]))
+
+    def require_same(self, env: Any) -> None:
+        """Refuse an environment whose options override the task's attributes: the file can only name the task."""
+        ours = self._mapping
+        same = (env.n_substeps, env.mapping.mode, env.mapping.fields) == (self._env.n_substeps, "flat", self._fields)
+        if not same or any(env.mapping.actions(key) != ours.actions(key) for key in ours.keys):
+            raise PolicyExportError(
+                f"The environment overrides attributes of {_name(self._task)}, but the file can only name the task.",
+                hint="Set them in a class that derives from the task.",
+            )
+
+    def moments(self, trained: _Trained) -> list[_Moment]:
+        """Return the moments of some episodes in which a model acts."""
+        found: list[_Moment] = []
+        for episode in range(EPISODES):
+            everything, info = self._env.reset(seed=episode)
+            seen, began = [self._observed(everything)] * trained.history, info["sim_time"]
+            last = np.zeros(self._mapping.n_actions)
+            for _ in range(STEPS):
+                state = copy.deepcopy(RobotState.of(self._robot))
+                time, goal = info["sim_time"] - began, self._goals[-1]
+                found.append(_Moment(seen[-1], np.concatenate(seen), state, last, time, goal))
+                last = trained.act(found[-1].seen[None])[0]
+                everything, _, terminated, truncated, info = self._env.step(last)
+                seen = [*seen[1:], self._observed(everything)]
+                if terminated or truncated:
+                    break
+        return found
+
+    def terms(self, moments: Sequence[_Moment], given: Sequence[NumberTerm] | None) -> list[Term]:
+        """Return the terms of one observation; none if a declaration cannot describe it."""
+        observed, goals = self._mapping.observed, np.array([each.goal for each in moments])
+        if len(observed) > 1 and given:
+            raise PolicyExportError(f"Terms describe one robot, but {', '.join(observed)} are observed.")
+        if given is None and goals.shape[1] == self._task.n_observed:
+            shown = np.array([each.observed for each in moments])[:, self.size - goals.shape[1] :]
+            given = [GoalTerm()] * bool(goals.shape[1]) if np.array_equal(shown, goals) else None
+        return [] if given is None or len(observed) > 1 else [*(FieldTerm(field=name) for name in self._fields), *given]
+
+    def declared(self, history: int, observation: list[Term]) -> PolicySpec:
+        """Return the declaration."""
+        robot, task, actions = self._robot, self._task, self._mapping.actions(self._robot.prefix)
+        actuators, controller = [*robot.actuators.values()], robot.controller
+        gains = None
+        if controller is not None and robot.control_mode is not ControlMode.RAW:
+            params: Any = controller.params
+            gains = Gains(
+                **{
+                    name: _number([params[name][each.name] for each in actuators])
+                    for name in ("kp", "kv", "torque_limit")
+                }
+            )
+        servo = gains is not None or any(actuator.type == ActuatorType.POSITION for actuator in actuators)
+        kinds = {type(term) for term in observation}
+        low, high = _bounds(self._env.action_space)
+        return PolicySpec(
+            robot=robot.prefix,
+            step_modes=[StepMode.DIRECT, StepMode.LIVE],
+            timestep=float(task.scene.model.opt.timestep),
+            decimation=self._env.n_substeps,
+            task=_name(task),
+            keyframe=task.keyframe,
+            history=history,
+            observation=observation,
+            action=Action(
+                kind="joint_position" if servo else "torque",
+                via="actuators" if gains is None else "controller",
+                joints=[actuator.joint or "" for actuator in actuators],
+                scale=_number(actions.scale),
+                offset=_number(actions.offset),
+                clip=(float(low.min()), float(high.max())),
+            ),
+            gains=gains,
+            command=self._limits(Command) if CommandTerm in kinds else None,
+            goal=self._limits(Goal) if GoalTerm in kinds else None,
         )
 
-    env = getattr(given, "unwrapped", None)
-    if env is not None and (
-        (env.n_substeps, env.mapping.mode, env.mapping.fields)
-        != (served.n_substeps, "flat", fields_of(task.observations))
-        or any(env.mapping.actions(key) != served.mapping.actions(key) for key in served.mapping.keys)
-    ):
-        raise PolicyExportError(
-            f"The environment overrides attributes of {_name(task)}, but the file can only name the task.",
-            hint="Set them in a class that derives from the task.",
-        )
-    return served.articulations[driven[0]]
+    def check(self, policy: Policy, moments: Sequence[_Moment], tolerance: float) -> None:
+        """Check that a policy's declaration gives the observations and set-points of the task."""
+        mapping = PolicyMapping(policy.spec, self._robot, policy.source)
+        if policy.spec.observation:
+            require(aio_of(self._env.client), policy, self._robot.prefix)
+            found = [
+                mapping.observe(each.state, each.goal, mapping.clipped(each.last_action), each.time, each.goal)
+                for each in moments
+            ]
+            observed = [each.observed for each in moments]
+            _require_equal(policy.source, "observation", np.array(found), np.array(observed), tolerance)
+        actions = np.array([each.last_action for each in moments])
+        expected = self._mapping.set_points(actions)[self._robot.prefix][:, mapping.ctrl]
+        _require_equal(policy.source, "set-points", mapping.targets(mapping.clipped(actions)), expected, tolerance)
 
+    def _observed(self, everything: Floats) -> Floats:
+        """Return the observation of the task, given one of all fields."""
+        fields = ((key, field) for key in self._mapping.observed for field in self._fields)
+        parts = [self._mapping.field(everything, *each) for each in fields]
+        return np.concatenate([*parts, everything[len(everything) - self._task.n_observed :]])
 
-def _observed(served: URLabEnv, task: Task, everything: Floats) -> Floats:
-    """Return the observation of a task, given one of all fields."""
-    from urlab_client.integrations.gym.spaces import fields_of
+    def _limits(self, table: type[AnyGoal]) -> AnyGoal:
+        """Return the table of the goal, with the limits of many goals that the task draws."""
+        from urlab_client.integrations.gym import Start
 
-    mapping = served.mapping
-    parts = [
-        mapping.field(everything, key, field) for key in mapping.observed for field in fields_of(task.observations)
-    ]
-    return np.concatenate([*parts, everything[len(everything) - task.n_observed :]])
+        task, rng = self._task, np.random.default_rng(0)
+        for _ in range(DRAWN):
+            memory = {name: np.zeros(shape) for name, shape in task.memory.items()}
+            task.reset(rng, Start(task.scene, np.array(task.scene.model.qpos0), memory=memory))
+        drawn = np.round(self._goals, 4)
+        low, high = drawn.min(axis=0), drawn.max(axis=0)
+        limits: dict[str, Floats] = {"default": np.round((low + high) / 2, 4), "low": low, "high": high}
+        return msgspec.convert({name: values.tolist() for name, values in limits.items()}, table)
 
 
 def _trained(model: Any, env: Any, size: int, space: Any) -> _Trained:
@@ -301,8 +396,8 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> _Trained:
         )
     steps: list[Callable[[Floats], Floats]] = []
     before: list[Layer] = []
-    for mean, deviation, limit in filter(None, map(_statistics, reversed(wrappers))):
-        mean, deviation = (np.tile(values, inputs // len(values)) for values in (mean, deviation))
+    for *moments, limit in filter(None, map(_statistics, reversed(wrappers))):
+        mean, deviation = (np.tile(values, history) for values in moments)
         before += [("Sub", [mean], {}), ("Div", [deviation], {}), *_clipped(-limit, limit)]
         steps.append(partial(_normalised, mean, deviation, limit))
     after: list[Layer] = []
@@ -360,20 +455,21 @@ def _ancestors(thing: object) -> list[str]:
 def _stable_baselines(model: Any) -> tuple[list[Layer], _Act]:
     """Return the layers that give the deterministic actions of a model of Stable-Baselines3, and its own actions."""
     policy: Any = model.policy
-    actor = getattr(policy, "actor", None)
+    actor: Any = getattr(policy, "actor", None)
     if hasattr(actor, "mu"):  # SAC and TD3; the network of TD3 ends with its Tanh
         parts = [actor.features_extractor, *([actor.latent_pi] if hasattr(actor, "latent_pi") else []), actor.mu]
-        squashes = hasattr(actor, "latent_pi")
+        squashes: bool = hasattr(actor, "latent_pi")
     elif hasattr(policy, "action_net") and hasattr(model.action_space, "low") and not hasattr(policy, "lstm_actor"):
         parts = [policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net]  # PPO and A2C
         squashes = policy.squash_output
     else:
         raise PolicyExportError(f"{type(model).__name__} has no actor with continuous actions and without memory.")
-    layers = [layer for part in parts for layer in _layers(part)] + ([("Tanh", [], {})] if squashes else [])
+    squashed: list[Layer] = [("Tanh", [], {})] if squashes else []
     low, high = _bounds(model.action_space)
     unscaled: list[Layer] = [("Mul", [(high - low) / 2], {}), ("Add", [(high + low) / 2], {})]
-    layers += unscaled if policy.squash_output else _clipped(low, high)
-    return layers, lambda inputs: model.predict(inputs, deterministic=True)[0]
+    scaled = unscaled if policy.squash_output else _clipped(low, high)
+    layers = [layer for part in parts for layer in _layers(part)]
+    return [*layers, *squashed, *scaled], lambda inputs: model.predict(inputs, deterministic=True)[0]
 
 
 def _rsl_rl(runner: Any) -> tuple[list[Layer], _Act]:
@@ -438,97 +534,13 @@ def _array(tensor: Any) -> Floats:
     return tensor.detach().cpu().numpy()
 
 
-def _episodes(
-    served: URLabEnv, robot: URLabArticulation, task: Task, trained: _Trained, goals: Sequence[Floats]
-) -> list[_Moment]:
-    """Return the moments of some episodes in which the model acts."""
-    found: list[_Moment] = []
-    for episode in range(EPISODES):
-        everything, info = served.reset(seed=episode)
-        seen = [_observed(served, task, everything)] * trained.history
-        last, began = np.zeros(served.mapping.n_actions), info["sim_time"]
-        for _ in range(STEPS):
-            state = RobotState(*map(copy.deepcopy, RobotState.of(robot)))
-            found.append(_Moment(seen[-1], np.concatenate(seen), state, last, info["sim_time"] - began, goals[-1]))
-            last = trained.act(found[-1].seen[None])[0]
-            everything, _, terminated, truncated, info = served.step(last)
-            seen = [*seen[1:], _observed(served, task, everything)]
-            if terminated or truncated:
-                break
-    return found
-
-
-def _observation(
-    served: URLabEnv, task: Task, moments: Sequence[_Moment], terms: Sequence[NumberTerm] | None
-) -> list[NumberTerm]:
-    """Return the terms of one observation; none if the declaration cannot describe it."""
-    from urlab_client.integrations.gym.spaces import fields_of
-
-    observed, n_goal = served.mapping.observed, len(moments[0].goal)
-    if len(observed) > 1:
-        if terms:
-            raise PolicyExportError(f"Terms describe one robot, but {', '.join(observed)} are observed.")
-        return []
-    if terms is None and n_goal == task.n_observed:
-        told = all(np.array_equal(each.observed[len(each.observed) - n_goal :], each.goal) for each in moments)
-        terms = [GoalTerm()] * bool(n_goal) if told else None
-    return [] if terms is None else [*(FieldTerm(field=field) for field in fields_of(task.observations)), *terms]
-
-
-def _declaration(
-    served: URLabEnv,
-    robot: URLabArticulation,
-    task: Task,
-    history: int,
-    observation: list[NumberTerm],
-    limits: Mapping[str, Goal],
-) -> PolicySpec:
-    """Return the declaration, given its terms, and its table `goal` or `command`."""
-    actuators, controller = [*robot.actuators.values()], robot.controller
-    actions, (low, high) = served.mapping.actions(robot.prefix), _bounds(served.action_space)
-    gains = None
-    if controller is not None and robot.control_mode is not ControlMode.RAW:
-        params: Any = controller.params
-        values = ([params[name][each.name] for each in actuators] for name in ("kp", "kv", "torque_limit"))
-        gains = Gains(**dict(zip(("kp", "kv", "torque_limit"), map(_number, values), strict=True)))
-    servo = gains is not None or any(actuator.type == ActuatorType.POSITION for actuator in actuators)
-    return PolicySpec(
-        robot=robot.prefix,
-        step_modes=[StepMode.DIRECT, StepMode.LIVE],
-        timestep=float(task.scene.model.opt.timestep),
-        decimation=served.n_substeps,
-        task=_name(task),
-        keyframe=task.keyframe,
-        history=history,
-        observation=[*observation],
-        action=Action(
-            kind="joint_position" if servo else "torque",
-            via="actuators" if gains is None else "controller",
-            joints=[actuator.joint or "" for actuator in actuators],
-            scale=_number(actions.scale),
-            offset=_number(actions.offset),
-            clip=(float(low.min()), float(high.max())),
-        ),
-        gains=gains,
-        **limits,  # type: ignore[arg-type]  # a `command` is a `Command`
-    )
-
-
-def _limits_of_goal(task: Task, observation: Sequence[NumberTerm], goals: Sequence[Floats]) -> dict[str, Goal]:
-    """Return the table `goal` or `command` if the terms need one, with the limits of many goals that the task draws."""
-    from urlab_client.integrations.gym import Start
-
-    commanded = any(isinstance(term, CommandTerm) for term in observation)
-    if not commanded and not any(isinstance(term, GoalTerm) for term in observation):
-        return {}
-    rng, qpos = np.random.default_rng(0), np.array(task.scene.data.qpos)
-    for _ in range(DRAWN):
-        memory = {name: np.zeros(shape) for name, shape in task.memory.items()}
-        task.reset(rng, Start(task.scene, qpos.copy(), memory=memory))
-    low, high = np.floor(np.min(goals, axis=0) * 1e3) / 1e3, np.ceil(np.max(goals, axis=0) * 1e3) / 1e3
-    limits = {"default": np.round((low + high) / 2, 4), "low": low, "high": high}
-    table = msgspec.convert({name: values.tolist() for name, values in limits.items()}, Command if commanded else Goal)
-    return {"command" if commanded else "goal": table}
+def _check_network(network: OnnxNetwork, trained: _Trained, seen: Floats, tolerance: float) -> None:
+    """Check that a network acts like the model, in the inputs of episodes and in random ones."""
+    random = np.random.default_rng(0).normal(seen.mean(axis=0), 3 * seen.std(axis=0) + 0.1, (DRAWN, seen.shape[1]))
+    for kind, inputs in (("of an episode", seen), ("drawn at random", random)):
+        exact = inputs.astype(np.float32).astype(np.float64)  # what a network is given
+        found, who = np.array([network(each) for each in exact]), f"The network, for an observation {kind},"
+        _require_equal(who, "action", found, trained.act(exact), tolerance)
 
 
 def _number(values: Any) -> Numbers:
@@ -537,42 +549,13 @@ def _number(values: Any) -> Numbers:
     return found[0] if len(set(found)) == 1 else found
 
 
-def _check_network(network: OnnxNetwork, trained: _Trained, seen: Floats, tolerance: float) -> None:
-    """Check that a network acts like the model, in the inputs of episodes and in random ones."""
-    rng = np.random.default_rng(0)
-    random = rng.normal(seen.mean(axis=0), 3.0 * seen.std(axis=0) + 0.1, (DRAWN, seen.shape[1]))
-    for kind, inputs in (("of an episode", seen), ("drawn at random", random)):
-        inputs = inputs.astype(np.float32).astype(np.float64)  # what a network is given
-        found = np.array([network(each) for each in inputs])
-        _check_equal(f"The network, for an observation {kind}", "action", found, trained.act(inputs), tolerance)
-
-
-def _check_declaration(
-    served: URLabEnv, robot: URLabArticulation, policy: Policy, moments: Sequence[_Moment], tolerance: float
-) -> None:
-    """Check that a declaration gives the task's observations and set-points."""
-    if policy.spec.observation:
-        require(aio_of(served.client), policy, robot.prefix)
-    mapping = PolicyMapping(policy.spec, robot, policy.source)
-    if policy.spec.observation:
-        found = [
-            mapping.observe(each.state, each.goal, mapping.clipped(each.last_action), each.time, each.goal)
-            for each in moments
-        ]
-        observed = [each.observed for each in moments]
-        _check_equal("The declaration", "observation", np.array(found), np.array(observed), tolerance)
-    actions = np.array([each.last_action for each in moments])
-    expected = served.mapping.set_points(actions)[robot.prefix][:, mapping.ctrl]
-    _check_equal("The declaration", "set-points", mapping.targets(mapping.clipped(actions)), expected, tolerance)
-
-
-def _check_equal(giver: str, what: str, found: Floats, expected: Floats, tolerance: float) -> None:
+def _require_equal(who: str, what: str, found: Floats, expected: Floats, tolerance: float) -> None:
     if found.shape != expected.shape:
-        raise PolicyExportError(f"{giver} gives {what} of {found.shape[1]} numbers, not {expected.shape[1]}.")
-    error = np.abs(found - expected) / (1.0 + np.abs(expected))
-    row, column = np.unravel_index(np.argmax(np.where(np.isnan(error), np.inf, error)), error.shape)
-    if not error[row, column] <= tolerance:
+        raise PolicyExportError(f"{who} gives {what} of {found.shape[1]} numbers, not {expected.shape[1]}.")
+    error = np.nan_to_num(np.abs(found - expected) / (1.0 + np.abs(expected)), nan=np.inf)
+    row, column = np.unravel_index(np.argmax(error), error.shape)
+    if error[row, column] > tolerance:
         raise PolicyExportError(
-            f"{giver} gives {found[row, column]:.6g} as number {column} of the {what}, not "
-            f"{expected[row, column]:.6g}: the largest difference of {len(found)}, beyond the tolerance of {tolerance:g}."
+            f"{who} gives {found[row, column]:.6g} as number {column} of the {what}, not {expected[row, column]:.6g}: "
+            f"the largest difference of {len(found)}, beyond the tolerance of {tolerance:g}."
         )

@@ -326,10 +326,11 @@ class PolicyMapping:
             case SensorTerm():
                 sensor = self._element("sensor", term.sensor, robot.sensors, f"{where}.sensor")
                 return sensor.dim, lambda moment: moment.state.sensors[sensor.name]
-            case FieldTerm():
-                return _field(robot, term.field)
-            case GoalTerm():
-                return len(self.default_goal), self._goal_term(robot, term, where)
+            case FieldTerm() | GoalTerm():
+                goal = isinstance(term, GoalTerm)
+                return (
+                    (len(self.default_goal), self._goal_term(robot, term, where)) if goal else _field(robot, term.field)
+                )
             case PhaseClock():
                 rate = 2 * math.pi * term.hz
                 return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
