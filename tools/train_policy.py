@@ -279,6 +279,13 @@ def train(arena: Arena, network: LegNetwork, options: Options) -> tuple[Floats, 
     return centre, curve
 
 
+def to_onnx(weights: list[Floats]) -> bytes:
+    """Return an ONNX file of a network with one hidden layer of tanh."""
+    first, first_bias, second, second_bias = weights
+    layers: list[Layer] = [("Gemm", [first, first_bias], {}), ("Tanh", [], {}), ("Gemm", [second, second_bias], {})]
+    return onnx_network(layers, len(first))
+
+
 class Options(argparse.Namespace):
     """What the command line says."""
 
@@ -332,9 +339,7 @@ def main(argv: list[str] | None = None) -> int:
         "evaluation": {**baselines, "trained": trained},
     }
     path = options.output / DECLARATION.with_suffix(".onnx").name
-    first, first_bias, second, second_bias = network.unrolled(parameters)
-    layers: list[Layer] = [("Gemm", [first, first_bias], {}), ("Tanh", [], {}), ("Gemm", [second, second_bias], {})]
-    path.write_bytes(onnx_network(layers, len(first)))
+    path.write_bytes(to_onnx(network.unrolled(parameters)))
     path.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     print(f"{path}: {path.stat().st_size} bytes")
     return 0
