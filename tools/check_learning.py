@@ -1,6 +1,6 @@
 """Drives the environments with the learning libraries that users bring: Stable-Baselines3, RLlib, LeRobot and others.
 
-    pip install stable-baselines3 'ray[rllib]' mujoco-warp mujoco-mjx 'minari[create,hdf5]'
+    pip install stable-baselines3 rsl-rl-lib onnx onnxruntime 'ray[rllib]' mujoco-warp mujoco-mjx 'minari[create,hdf5]'
     python tools/check_learning.py            # or the names of some checks
     python tools/check_learning.py lerobot envhub --lerobot-python ENVIRONMENT/bin/python
 
@@ -11,6 +11,8 @@ It prints a line for each check and exits with 1 when one failed.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import re
@@ -95,6 +97,81 @@ def sb3_pictures() -> str:
     if after > before / 2:
         raise AssertionError(done.stdout)
     return done.stdout.strip()
+
+
+def export() -> str:
+    """Models of Stable-Baselines3 become files that act like them: the export itself compares them in episodes."""
+    sb3: Any = import_module("urlab_client.integrations.gym.sb3")
+    library, wrappers = import_module("stable_baselines3"), import_module("stable_baselines3.common.vec_env")
+    policy: Any = import_module("urlab_client.integrations.policy")
+    made: list[str] = []
+
+    def train(name: str, wrap: Callable[[Any], Any], task: str, steps: int, **options: Any) -> None:
+        modes: Any = import_module("gymnasium.vector").AutoresetMode
+        batch = gymnasium.make_vec(task, num_envs=4, backend="batch", autoreset_mode=modes.SAME_STEP)
+        envs = wrap(batch)
+        model = getattr(library, name)("MlpPolicy", envs, seed=1, device="cpu", **options)
+        model.learn(steps)
+        with tempfile.TemporaryDirectory() as folder:
+            spec = policy.export_policy(model, task, Path(folder) / "policy.onnx")
+        made.append(f"{name} {task} (history {spec.history})" if spec.history > 1 else f"{name} {task}")
+        envs.close()
+
+    def stacked(batch: Any) -> Any:
+        return wrappers.VecFrameStack(wrappers.VecNormalize(sb3.Sb3VecEnv(batch)), 3)
+
+    def rescaled(batch: Any) -> Any:
+        return import_module("gymnasium.wrappers.vector").RescaleAction(batch, np.float32(-1.0), np.float32(1.0))
+
+    small: dict[str, Any] = {"learning_starts": 10, "policy_kwargs": {"net_arch": [32, 32]}}
+    train("PPO", stacked, "urlab/Walk-v0", 256, n_steps=32)
+    train("PPO", lambda batch: sb3.Sb3VecEnv(rescaled(batch)), "urlab/Reach-v0", 256, n_steps=32)
+    train("A2C", sb3.Sb3VecEnv, "urlab/Quadruped-v0", 60, use_sde=True, policy_kwargs={"squash_output": True})
+    train("SAC", lambda batch: wrappers.VecNormalize(sb3.Sb3VecEnv(batch)), "urlab/Push-v0", 60, **small)
+    train("TD3", sb3.Sb3VecEnv, "urlab/Arm-v0", 60, **small)
+    return ", ".join(made)
+
+
+def rsl_rl() -> str:
+    """RSL-RL's runner trains on a batch of 64, with staggered ends, and its actor becomes a file that acts like it."""
+    adapter: Any = import_module("urlab_client.integrations.gym.rsl_rl")
+    policy: Any = import_module("urlab_client.integrations.policy")
+    modes: Any = import_module("gymnasium.vector").AutoresetMode
+    envs = adapter.RslRlVecEnv(
+        gymnasium.make_vec("urlab/Reach-v0", num_envs=64, backend="batch", autoreset_mode=modes.SAME_STEP)
+    )
+    layers: dict[str, Any] = {"class_name": "MLPModel", "hidden_dims": [64, 64], "obs_normalization": True}
+    gaussian = {"class_name": "HeteroscedasticGaussianDistribution", "init_std": 0.3}
+    settings: dict[str, Any] = {
+        "num_steps_per_env": 50,
+        "save_interval": 100,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "algorithm": {"class_name": "PPO", "gamma": 0.97},
+        "actor": {**layers, "distribution_cfg": gaussian},
+        "critic": {**layers},
+    }
+    with contextlib.redirect_stdout(io.StringIO()):
+        runner = import_module("rsl_rl.runners").OnPolicyRunner(envs, settings, device="cpu")
+        runner.learn(4, init_at_random_ep_len=True)
+    lengths = envs.episode_length_buf.tolist()
+    if len(set(lengths)) == 1 or not max(lengths) < envs.max_episode_length:
+        raise AssertionError(f"the episodes' ends are not staggered: {lengths}")
+    with tempfile.TemporaryDirectory() as folder:
+        policy.export_policy(runner, "urlab/Reach-v0", Path(folder) / "reach.onnx")
+    envs.close()
+    return f"{runner.current_learning_iteration + 1} iterations of {64 * 50} steps, exported"
+
+
+def single_file() -> str:
+    """The PPO of the examples, which needs PyTorch alone, runs for a moment and writes a file that can be evaluated."""
+    example = Path(__file__).parents[1] / "examples/ppo.py"
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(  # noqa: S603 - ours
+            [sys.executable, example, "--steps=9600"], cwd=folder, capture_output=True, text=True, check=True
+        )
+        command = [sys.executable, "-m", "urlab_client", "evaluate", "reach.toml", "--episodes=10", "--json"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - ours
+    return f"exported; mean return of 10 episodes {json.loads(done.stdout)['mean_return']['value']:.1f}"
 
 
 def warp() -> str:
@@ -351,6 +428,9 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "sb3-ppo": ("stable-baselines3", sb3_ppo),
     "sb3-batch": ("stable-baselines3", sb3_batch),
     "sb3-pictures": ("stable-baselines3", sb3_pictures),
+    "export": ("stable-baselines3", export),
+    "rsl-rl": ("rsl-rl-lib", rsl_rl),
+    "single-file": ("torch", single_file),
     "gym-async": ("gymnasium", gym_async),
     "warp": ("mujoco-warp", warp),
     "mjx": ("mujoco-mjx", mjx),

@@ -54,6 +54,7 @@ SMOKE = {
     "prometheus": "tests/integrations/test_telemetry.py",
     "ray": "tests/integrations/test_cluster.py",
     "rerun": "tests/integrations/test_view.py",
+    "rsl-rl": "tests/integrations/test_rsl_rl.py",
     "sb3": "tests/integrations/test_sb3.py",
     "teleop": "tests/integrations/test_teleop.py",
     "train": "tests/integrations/test_policy_trained.py",
@@ -66,7 +67,7 @@ SMOKE = {
 LOWEST = re.compile(r">=([\d.]+)[^;]*")
 """What a requirement says of versions; the lowest is in the group."""
 
-GIGABYTES = {"ray", "sb3", "warp"}
+GIGABYTES = {"ray", "rsl-rl", "sb3", "warp"}
 LIGHT = SMOKE.keys() - GIGABYTES
 QUICK = {
     "lowest": CORE,

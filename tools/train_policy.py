@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 
 from urlab_client import URLabClient
 from urlab_client.integrations.gym import URLabBatchEnv
 from urlab_client.integrations.policy import Policy, PolicyMapping, PolicySpec, RobotState, read_spec
+from urlab_client.integrations.policy.export import Layer, onnx_network
 
 Floats = NDArray[np.float64]
 Act = Callable[[Floats], Floats]
@@ -279,27 +279,11 @@ def train(arena: Arena, network: LegNetwork, options: Options) -> tuple[Floats, 
     return centre, curve
 
 
-def to_onnx(layers: list[Floats]) -> bytes:
+def to_onnx(weights: list[Floats]) -> bytes:
     """Return an ONNX file of a network with one hidden layer of tanh."""
-    names = ["w1", "b1", "w2", "b2"]
-    arrays = [array.astype(np.float32) for array in layers]
-    helper, number = onnx.helper, onnx.TensorProto.FLOAT
-    graph = helper.make_graph(
-        [
-            helper.make_node("Gemm", ["observation", "w1", "b1"], ["sum"]),
-            helper.make_node("Tanh", ["sum"], ["hidden"]),
-            helper.make_node("Gemm", ["hidden", "w2", "b2"], ["action"]),
-        ],
-        "policy",
-        [helper.make_tensor_value_info("observation", number, ["batch", len(layers[0])])],
-        [helper.make_tensor_value_info("action", number, ["batch", len(layers[3])])],
-        [onnx.numpy_helper.from_array(array, name) for array, name in zip(arrays, names, strict=True)],
-    )
-    model = helper.make_model(
-        graph, producer_name="urlab_client", opset_imports=[helper.make_opsetid("", 17)], ir_version=8
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString()
+    first, first_bias, second, second_bias = weights
+    layers: list[Layer] = [("Gemm", [first, first_bias], {}), ("Tanh", [], {}), ("Gemm", [second, second_bias], {})]
+    return onnx_network(layers, len(first))
 
 
 class Options(argparse.Namespace):

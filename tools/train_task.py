@@ -1,11 +1,12 @@
 """Trains PPO on a shipped task on a batch, and says how often what it learned succeeds.
 
-    pip install -e '.[sb3]'
+    pip install -e '.[sb3,onnx,train]'
     python tools/train_task.py urlab/Reach-v0              # a million steps, some minutes
     python tools/train_task.py urlab/Push-v0 --steps 3000000
 
 Success is counted at the end of episodes with seeds that training did not see, without exploration, with a 95 %
-interval. The same episodes with a fresh network, and with set-points of 0, say what no training is worth.
+interval. The same episodes with a fresh network, and with set-points of 0, say what no training is worth. With
+`-o reach.onnx`, the network is exported, and `urlab evaluate reach.toml` runs it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from gymnasium.vector import AutoresetMode
 
 import urlab_client.integrations.gym  # registers the tasks  # noqa: F401
 from urlab_client.integrations.gym.sb3 import Sb3VecEnv
-from urlab_client.integrations.policy.evaluation import wilson
+from urlab_client.integrations.policy import export_policy, wilson
 
 __all__ = ["main"]
 
@@ -59,6 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("task", help="id, such as urlab/Reach-v0; one whose task says what success is")
     parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps")
     parser.add_argument("--seed", type=int, default=0, help="of the training")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", help="a .onnx file for the network, with a .toml file beside it"
+    )
     arguments = parser.parse_args(argv)
     import_module("torch").set_num_threads(1)
     sb3: Any = import_module("stable_baselines3")
@@ -87,6 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     started = time.perf_counter()
     model.learn(arguments.steps)
     say(f"{arguments.steps} steps, {time.perf_counter() - started:.0f} s", learned)
+    if arguments.output is not None:
+        export_policy(model, arguments.task, arguments.output)
     envs.close()
     return 0
 

@@ -27,7 +27,7 @@ from typing import IO, Final
 
 import msgspec
 
-from urlab_client._platform.children import APART
+from urlab_client._platform.signals import APART
 from urlab_client._platform.threads import daemon
 from urlab_client._sandbox.confinement import confine_files, limit_process
 

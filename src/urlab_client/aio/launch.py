@@ -27,7 +27,7 @@ from weakref import WeakMethod
 import msgspec
 from msgspec import Struct
 
-from urlab_client._platform.children import APART
+from urlab_client._platform.signals import APART
 from urlab_client.aio.background import Tell, background_thread
 from urlab_client.aio.transport.base import LateReply
 from urlab_client.aio.transport.connection import ClientKeys

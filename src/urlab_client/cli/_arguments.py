@@ -233,10 +233,12 @@ DIALECT = "--dialect alpha|beta=alpha  plugin generation to simulate: alpha (Jun
 STEP_MODE = "--step-mode live|direct=live  whether physics runs by itself, or this command steps it"
 RECORDING = "RECORDING  a .mcap file, or a server's .json recording"
 POLICY = """
-POLICY  the network, a .onnx file
+POLICY  the network, a .onnx file, or the .toml file beside it
 --declaration FILE  the .toml file (default: the one beside POLICY with the same name)
 """
-TASK = "--task TASK  a task, such as urlab/Reach-v0, or module:Class of your own, found from the current folder"
+TASK = """
+--task TASK  a task, such as urlab/Reach-v0, or module:Class of your own, found from the current folder{}
+"""
 
 
 def handshake(arguments: Namespace) -> bytes | None:
@@ -258,6 +260,22 @@ def task_named(name: str) -> type[Task]:
         sys.path.insert(0, here)  # an installed command does not look there
     with refusing(ValueError, option="--task"):
         return found(name)
+
+
+def policy_task(arguments: Namespace, *about_robots: str) -> tuple[Path, type[Task] | None, int]:
+    """Return the network of `POLICY`, the task that it runs in, and the number of observations in its input.
+
+    The task is that of `--task`, or else the one that the declaration names, unless an option about robots is given.
+    """
+    from urlab_client.integrations.policy import policy_files, read_spec
+
+    network, declaration = policy_files(arguments.policy, arguments.declaration)
+    spec = read_spec(declaration) if arguments.task is None or declaration.is_file() else None
+    given = [name for name in about_robots if getattr(arguments, name)]
+    if arguments.task is not None and given:
+        raise CommandError(f"--{given[0].replace('_', '-')} cannot be combined with --task, which determines it")
+    name = arguments.task or (spec.task if spec is not None and not given else "")
+    return network, task_named(name) if name else None, 1 if spec is None else spec.history
 
 
 def _public_url(text: str) -> str:

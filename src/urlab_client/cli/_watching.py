@@ -12,7 +12,7 @@ from collections.abc import AsyncGenerator, Callable, Generator
 from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import cameras, make_client, task_named
+from urlab_client.cli._arguments import cameras, make_client
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
@@ -21,7 +21,7 @@ from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
-    from urlab_client.integrations.gym import URLabEnv
+    from urlab_client.integrations.gym import Task, URLabEnv
     from urlab_client.integrations.record import AsyncRecorder
 
 _LOOK_S = 0.05
@@ -120,9 +120,8 @@ async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[
 
 
 @contextlib.contextmanager
-def task_environment(arguments: Namespace, **options: Any) -> Generator[URLabEnv]:
-    """Yield an environment of `--task`, over the server that the arguments name or else a simulated one."""
-    kind = task_named(arguments.task)
+def task_environment(arguments: Namespace, kind: type[Task], **options: Any) -> Generator[URLabEnv]:
+    """Yield an environment of a task, over the server that the arguments name or else a simulated one."""
     from urlab_client.integrations.gym import URLabEnv
 
     address = arguments.address or with_model_options(kind.scene_address)

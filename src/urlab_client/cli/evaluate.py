@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options, with_option
-from urlab_client.cli._arguments import POLICY, TASK, task_named
+from urlab_client.cli._arguments import POLICY, TASK, policy_task
 from urlab_client.cli._common import CommandError, aligned, import_mujoco, json_line, progress_bar, refusing
 
 if TYPE_CHECKING:
+    from urlab_client.integrations.gym import Task
     from urlab_client.integrations.policy import Evaluation, Outcome
     from urlab_client.randomise import Randomisation
 
@@ -35,7 +36,7 @@ _MOST_COPIES = 64
 USAGE = f"""
 {POLICY}
 --robot ROBOT  an MJCF file or the name of a bundled robot (default: as declared)
-{TASK}
+{TASK.format(" (default: as declared)")}
 --episodes N=100  number of episodes
 --seconds S  simulated seconds per episode, without --task (default: 10)
 --seed SEED=0  seed of the evaluation
@@ -57,6 +58,7 @@ def run(arguments: Namespace) -> int:
     if not 0 < arguments.confidence < 1:
         raise CommandError(f"--confidence must be between 0 and 1, not {arguments.confidence:g}")
     declared = _declared(arguments.randomise)
+    network, kind, history = policy_task(arguments, "robot", "seconds")
     with progress_bar(arguments.policy.name, arguments.episodes) as progress:
         number = itertools.count(1)
 
@@ -69,10 +71,12 @@ def run(arguments: Namespace) -> int:
             "confidence": arguments.confidence,
             "on_episode": show,
         }
-        if arguments.task is None:
+        if kind is None:
             found = asyncio.run(_on_robot(arguments, declared, options))
         else:
-            found = _in_task(arguments, arguments.task, declared, options)
+            found = _in_task(
+                min(arguments.episodes, _MOST_COPIES), network, kind, declared, {**options, "history": history}
+            )
     if arguments.json:
         print(json_line(found))
     else:
@@ -89,25 +93,20 @@ def _declared(given: str | None) -> Randomisation | None:
         return Randomisation.of(given)
 
 
-def _in_task(arguments: Namespace, task: str, declared: Randomisation | None, options: dict[str, Any]) -> Evaluation:
-    for name in ("robot", "declaration", "seconds"):
-        if getattr(arguments, name) is not None:
-            raise CommandError(f"--{name} cannot be combined with --task, which determines it")
+def _in_task(
+    num_envs: int, path: Path, kind: type[Task], declared: Randomisation | None, options: dict[str, Any]
+) -> Evaluation:
     from gymnasium.vector import AutoresetMode
 
-    kind = task_named(task)
     from urlab_client.integrations.gym import URLabBatchEnv
     from urlab_client.integrations.policy import evaluate_in, task_network
 
-    env = URLabBatchEnv(
-        kind.scene_address,
-        min(arguments.episodes, _MOST_COPIES),
-        task=kind(),
-        randomise=declared,
-        autoreset_mode=AutoresetMode.DISABLED,
-    )
-    with closing(env):
-        network: Any = task_network(arguments.policy, env.single_observation_space, env.single_action_space)
+    mode = AutoresetMode.DISABLED
+    with closing(
+        URLabBatchEnv(kind.scene_address, num_envs, task=kind(), randomise=declared, autoreset_mode=mode)
+    ) as env:
+        spaces = env.single_observation_space, env.single_action_space
+        network: Any = task_network(path, *spaces, options["history"])
         return evaluate_in(env, network, **options)
 
 

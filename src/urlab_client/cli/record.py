@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from urlab_client.aio import URLabClient
-from urlab_client.cli._arguments import CAMERA, CAMERA_HZ, CLIENT, STEP_MODE, TASK, address_usage, make_client
+from urlab_client.cli._arguments import (
+    CAMERA,
+    CAMERA_HZ,
+    CLIENT,
+    STEP_MODE,
+    TASK,
+    address_usage,
+    make_client,
+    task_named,
+)
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, recording_options, run_session, task_environment
 from urlab_client.enums import StepMode
@@ -81,7 +90,7 @@ def _record_task(arguments: Namespace) -> Recorder:
 
     from urlab_client.integrations.record import record
 
-    with task_environment(arguments) as env:
+    with task_environment(arguments, task_named(arguments.task)) as env:
         recorder = record(env.client, arguments.output, **recording_options(arguments))
         spaces: Any = gymnasium.spaces
         space = spaces.flatten_space(env.action_space)

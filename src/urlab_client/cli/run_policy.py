@@ -3,9 +3,10 @@
 Run a policy: a network in an ONNX file, and a TOML file beside it that declares what the network observes and what its
 outputs mean. Refuses to start if the robot, step mode, timestep or controller is not the one that the policy requires.
 Without an address it starts a simulated server; with one it opens a session, which takes the server over from the
-client that drives it. With --task, the network maps observations of a task to actions, as for evaluate, and one episode
-runs. Exit code 1 if the robot fell, or the episode of the task was terminated without success. Needs the extra
-'urlab-client[onnx]', and with --task also 'urlab-client[gym]'.
+client that drives it. With --task, or if the declaration names a task, the network maps observations of the task
+to actions, as for evaluate, and one episode runs. With --robot, --command, --goal, --step-mode or --compare, the
+declaration's terms drive the robot instead. Exit code 1 if the robot fell, or the episode of the task was terminated
+without success. Needs the extra 'urlab-client[onnx]', and for tasks also 'urlab-client[gym]'.
 """
 
 from __future__ import annotations
@@ -22,9 +23,8 @@ import numpy as np
 
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import with_model_options
-from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, make_client
+from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, make_client, policy_task
 from urlab_client.cli._common import (
-    CommandError,
     aligned,
     check_recording,
     import_mujoco,
@@ -36,6 +36,7 @@ from urlab_client.cli._watching import recorded, recording_options, task_environ
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
+    from urlab_client.integrations.gym import Task
     from urlab_client.integrations.policy import Policy, PolicyRun
     from urlab_client.protocol.base import Floats
 
@@ -48,7 +49,7 @@ USAGE = f"""
 {address_usage("ADDRESS?", "a simulated server for --robot or --task")}
 --robot ROBOT  an MJCF file or the name of a bundled robot to simulate; with an address, the articulation to drive
     (default: as declared)
-{TASK}
+{TASK.format(" (default: as declared)")}
 --seconds S=10  simulated seconds
 --command VX VY WZ  velocity to follow: m/s forward, m/s to the left, rad/s to the left (default: as declared)
 --goal NUMBER+  goal to reach, with as many numbers as the declaration's table [goal] has (default: as declared)
@@ -70,8 +71,9 @@ def run(arguments: Namespace) -> int:
     """Run the policy; return 1 if the robot fell, else 0."""
     import_mujoco()
     check_recording(arguments.record, arguments)
-    if arguments.task is not None:
-        return _in_task(arguments)
+    network, kind, history = policy_task(arguments, "robot", "command", "goal", "step_mode", "compare")
+    if kind is not None:
+        return _in_task(arguments, network, kind, history)
     from urlab_client.integrations.policy import load
 
     policy = load(arguments.policy, arguments.declaration)
@@ -87,28 +89,26 @@ def run(arguments: Namespace) -> int:
     return _FELL if runs["policy"].falls else 0
 
 
-def _in_task(arguments: Namespace) -> int:
+def _in_task(arguments: Namespace, path: Path, kind: type[Task], history: int) -> int:
     """Run one episode of a task; return 1 if it was terminated without success, else 0."""
-    for name in ("declaration", "robot", "command", "goal", "step_mode", "compare"):
-        if getattr(arguments, name):
-            raise CommandError(f"--{name.replace('_', '-')} cannot be combined with --task, which determines it")
-    from urlab_client.integrations.policy import task_network
+    from urlab_client.integrations.policy import joined, task_network
 
     with (
-        task_environment(arguments, max_episode_steps=sys.maxsize) as env,
+        task_environment(arguments, kind, max_episode_steps=sys.maxsize) as env,
         contextlib.ExitStack() as stack,
-        progress_bar(arguments.task, arguments.seconds) as progress,
+        progress_bar(kind.__name__, arguments.seconds) as progress,
     ):
+        network: Any = task_network(path, env.observation_space, env.action_space, history)
         if arguments.record is not None:
             from urlab_client.integrations.record import record
 
             with refusing(KeyError, option="--camera"):
                 stack.enter_context(record(env.client, arguments.record, **recording_options(arguments)))
-        network: Any = task_network(arguments.policy, env.observation_space, env.action_space)
         observation, info = env.reset(seed=_SEED)
-        total, actions, terminated = 0.0, 0, False
+        seen, total, actions, terminated = [observation] * history, 0.0, 0, False
         while not terminated and info["sim_time"] < arguments.seconds - _ROUNDING_S:
-            observation, reward, terminated, _, info = env.step(network(observation))
+            seen = [*seen[1:], observation]
+            observation, reward, terminated, _, info = env.step(network(joined(seen)))
             total, actions = total + reward, actions + 1
             progress(info["sim_time"])
     success = info.get("success")
@@ -116,7 +116,7 @@ def _in_task(arguments: Namespace) -> int:
     if arguments.json:
         print(json_line({**found, "terminated": terminated}))
     else:
-        print(f"{arguments.policy.name} in {arguments.task}, {info['sim_time']:.1f} s of simulation")
+        print(f"{arguments.policy.name} in {kind.__name__}, {info['sim_time']:.1f} s of simulation")
         row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
         print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0

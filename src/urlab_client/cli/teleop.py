@@ -37,7 +37,7 @@ _MOST = 1024
 
 USAGE = f"""
 {address_usage("ADDRESS?", "a simulated server for --task, else tcp://localhost")}
-{TASK}
+{TASK.format("")}
 --robot KEY  the articulation (default: the only one)
 --site NAME  the hand, a site of the robot (default: the only one)
 --gripper NAME  actuator of the gripper (default: the one that does not move the hand)

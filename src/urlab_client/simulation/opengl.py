@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from urlab_client._platform.children import APART
+from urlab_client._platform.signals import APART
 from urlab_client.errors import URLabError
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")

@@ -158,6 +158,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         return self._alone.mapping
 
     @property
+    def n_substeps(self) -> int:
+        """Physics steps per action."""
+        return self._alone.n_substeps
+
+    @property
     def articulations(self) -> NameMap[URLabArticulation]:
         """The client's articulations by key."""
         return self.client.articulations

@@ -73,6 +73,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         termination_fn: The termination function. If None, episodes never terminate.
         autoreset_mode: When environments whose episode ended are reset.
         rngs: The generator of each environment's episodes.
+        elapsed: Actions of each episode so far, shape (num_envs,). May be written in place, to stagger truncations.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
@@ -120,7 +121,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self._observations_disturbed:
             self._sensed = create_empty_array(self.single_observation_space, num_envs)
         self._step_count = np.zeros(num_envs, dtype=np.int64)
-        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self.elapsed: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
         self._totals = np.zeros(num_envs)
         self._begun = np.zeros(num_envs, dtype=bool)
         self._ended = np.ones(num_envs, dtype=bool)
@@ -207,14 +208,14 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
             fresh, acting = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
         before = None if self.reward_fn is None else mapped(np.copy, self._observations)
-        self._elapsed += 1
+        self.elapsed += 1
         errors = self._move(fresh, self._keyframe, acting, flat)
         infos = self._infos(errors)
         rewards, terminated = self._judged(before, actions, errors, infos)
         if idle := [*fresh.tolist(), *errors]:
             rewards[idle], terminated[idle] = 0.0, False
         limit = self.max_episode_steps
-        truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self._elapsed >= limit
+        truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self.elapsed >= limit
         if errors:
             truncated[list(errors)] = True
         self._ended = terminated | truncated
@@ -245,12 +246,17 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             told["chosen"] = {key: values.tolist() for key, values in meant.items()}
         reward, terminated, truncated = (values[i].item() for values in judged)
         told |= {"reward": reward, "terminated": terminated, "truncated": truncated}
-        return Transition(actions=int(self._elapsed[i]), action=actions[i].tolist(), **told)
+        return Transition(actions=int(self.elapsed[i]), action=actions[i].tolist(), **told)
 
     @property
     def max_episode_steps(self) -> int | None:
         """Actions after which an episode is truncated, or None."""
         return self._settings.max_episode_steps
+
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps per action."""
+        return self._settings.n_substeps
 
     def episode_seeds(self) -> NDArray[np.int64]:
         """Return the seed of each environment's episode, from which all variation follows; -1 if nothing varies."""
@@ -286,7 +292,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             for i, disturbances in self._disturbed(moved):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
-            self._elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
+            self.elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
             self._note(fresh if not errors else np.setdiff1d(fresh, [*errors]), self._transition)
         if errors:
             self._ended[list(errors)] = True
@@ -343,7 +349,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
         for i in np.flatnonzero(self._ended).tolist():
             if i not in errors:
-                steps, total = int(self._elapsed[i]), float(self._totals[i])
+                steps, total = int(self.elapsed[i]), float(self._totals[i])
                 task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
 
     def _same_step_reset(self, errors: Mapping[int, Exception], infos: dict[str, Any]) -> dict[str, Any]:

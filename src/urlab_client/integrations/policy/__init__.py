@@ -10,8 +10,10 @@ from urlab_client.integrations.policy.evaluation import (
     bootstrap_mean,
     evaluate_in,
     evaluate_on,
+    joined,
     wilson,
 )
+from urlab_client.integrations.policy.export import PolicyExportError, export_policy
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.network import (
     Network,
@@ -21,7 +23,7 @@ from urlab_client.integrations.policy.network import (
     PicturesNetwork,
     task_network,
 )
-from urlab_client.integrations.policy.policy import Policy, load
+from urlab_client.integrations.policy.policy import Policy, load, policy_files
 from urlab_client.integrations.policy.runner import PolicyRun, require, run, run_blocking
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
 
@@ -35,6 +37,7 @@ __all__ = [
     "Outcome",
     "PicturesNetwork",
     "Policy",
+    "PolicyExportError",
     "PolicyFileError",
     "PolicyMapping",
     "PolicyMismatch",
@@ -44,8 +47,11 @@ __all__ = [
     "bootstrap_mean",
     "evaluate_in",
     "evaluate_on",
+    "export_policy",
+    "joined",
     "load",
     "parse_spec",
+    "policy_files",
     "read_spec",
     "require",
     "run",

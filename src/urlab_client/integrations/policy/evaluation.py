@@ -145,6 +145,7 @@ def evaluate_in(
     seed: int = 0,
     confidence: float = 0.95,
     on_episode: OnEpisode | None = None,
+    history: int = 1,
 ) -> Evaluation:
     """Evaluate a network that maps observations to actions, in a batch of environments or over servers.
 
@@ -158,6 +159,8 @@ def evaluate_in(
         seed: Seed of the evaluation.
         confidence: Coverage of the intervals, 0 to 1.
         on_episode: Callback invoked with the outcome after each episode.
+        history: Number of observations that the network maps at once, oldest first, if they are flat. In the beginning
+            the first one is repeated.
 
     Raises:
         ValueError: A number is out of range, the network does not fit the spaces, the environments lack
@@ -184,9 +187,12 @@ def evaluate_in(
         _raise_any(infos, mask)
         going, totals, lengths = mask.copy(), np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         actions = np.zeros((env.num_envs, *space.shape), dtype=space.dtype)
+        seen = [observations] * history
         while going.any():
+            seen = [*seen[1:], observations]
+            latest = joined(seen)
             for i in np.flatnonzero(going):
-                actions[i] = _fitting(network(_of(observations, int(i))), space)
+                actions[i] = _fitting(network(_of(latest, int(i))), space)
             given = actions if driven is None else {driven: actions}
             observations, rewards, terminated, truncated, infos = env.step(given)
             _raise_any(infos, going)
@@ -238,6 +244,11 @@ async def evaluate_on(
         if on_episode is not None:
             on_episode(outcomes[-1])
     return Evaluation.of(outcomes, confidence)
+
+
+def joined(observations: Sequence[Any]) -> Any:
+    """Return observations, oldest first, as the input of a network: one as it is, several concatenated."""
+    return observations[0] if len(observations) == 1 else np.concatenate(observations, axis=-1)
 
 
 def _of(observations: Any, index: int) -> Any:

@@ -21,6 +21,7 @@ from urlab_client.integrations.policy.spec import (
     AngularVelocity,
     BaseHeight,
     CommandTerm,
+    FieldTerm,
     GoalTerm,
     Gravity,
     JointPosition,
@@ -42,6 +43,8 @@ T = TypeVar("T")
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 
+_NONE: Final = np.zeros(0)
+
 PolicyRobot: TypeAlias = AsyncArticulation | URLabArticulation
 """An articulation of either flavour."""
 
@@ -57,16 +60,20 @@ class RobotState(NamedTuple):
         qpos: Joint positions in the order of `qpos_array`, shape (…, nq).
         qvel: Joint velocities in the order of `qvel_array`, shape (…, nv).
         sensors: Readings by sensor name, shape (…, dim).
+        ctrl: Set-points in force, shape (…, nu).
+        act: Activations, likewise.
     """
 
     qpos: Floats
     qvel: Floats
     sensors: Mapping[str, Floats] = {}
+    ctrl: Floats = _NONE
+    act: Floats = _NONE
 
     @classmethod
     def of(cls, robot: PolicyRobot) -> RobotState:
         """Return the current state of an articulation."""
-        return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
+        return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors(), robot.last_applied_ctrl, robot.act_array)
 
     @property
     def gravity(self) -> Floats:
@@ -319,8 +326,11 @@ class PolicyMapping:
             case SensorTerm():
                 sensor = self._element("sensor", term.sensor, robot.sensors, f"{where}.sensor")
                 return sensor.dim, lambda moment: moment.state.sensors[sensor.name]
-            case GoalTerm():
-                return len(self.default_goal), self._goal_term(robot, term, where)
+            case FieldTerm() | GoalTerm():
+                goal = isinstance(term, GoalTerm)
+                return (
+                    (len(self.default_goal), self._goal_term(robot, term, where)) if goal else _field(robot, term.field)
+                )
             case PhaseClock():
                 rate = 2 * math.pi * term.hz
                 return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
@@ -359,6 +369,17 @@ class PolicyMapping:
 
     def _misfit(self, where: str, problem: str) -> PolicyMismatch:
         return PolicyMismatch(f"{self._source}: {where}: {problem}.")
+
+
+def _field(robot: PolicyRobot, name: str) -> tuple[int, _Read]:
+    if name != "sensors":
+        return len(getattr(RobotState.of(robot), name)), lambda moment: getattr(moment.state, name)
+    dims = {sensor.name: sensor.dim for sensor in robot.sensors.values()}
+
+    def read(moment: _Moment) -> Floats:
+        return np.concatenate([moment.state.sensors[sensor] for sensor in dims], axis=-1)
+
+    return sum(dims.values()), read
 
 
 def _picture(term: PictureTerm) -> NDArray[Any]:

@@ -148,13 +148,14 @@ class OnnxDictNetwork(OnnxInputs):
         return super().__call__(_entries(observation))
 
 
-def task_network(path: Path, observation_space: Any, action_space: Any) -> Network | OnnxDictNetwork:
+def task_network(path: Path, observation_space: Any, action_space: Any, history: int = 1) -> Network | OnnxDictNetwork:
     """Return the network in an ONNX file that maps the observations of an environment to its actions.
 
     Args:
         path: The file.
         observation_space: `single_observation_space` of the environment, flat or a `Dict`.
         action_space: Its `single_action_space`.
+        history: Number of observations in one input, oldest first, if they are flat.
 
     Raises:
         PolicyFileError: The file is missing, is not an ONNX file, or does not fit the environment.
@@ -164,9 +165,9 @@ def task_network(path: Path, observation_space: Any, action_space: Any) -> Netwo
         ((_, box),) = action_space.items()
         return OnnxDictNetwork(path, observation_space, len(box.low))
     network = OnnxNetwork(path)
-    for name, space in (("inputs", observation_space), ("outputs", action_space)):
-        if getattr(network, name) not in (None, space.shape[0]):
-            raise PolicyFileError(f"{path} has {getattr(network, name)} {name}, but the task has {space.shape[0]}.")
+    for name, size in (("inputs", history * observation_space.shape[0]), ("outputs", action_space.shape[0])):
+        if getattr(network, name) not in (None, size):
+            raise PolicyFileError(f"{path} has {getattr(network, name)} {name}, but the task has {size}.")
     return network
 
 

@@ -186,18 +186,28 @@ def _within(what: str, known: Goal | None, values: Sequence[float] | Floats, sou
     return given
 
 
+def policy_files(path: str | PathLike[str], toml: str | PathLike[str] | None = None) -> tuple[Path, Path]:
+    """Return the files of a network and its declaration, given either; `toml` names a declaration elsewhere."""
+    given = Path(path)
+    return given.with_suffix(".onnx") if given.suffix == ".toml" else given, Path(toml or given.with_suffix(".toml"))
+
+
 def load(onnx: str | PathLike[str], toml: str | PathLike[str] | None = None) -> Policy:
     """Load a network and its declaration.
 
     Args:
-        onnx: The network.
+        onnx: The network, or the declaration beside it.
         toml: The declaration; by default, the file with the same name and the suffix `.toml`.
 
     Raises:
-        PolicyFileError: A file is missing or invalid.
+        PolicyFileError: A file is missing or invalid, or declares nothing but the task that the network runs in.
         ImportError: The extra `onnx` is not installed.
     """
-    path = Path(onnx)
-    declared = path.with_suffix(".toml") if toml is None else Path(toml)
+    path, declared = policy_files(onnx, toml)
     spec = read_spec(declared)
+    if not spec.observation:
+        raise PolicyFileError(
+            f"{declared}: it declares no observation, so the policy runs only in the task {spec.task!r}.",
+            hint="Run it with `urlab run-policy` or `urlab evaluate`, or in an environment with task_network().",
+        )
     return Policy(spec, OnnxInputs(path) if spec.named else OnnxNetwork(path), source=str(declared))

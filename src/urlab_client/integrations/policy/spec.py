@@ -6,8 +6,10 @@ key and the valid choices. Whether joints and sensors exist is checked against a
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, cast, get_args
 from urllib.parse import urlencode
@@ -31,7 +33,7 @@ Numbers = float | list[float]
 Positive = Annotated[float, Meta(gt=0)]
 
 
-class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, frozen=True, omit_defaults=True):
     """One part of an observation: `clip((value - offset) * scale)`.
 
     Attributes:
@@ -128,6 +130,16 @@ class PhaseClock(_Term, tag="clock", kw_only=True, frozen=True):
     hz: Positive
 
 
+class FieldTerm(_Term, tag="field", kw_only=True, frozen=True):
+    """A field of the robot as environments observe it: all of its numbers, in the order of its arrays.
+
+    Attributes:
+        field: `qpos`, `qvel`, `ctrl`, `act` or `sensors`.
+    """
+
+    field: Literal["qpos", "qvel", "ctrl", "act", "sensors"]
+
+
 class PictureTerm(Struct, tag_field="term", tag="picture", kw_only=True, forbid_unknown_fields=True, frozen=True):
     """The picture of a camera of the robot, in its own network input and in the format of environments.
 
@@ -155,6 +167,7 @@ NumberTerm = (
     | JointPosition
     | JointVelocity
     | SensorTerm
+    | FieldTerm
     | CommandTerm
     | GoalTerm
     | LastAction
@@ -163,7 +176,7 @@ NumberTerm = (
 Term = NumberTerm | PictureTerm
 
 
-class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
+class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True, omit_defaults=True):
     """Meaning of the network's outputs: `offset + scale * clip(output)`, one output per joint.
 
     Attributes:
@@ -297,7 +310,7 @@ class TrackingReward(Struct, kw_only=True, forbid_unknown_fields=True, frozen=Tr
     spread_joints: list[str] = []
 
 
-class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
+class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True, omit_defaults=True):
     """A policy's declaration.
 
     Attributes:
@@ -305,9 +318,10 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
         step_modes: Supported step modes.
         timestep: Physics timestep the policy was trained with, seconds.
         decimation: Physics steps per action.
+        task: The task that the network was trained for: its id, or `module:Class`. Empty for none.
         keyframe: Keyframe to start from, or None for the initial state.
         history: Number of observations in one network input, oldest first.
-        observation: Terms of one observation, in order.
+        observation: Terms of one observation, in order. Only a file that names a task may have none.
         action: Meaning of the outputs.
         gains: Gains of the PD law; required unless the action goes via `actuators`.
         command: Supported commands; required by the term `command`.
@@ -320,9 +334,10 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     step_modes: Annotated[list[StepMode], Meta(min_length=1)]
     timestep: Positive
     decimation: Annotated[int, Meta(ge=1)]
+    task: str = ""
     keyframe: str | None = None
     history: Annotated[int, Meta(ge=1)] = 1
-    observation: Annotated[list[Term], Meta(min_length=1)]
+    observation: list[Term] = []
     action: Action
     gains: Gains | None = None
     command: Command | None = None
@@ -331,6 +346,8 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     reward: TrackingReward | None = None
 
     def __post_init__(self) -> None:
+        if not self.observation and not self.task:
+            raise ValueError("a policy needs at least one [[observation]]")
         if bad := [str(mode) for mode in self.step_modes if mode not in (StepMode.DIRECT, StepMode.LIVE)]:
             raise ValueError(f"step_modes can contain 'direct' and 'live', not {bad[0]!r}")
         if self.action.via == "client" and StepMode.LIVE in self.step_modes:
@@ -386,6 +403,22 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def period(self) -> float:
         """Seconds between two actions."""
         return self.timestep * self.decimation
+
+    def to_toml(self) -> str:
+        """Return the declaration as the text of a TOML file, without what has its default value."""
+        entries: dict[str, Any] = msgspec.to_builtins(self)
+        tables = {f"[{name}]": entries.pop(name) for name in [*entries] if isinstance(entries[name], dict)}
+        terms = [("[[observation]]", term) for term in entries.pop("observation", [])]
+        parts = [("", entries), *terms, *tables.items()]
+        lines = ([head, *(f"{name} = {_toml(value)}" for name, value in part.items())] for head, part in parts)
+        return "\n\n".join("\n".join(filter(None, part)) for part in lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """Return a string, a number or a list as a TOML value."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_toml, cast('Sequence[Any]', value)))}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)
 
 
 def _listed(value: Numbers) -> list[float]:

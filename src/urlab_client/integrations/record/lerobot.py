@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._platform.children import APART
+from urlab_client._platform.signals import APART
 from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import GOAL, TASK, Column, Table, even, farthest, visible
 from urlab_client.integrations.record.index import Progress

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
@@ -23,7 +24,6 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.dialects import ALPHA, Dialect
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.physics.scheduling import (
     GIVE_WAY_S,
@@ -46,6 +46,8 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")
 
+Hook = Callable[[], None]
+
 SLICE_S: Final = 0.05
 """About how long a direct request integrates between two looks at the stop flag."""
 
@@ -54,6 +56,40 @@ MAX_SLICE: Final = 1000
 
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
+
+
+def call_hooks(hooks: list[Hook]) -> None:
+    """Call each hook; one that raises is logged and removed."""
+    for hook in tuple(hooks):
+        try:
+            hook()
+        except Exception:
+            logger.exception("%r failed and will not be called again", hook)
+            if hook in hooks:
+                hooks.remove(hook)
+
+
+@dataclass(eq=False)
+class Snapshots:
+    """Numbers the snapshots of the state.
+
+    Attributes:
+        number: Number of the newest snapshot.
+        episode: Number of resets so far.
+        hooks: Called for each snapshot and at each reset. One that raises is logged and removed.
+    """
+
+    number: int = 0
+    episode: int = 0
+    hooks: list[Hook] = field(default_factory=list[Hook])
+
+    def take(self) -> None:
+        self.number += 1
+        call_hooks(self.hooks)
+
+    def restart(self) -> None:
+        self.episode += 1
+        call_hooks(self.hooks)
 
 
 class Engine(PhysicsThread):
