@@ -188,8 +188,8 @@ def address_usage(value: str = "ADDRESS=tcp://localhost", otherwise: str = "", o
     """
     default = f"(default: {otherwise})" if otherwise else ""
     return f"""
-{value}  HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command{or_else}
-    {default}
+{value}  HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this
+    command{or_else} {default}
 {MJCF_OPTIONS.format("with sim://MODEL")}
 """
 

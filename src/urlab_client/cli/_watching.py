@@ -15,10 +15,10 @@ from urlab_client.cli._arguments import cameras
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
-from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
+    from urlab_client.events import ClientEvent
     from urlab_client.integrations.record import AsyncRecorder
 
 _LOOK_S = 0.05
@@ -126,6 +126,8 @@ def _lost_at(events: Stream[ClientEvent], lost_at: float | None) -> float | None
     Raises:
         CommandError: No further state will arrive: a client that only watches would wait forever.
     """
+    from urlab_client.events import PlayEnded, ServerLost, ServerReconnected, SessionLost
+
     now = asyncio.get_running_loop().time()
     while (event := events.receive_nowait()) is not None:
         match event:

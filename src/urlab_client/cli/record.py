@@ -13,7 +13,7 @@ import asyncio
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.cli._arguments import CAMERA, CAMERA_HZ, CLIENT, STEP_MODE, address_usage, cameras, make_client
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, run_session
@@ -66,7 +66,7 @@ def run(arguments: Namespace) -> int:
 async def _record(arguments: Namespace) -> AsyncRecorder:
     from urlab_client.integrations.record import record
 
-    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
         with announced_wait(client):
             await client.discover()

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, cameras, make_client, task_named
 from urlab_client.cli._common import (
@@ -34,7 +34,6 @@ from urlab_client.cli._common import (
 )
 from urlab_client.cli._watching import recorded
 from urlab_client.enums import StepMode
-from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.integrations.policy import Policy, PolicyRun
@@ -97,6 +96,7 @@ def _in_task(arguments: Namespace) -> int:
     from urlab_client.integrations.gym import URLabEnv
     from urlab_client.integrations.policy import task_network
     from urlab_client.integrations.record import record
+    from urlab_client.sync.client import URLabClient as BlockingClient
 
     address = arguments.address or with_model_options(kind.scene_address)
     client = make_client(BlockingClient, address, arguments, step_mode="direct")
@@ -133,7 +133,7 @@ async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
 
     address, articulation = _where(arguments, policy)
     step_mode = arguments.step_mode or policy.spec.step_modes[0]
-    client = make_client(URLabClient, address, arguments, step_mode=step_mode)
+    client = make_client(aio.URLabClient, address, arguments, step_mode=step_mode)
     actors = {**(_baselines(policy) if arguments.compare else {}), "policy": policy}
     runs: dict[str, PolicyRun] = {}
     async with client:

@@ -15,7 +15,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.cli import console
 from urlab_client.cli._arguments import (
     CAMERA,
@@ -116,7 +116,7 @@ def _show_console(arguments: Namespace) -> int:
 async def _view(arguments: Namespace) -> ViewStats:
     from urlab_client.integrations.view import AsyncView
 
-    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
         with announced_wait(client):
             await client.discover()
