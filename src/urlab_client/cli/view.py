@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from urlab_client.integrations.view import ViewStats
     from urlab_client.integrations.view.view import ViewBackend
 
-_FOXGLOVE_PORT = 8765
-_RERUN_PORT = 9090
+_PORTS = {"foxglove": 8765, "rerun": 9090}
 
 USAGE = f"""
 {address_usage(or_else="; or FILE.mcap, a recording")}
@@ -158,14 +157,13 @@ def _backend(arguments: Namespace) -> ViewBackend:
         from urlab_client.integrations.view.view import WindowBackend
 
         return WindowBackend()
+    port = _PORTS[arguments.where] if arguments.port is None else arguments.port
     if arguments.where == "foxglove":
         from urlab_client.integrations.view.foxglove_view import FoxgloveBackend
 
-        port = _FOXGLOVE_PORT if arguments.port is None else arguments.port
         return FoxgloveBackend(host="127.0.0.1", port=port, sensors=arguments.sensors)
     from urlab_client.integrations.view.rerun_view import RerunBackend
 
-    port = _RERUN_PORT if arguments.port is None else arguments.port
     target: dict[str, Any] = {"save": arguments.save, "connect": arguments.connect, "web": arguments.page}
     return RerunBackend(**target, web_port=port, sensors=arguments.sensors)
 

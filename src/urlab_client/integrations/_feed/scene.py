@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from urlab_client._mujoco import control_counts, model_names
 from urlab_client.aio.articulation import URLabArticulation
+from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.state.scene_objects import entities_of
@@ -58,17 +59,15 @@ class SceneLayout(Struct, kw_only=True):
     prefix: str = ""
 
 
-class Lens(Protocol):
-    """What is known of a camera: the meaning of its pixels, its size in pixels, and its field of view, degrees."""
+class RecordedCamera(NamedTuple):
+    """What a recording says of a camera, as `URLabCameraView` does of a client's."""
 
-    @property
-    def mode(self) -> str: ...
+    mode: str
+    resolution: tuple[int, int]
+    fovy: float
 
-    @property
-    def resolution(self) -> tuple[int, int]: ...
 
-    @property
-    def fovy(self) -> float: ...
+Lens = URLabCameraView | RecordedCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +109,11 @@ class FollowedScene:
 
     @classmethod
     def of(cls, client: URLabClient, cameras: Sequence[tuple[str, Lens]]) -> FollowedScene:
-        own = {
-            name: (entity.body_id, entity.qpos_offset, entity.qvel_offset)
-            for name, entity in client.entities.items()
-            if not isinstance(entity, URLabArticulation)
-        }
-        return cls._made(client.model, compiled_prefixes(client), own, cameras, client)
+        plain = {name: one for name, one in client.entities.items() if not isinstance(one, URLabArticulation)}
+        bodies = {name: (one.body_id, one.qpos_offset, one.qvel_offset) for name, one in plain.items()}
+        scene = cls._made(client.model, compiled_prefixes(client), bodies, cameras)
+        model = scene.model
+        return scene if model is None else replace(scene, variation=server_variation(client, model, scene.layouts))
 
     @classmethod
     def recorded(
@@ -123,34 +121,30 @@ class FollowedScene:
     ) -> FollowedScene:
         """Return the scene of a recording from its model and what its articulations' names begin with there."""
         infos = entities_of(model, frozenset(prefixes.values()))
-        own = {name: (info.id, info.qpos_offset, info.qvel_offset) for name, info in infos.items()}
-        return cls._made(model, prefixes, own, cameras, None)
+        bodies = {name: (info.id, info.qpos_offset, info.qvel_offset) for name, info in infos.items()}
+        return cls._made(model, prefixes, bodies, cameras)
 
     @classmethod
     def _made(
         cls,
         model: mujoco.MjModel | None,
         prefixes: Mapping[str, str],
-        own: Mapping[str, tuple[int, int | None, int | None]],
+        bodies: Mapping[str, tuple[int, int | None, int | None]],
         cameras: Sequence[tuple[str, Lens]],
-        client: URLabClient | None,
     ) -> FollowedScene:
         layouts = {key: ArticulationLayout() for key in prefixes}
+        mocap: dict[str, int] = {}
         if model is not None:
             layouts = articulation_layouts(model, prefixes)
-        mocap = (
-            {}
-            if model is None
-            else {name: int(model.body_mocapid[body]) for name, (body, _, _) in own.items() if body >= 0}
-        )
+            mocap = {name: int(model.body_mocapid[body]) for name, (body, _, _) in bodies.items() if body >= 0}
         return cls(
             model=model,
             layouts=layouts,
             names={key: _layout(model, layout, prefixes[key]) for key, layout in layouts.items()},
-            entities={name: None if q is None or v is None else (q, v) for name, (_, q, v) in own.items()},
+            entities={name: None if q is None or v is None else (q, v) for name, (_, q, v) in bodies.items()},
             mocap={name: number for name, number in mocap.items() if number >= 0},
             cameras={id(view): CameraLayout(name, view, camera_id(model, prefixes, name)) for name, view in cameras},
-            variation=None if model is None or client is None else server_variation(client, model, layouts),
+            variation=None,
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -220,14 +220,6 @@ def foxglove_view(
     Entering the block raises `URLabError` if the port cannot be used, before `discover()` or without a local model,
     and `KeyError` for an unknown camera.
     """
-    return in_flavour(
-        client,
-        AsyncView,
-        View,
-        FoxgloveBackend(host=host, port=port, sensors=sensors),
-        "foxglove_view",
-        cameras=cameras,
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-    )
+    backend = FoxgloveBackend(host=host, port=port, sensors=sensors)
+    options: dict[str, Any] = {"cameras": cameras, "camera_hz": camera_hz, "max_hz": max_hz, "contacts": contacts}
+    return in_flavour(client, AsyncView, View, backend, "foxglove_view", **options)

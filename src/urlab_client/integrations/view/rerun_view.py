@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 import numpy as np
@@ -253,14 +253,5 @@ def rerun_view(
         raise ValueError("give one of save, connect and web")
     path = None if save is None else Path(save)
     backend = RerunBackend(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return in_flavour(
-        client,
-        AsyncView,
-        View,
-        backend,
-        "rerun_view",
-        cameras=cameras,
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-    )
+    options: dict[str, Any] = {"cameras": cameras, "camera_hz": camera_hz, "max_hz": max_hz, "contacts": contacts}
+    return in_flavour(client, AsyncView, View, backend, "rerun_view", **options)

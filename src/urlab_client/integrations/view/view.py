@@ -23,7 +23,7 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
-from urlab_client.integrations._feed.scene import FollowedScene, Lens, Simulation, camera_id
+from urlab_client.integrations._feed.scene import FollowedScene, Lens, RecordedCamera, Simulation, camera_id
 from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import EntityState, StepOk
@@ -300,15 +300,6 @@ class Viewing(Block):
         self._counts["states"] += 1
 
 
-@dataclass(frozen=True, slots=True)
-class _RecordedLens:
-    """A camera of a recording; see `Lens`."""
-
-    mode: str
-    resolution: tuple[int, int]
-    fovy: float
-
-
 def show_recording(
     run: Run,
     backend: ViewBackend,
@@ -321,24 +312,15 @@ def show_recording(
     opened: Callable[[], None] = lambda: None,
     over: Callable[[], bool] = lambda: False,
 ) -> ViewStats:
-    """Show the states and pictures of a recording, with the model that is in it, and close the display.
+    """Show a recording with the model that is in it, which MuJoCo does not check, and close the display.
 
-    Args:
-        run: The recording. MuJoCo does not check the model in it, so it must come from a source that you trust.
-        backend: The display, which is not open yet.
-        max_hz: Maximum number of states shown per second of the recording's clock.
-        contacts: Show contacts, computed from the states.
-        cameras: Cameras to show; None for all that have pictures.
-        seconds: Seconds of the recording's clock to show, from its start; None for all.
-        paced: Show it at the pace of its clock and again from its start, instead of once, and as fast as it goes.
-        opened: Called once the display is open.
-        over: Whether to end; called before each state.
+    It is shown at the pace of its clock and again from its start until `over()`, or else at once, and once. `max_hz`
+    and `seconds` are those of its clock; `opened` is called when the display is open.
 
     Raises:
         OSError: The file cannot be read, or the display not opened.
         KeyError: The file has no pictures of a camera.
-        RecordingError: It has no model, or cannot be read.
-        URLabError: The display cannot be opened.
+        URLabError: The recording has no model, or is damaged; or the display cannot be opened.
     """
     model, prefixes, (start, end) = run.model(), run.prefixes(), run.time_range()
     end = end if seconds is None else min(end, start + seconds)
@@ -348,7 +330,7 @@ def show_recording(
         height, width = first.pixels().shape[:2]
         number = camera_id(model, prefixes, name)
         fovy = float(model.cam_fovy[number]) if number >= 0 else _FOVY
-        lenses.append((name, _RecordedLens(first.mode, (width, height), fovy)))
+        lenses.append((name, RecordedCamera(first.mode, (width, height), fovy)))
     scene = FollowedScene.recorded(model, prefixes, lenses)
     simulation, clock, counts = Simulation(scene, model), SampleClock(), {"states": 0, "frames": 0}
     times: dict[str, float] = {}  # of what is shown
