@@ -18,7 +18,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -446,6 +446,7 @@ def source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+@cache
 def exports(module: str) -> dict[str, str]:
     """Return the names in a module's `__all__` and where each is defined; without importing, which takes extras."""
     names: list[str] = []
@@ -505,6 +506,7 @@ MANY = 12
 """Names of a module that fit on one page."""
 
 
+@cache
 def parts(module: str) -> dict[str, dict[str, str]]:
     """Return a module's names and where they are defined, by page: those of one with many, by the defining module."""
     names = {name: where for name, where in exports(module).items() if not name.startswith("pytest_")}  # hooks
@@ -518,6 +520,7 @@ def parts(module: str) -> dict[str, dict[str, str]]:
     return dict(sorted(found.items()))
 
 
+@cache
 def base_names(where: str) -> set[str]:
     """Return the names of a class's bases, as they are written; none for what is no class."""
     module, _, name = where.rpartition(".")
