@@ -18,7 +18,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -446,6 +446,7 @@ def source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+@cache
 def exports(module: str) -> dict[str, str]:
     """Return the names in a module's `__all__` and where each is defined; without importing, which takes extras."""
     names: list[str] = []
@@ -498,12 +499,80 @@ def render_integrations() -> str:
     return "\n".join([INTEGRATIONS, *table(["module", "what it is for"], rows)]) + "\n"
 
 
+COMMON = "to_dict|to_json|from_dict|from_json|replace"
+"""What sixty classes inherit, and one page has."""
+
+MANY = 12
+"""Names of a module that fit on one page."""
+
+
+@cache
+def parts(module: str) -> dict[str, dict[str, str]]:
+    """Return a module's names and where they are defined, by page: those of one with many, by the defining module."""
+    names = {name: where for name, where in exports(module).items() if not name.startswith("pytest_")}  # hooks
+    page = module_page(module)
+    if len(names) <= MANY:
+        return {page: names}
+    found: dict[str, dict[str, str]] = {}
+    for name, where in names.items():
+        defining = where.rpartition(".")[0].rpartition(".")[2]
+        found.setdefault(page.replace(".md", f"-{defining}.md"), {})[name] = where
+    return dict(sorted(found.items()))
+
+
+@cache
+def base_names(where: str) -> set[str]:
+    """Return the names of a class's bases, as they are written; none for what is no class."""
+    module, _, name = where.rpartition(".")
+    tree = ast.parse(source(module).read_text(encoding="utf-8"))
+    found = (node.bases for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    return {base.id for base in next(found, []) if isinstance(base, ast.Name)}
+
+
+def directive(where: str, bases: set[str], documented: Iterable[str] = ()) -> list[str]:
+    """Return the lines that mkdocstrings fills in, without members that another page or class has."""
+    options: list[str] = []
+    if bases & set(documented):
+        options = ["inherited_members: false"]
+    elif "Serializable" in bases:
+        options = [f'filters: ["!^_", "!^({COMMON})$"]']
+    return [f"::: {where}", *(["    options:"] if options else []), *(f"      {line}" for line in options), ""]
+
+
 def render_module(module: str) -> str:
     lines = [GENERATED, "", f"# {code(module)}", "", module_doc(module), ""]
-    for name, where in exports(module).items():
-        if not name.startswith("pytest_"):  # hooks
-            lines += [f"::: {where}", ""]
+    pages = parts(module)
+    if module_page(module) in pages:
+        for where in pages[module_page(module)].values():
+            lines += directive(where, base_names(where))
+    else:
+        rows = ([f"[{part_title(module, page)}]({page})", ", ".join(map(code, pages[page]))] for page in pages)
+        lines += table(["page", "what it has"], rows)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def part_title(module: str, page: str) -> str:
+    names = parts(module)[page]
+    word = page.removeprefix(module_page(module).replace(".md", "-")).removesuffix(".md").replace("_", " ")
+    return word.capitalize() if len(names) > 1 else code(next(iter(names)))
+
+
+def render_part(module: str, page: str) -> str:
+    names = parts(module)[page]
+    defining = next(iter(names.values())).rpartition(".")[0]
+    lines = [GENERATED, "", f"# {part_title(module, page)}", ""]
+    lines += [module_doc(defining), "", f"Import these names from [{code(module)}]({module_page(module)}).", ""]
+    for where in names.values():
+        lines += directive(where, base_names(where), exports(module))
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def module_pages() -> dict[str, Callable[[], str]]:
+    pages: dict[str, Callable[[], str]] = {}
+    for module in around():
+        pages[module_page(module)] = partial(render_module, module)
+        pages |= {page: partial(render_part, module, page) for page in parts(module) if page != module_page(module)}
+    return pages
 
 
 SHARED = "shared"  # a class that both clients share has one page, which begins with this word
@@ -531,12 +600,68 @@ OF_THEIR_OWN = {"URLabClient": "ClientState"}
 """Classes whose inherited members are on the page of a shared class, because there are so many."""
 
 
+SECOND_PAGES = {
+    "URLabClient": (
+        "streams",
+        "waiting, pictures, streams, diagnosis",
+        (
+            "resync", "run_for", "wait_until", "capture", "state_stream", "row_stream", "events", "call", "explain",
+            "meta", "close",
+        ),
+    ),
+    "URLabArticulation": (
+        "methods",
+        "methods",
+        (
+            "describe", "move_to", "claim", "release", "apply_xfrc", "set_ctrl", "get_ctrl", "get_qpos", "get_sensors",
+            "resolve_joint", "resolve_actuator",
+        ),
+    ),
+    "SceneNamespace": (
+        "levels",
+        "levels, uploads, placing",
+        (
+            "upload_model", "apply_scene", "create_level", "load_level", "save_level", "current_level",
+            "ensure_manager", "destroy_asset", "set_actor_transform", "actor_hierarchy",
+        ),
+    ),
+    "RuntimeNamespace": (
+        "robots",
+        "robots, cameras, mocap bodies",
+        (
+            "list_keyframes", "set_qpos", "set_twist", "set_user_channels", "read_mocap_pose", "set_mocap_pose",
+            "set_camera_delay", "set_camera_streaming",
+        ),
+    ),
+}  # fmt: skip
+"""Of classes with many members: the end of a second page's name, what it is about, and its members."""
+
+
+def home_of(name: str, flavour: str) -> str:
+    _, core, facade, _ = CLASSES[name]
+    return f"urlab_client.aio.{core}.{name}" if flavour == "aio" else f"urlab_client.sync.{facade or core}.{name}"
+
+
+def render_second_page(name: str, flavour: str) -> str:
+    _, words, members = SECOND_PAGES[name]
+    lines = [f"{START}. Do not edit. -->", "", f"# {name}: {words}", ""]
+    lines += [f"The rest of [{code(name)}]({flavour}-{CLASSES[name][0]}.md).", ""]
+    for member in members:
+        lines += [f"::: {home_of(name, flavour)}.{member}", ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
 def render_class(name: str, flavour: str, title: str) -> str:
-    slug, core, facade, owner = CLASSES[name]
-    home = f"aio.{core}" if flavour == "aio" else f"sync.{facade or core}"
+    slug, _, _, owner = CLASSES[name]
     base = OF_THEIR_OWN.get(name)
-    more = f" Inherited members are on the page [{base}]({SHARED}-{CLASSES[base][0]}.md)." if base else ""
-    options = "\n    options:\n      inherited_members: false" if base else ""
+    more = f"\nInherited members are on the page [{base}]({SHARED}-{CLASSES[base][0]}.md)." if base else ""
+    options = ["inherited_members: false"] if base else []
+    if name in SECOND_PAGES:
+        end, words, members = SECOND_PAGES[name]
+        more += f"\nA page of its own has [{words}]({flavour}-{slug}-{end}.md)."
+        options.append(f'filters: ["!^_", "!^({"|".join(members)})$"]')
+    options = "".join(f"\n      {option}" for option in options)
+    options = f"\n    options:{options}" if options else ""
     other, words = ("blocking", "blocking client") if flavour == "aio" else ("aio", "async client")
     return f"""\
 {START}. Do not edit. -->
@@ -546,7 +671,7 @@ def render_class(name: str, flavour: str, title: str) -> str:
 You get it from: {owner}. This is the class of the [{title}]({flavour}.md); the [{words}]({other}-{slug}.md)
 has the same one.{more}
 
-::: urlab_client.{home}.{name}{options}
+::: {home_of(name, flavour)}{options}
 """
 
 
@@ -571,6 +696,8 @@ def class_pages() -> dict[str, Callable[[], str]]:
         else:
             pages[f"blocking-{slug}.md"] = partial(render_class, name, "blocking", "blocking client")
             pages[f"aio-{slug}.md"] = partial(render_class, name, "aio", "async client")
+            for flavour in ("blocking", "aio") if name in SECOND_PAGES else ():
+                pages[f"{flavour}-{slug}-{SECOND_PAGES[name][0]}.md"] = partial(render_second_page, name, flavour)
     return pages
 
 
@@ -731,18 +858,13 @@ def render_subjects(name: str) -> str:
 
 
 def render_subject(name: str, page: Subject) -> str:
-    from urlab_client.values.plain import Serializable
-
-    # Left out because sixty classes inherit these methods, whose page has them once.
-    common = "|".join(member for member in vars(Serializable) if not member.startswith("_"))
     lines = [GENERATED, "", f"# {page.title}", "", *textwrap.wrap(page.words, 120, break_long_words=False), ""]
-    for where in by_subject(SUBJECTS[name])[page.slug]:
+    places = by_subject(SUBJECTS[name])[page.slug]
+    for where in places:
         module, _, attribute = where.rpartition(".")
         value = getattr(importlib.import_module(module), attribute)
-        lines.append(f"::: {where}")
-        if isinstance(value, type) and issubclass(value, Serializable) and value is not Serializable:
-            lines += ["    options:", f'      filters: ["!^_", "!^({common})$"]']
-        lines.append("")
+        above = {cls.__name__ for cls in value.__mro__[1:]} if isinstance(value, type) else set[str]()
+        lines += directive(where, above, {other.rpartition(".")[2] for other in places})
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -757,7 +879,7 @@ def subject_pages() -> dict[str, Callable[[], str]]:
 def pages() -> dict[str, Callable[[], str]]:
     return {
         **class_pages(),
-        **{module_page(module): partial(render_module, module) for module in around()},
+        **module_pages(),
         **namespace_pages(),
         **subject_pages(),
         **{f"{name}.md": partial(render_subjects, name) for name in SUBJECTS},

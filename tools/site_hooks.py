@@ -62,9 +62,10 @@ def with_listed(nav: Any, docs: Path) -> Any:
         return nav
     names = re.findall(rf"\]\(({re.escape(path.stem)}-[\w-]+\.md)", path.read_text(encoding="utf-8"))
     below = [
-        {_heading(path.parent / name): posixpath.join(posixpath.dirname(nav), name)} for name in dict.fromkeys(names)
+        {_heading(path.parent / name): with_listed(posixpath.join(posixpath.dirname(nav), name), docs)}
+        for name in dict.fromkeys(names)
     ]
-    return [nav, *below] if below else nav
+    return [{_heading(path): nav}, *below] if below else nav
 
 
 def _heading(page: Path) -> str:

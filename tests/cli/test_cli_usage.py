@@ -26,8 +26,10 @@ from urlab_client.server import bundled_models
 def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: Path) -> None:
     program = (
         "import sys; from urlab_client.cli import main\n"
+        "try: main(['record', '--help'])\n"
+        "except SystemExit: print({'numpy', 'zmq', 'urlab_client.aio.client'} & set(sys.modules))\n"
         "try: main(['serve', '--help'])\n"
-        "except SystemExit: print('urlab_client.aio' in sys.modules)\n"
+        "except SystemExit: print('urlab_client.aio.client' in sys.modules)\n"
         "try: main(['--help'])\n"
         "except SystemExit: print(sorted({'mujoco', 'numpy', 'rich', 'urlab_client.cli.ping'} & set(sys.modules)))"
     )
@@ -37,6 +39,7 @@ def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: 
     *text, imported = done.stdout.splitlines()
     assert set(COMMANDS) <= set(" ".join(text).split())
     assert imported == "[]"
+    assert "set()" in text, "the help of a command loads the client"
     assert "False" in text, "a server loads the clients"
 
 

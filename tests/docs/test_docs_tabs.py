@@ -46,9 +46,15 @@ def test_the_navigation_has_the_pages_that_a_page_lists_below_it(hooks: Any) -> 
     nav = [{"Reference": [{"Command line": "reference/cli.md"}]}, "index.md"]
     (reference, home) = hooks.with_listed(nav, ROOT / "docs")
     ((index, first, *others),) = (below["Command line"] for below in reference["Reference"])
-    assert (index, home) == ("reference/cli.md", "index.md")
+    assert (index, home) == ({"Command line": "reference/cli.md"}, "index.md")
     assert first == {"urlab serve": "reference/cli-serve.md"}
     assert len(others) + 1 == len(list((ROOT / "docs" / "reference").glob("cli-*.md")))
+
+
+def test_the_navigation_goes_as_deep_as_pages_list_others(hooks: Any) -> None:
+    _, *below = hooks.with_listed("reference/integrations.md", ROOT / "docs")
+    (gym,) = (page["urlab_client.integrations.gym"] for page in below if "urlab_client.integrations.gym" in page)
+    assert {"Tasks": "reference/integrations-gym-tasks.md"} in gym
 
 
 def test_the_site_makes_tabs_of_neighbours_only(hooks: Any) -> None:

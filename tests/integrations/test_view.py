@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from ports import free_ports
@@ -22,12 +23,16 @@ from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.cli import main
 from urlab_client.integrations._feed import samples
 from urlab_client.integrations._feed.geometry import Kind, shapes_of
 from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
 from urlab_client.integrations._feed.samples import CameraPicture, picture_message
+from urlab_client.integrations._feed.scene import FollowedScene
+from urlab_client.integrations.record import read_run, record
 from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 from urlab_client.integrations.view import view as viewing
+from urlab_client.integrations.view.view import WindowBackend, show_recording
 from urlab_client.server import SimulatedServer
 
 pytestmark = pytest.mark.view
@@ -295,6 +300,96 @@ def test_a_view_ends_when_its_window_is_closed(client: urlab_client.URLabClient,
         client.step(n_steps=5)
     assert view.error is None
     assert len(windows[0].shown) == before
+
+
+CRATE = """<mujoco><worldbody><body name="crate" pos="2 0 1"><freejoint name="crate_free"/><geom size="0.1"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Two episodes of a robot, another with a free base, and a falling crate, of which the server has gone."""
+    path, crate = tmp_path / "run.mcap", tmp_path / "crate.xml"
+    crate.write_text(CRATE)
+    with (
+        SimulatedServer("arm", "quadruped", crate, play=True) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, path):
+            for _ in range(2):
+                client.reset()
+                client.articulations["arm"].set_ctrl({"elbow": 0.5})
+                for _ in range(50):
+                    client.step()
+    return path
+
+
+def test_a_recording_alone_shows_its_robots_and_begins_again_until_the_view_ends(
+    recording: Path, windows: list[Window]
+) -> None:
+    run = read_run(recording)
+    columns = run.table().columns
+    order = ("arm/qpos", "quadruped/qpos", "crate/qpos")  # of the model
+    recorded = np.hstack([columns[key].values for key in order]).tolist()
+
+    def over() -> bool:
+        shown = [qpos for _, qpos in windows[0].shown] if windows else []
+        return recorded[-1] in shown and recorded[0] in shown[shown.index(recorded[-1]) :]
+
+    stats = show_recording(run, WindowBackend(), over=over)
+    (window,) = windows
+    assert all(qpos in recorded for _, qpos in window.shown)
+    assert stats.states == len(window.shown)
+    assert not window.open
+
+
+def test_rerun_gets_a_whole_recording_at_once(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.rrd"
+    assert main(["view", str(recording), "--rerun", "--save", str(path), "--max-hz", "1000"]) == 0
+    table = read_run(recording).table()
+    assert f"{len(table)} states" in capsys.readouterr().out
+    elbow = table.columns["arm/qpos"].values[:, table.columns["arm/qpos"].names.index("elbow")]
+    found = rows(path, "/joints/arm/elbow", "Scalars:scalars")
+    assert [value for _, (value,) in found] == elbow.tolist()
+    assert [times["sim_time"] for times, _ in found] == np.rint(1e9 * table.time).astype(int).tolist()
+    for body, key in (("quadruped_trunk", "quadruped/qpos"), ("crate_crate", "crate/qpos")):
+        moved = rows(path, f"/world/{body}", "Transform3D:translation")
+        assert np.allclose(np.ravel(moved[-1][1]), table.columns[key].values[-1, :3], atol=1e-6)
+    assert rows(path, "/world/contacts/forces", "Arrows3D:vectors")
+
+
+def test_a_recordings_plain_entities_are_found_in_its_model() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body name='arm_base'><geom size='.1'/></body><body name='crate'><freejoint/>"
+        "<geom size='.1'/></body><body name='target' mocap='true'/></worldbody></mujoco>"
+    )
+    scene = FollowedScene.recorded(model, {"arm": "arm"}, [])
+    assert scene.layouts["arm"].bodies == {"base": 1}
+    assert scene.entities == {"crate": (0, 0), "target": None}
+    assert scene.mocap == {"target": 0}
+
+
+@pytest.mark.opengl
+def test_a_recordings_pictures_are_shown(tmp_path: Path) -> None:
+    recorded, path = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    with (
+        SimulatedServer("arm", play=True, camera_modes={"arm/wrist": "depth"}, camera_size=(80, 60)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, recorded, cameras="all", camera_hz=100):
+            client.step(n_steps=5)
+            client.step(n_steps=20)
+        depth = client.articulations["arm"].cameras["wrist"].latest_frame
+    assert main(["view", str(recorded), "--rerun", "--save", str(path)]) == 0
+    _, (buffer,) = rows(path, "/world/cameras/arm/wrist/image", "DepthImage:buffer")[-1]
+    assert depth is not None
+    assert np.array_equal(np.frombuffer(bytes(buffer), "<f4").reshape(depth.shape), depth)
+    assert len(rows(path, "/world/cameras/arm/overview/image", "EncodedImage:blob")) == 2
+    assert rows(path, "/world/cameras/arm/overview", "Pinhole:image_from_camera")
 
 
 def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ COMMANDS = {
     "run-policy": "let a network from an ONNX file drive a robot",
     "evaluate": "measure how good a policy is, with confidence intervals",
     "teleop": "move a robot's hand with the keyboard, and record episodes",
-    "view": "show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
+    "view": "show a simulation or a recording in MuJoCo's window, a browser, Rerun or Foxglove",
 }
 
 _USAGE = """

@@ -178,17 +178,18 @@ def make_client(flavour: Callable[..., C], address: str, arguments: Namespace, *
         raise CommandError(str(error)) from None
 
 
-def address_usage(value: str = "ADDRESS=tcp://localhost", otherwise: str = "") -> str:
+def address_usage(value: str = "ADDRESS=tcp://localhost", otherwise: str = "", or_else: str = "") -> str:
     """Return the usage of the server's address, and of `--mjcf-options` for a server that the command starts.
 
     Args:
         value: The argument, with its default.
         otherwise: What happens without it, if it has no default.
+        or_else: What can stand in its place.
     """
     default = f"(default: {otherwise})" if otherwise else ""
     return f"""
-{value}  HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command
-    {default}
+{value}  HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this
+    command{or_else} {default}
 {MJCF_OPTIONS.format("with sim://MODEL")}
 """
 

@@ -16,11 +16,10 @@ from urlab_client.cli._arguments import cameras, make_client
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
 from urlab_client.errors import OutcomeUnknown, URLabTimeoutError
-from urlab_client.events import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
-from urlab_client.sync.client import URLabClient as BlockingClient
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabClient
+    from urlab_client.events import ClientEvent
     from urlab_client.integrations.gym import Task, URLabEnv
     from urlab_client.integrations.record import AsyncRecorder
 
@@ -123,6 +122,7 @@ async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[
 def task_environment(arguments: Namespace, kind: type[Task], **options: Any) -> Generator[URLabEnv]:
     """Yield an environment of a task, over the server that the arguments name or else a simulated one."""
     from urlab_client.integrations.gym import URLabEnv
+    from urlab_client.sync.client import URLabClient as BlockingClient
 
     address = arguments.address or with_model_options(kind.scene_address)
     with make_client(BlockingClient, address, arguments, step_mode="direct") as client:
@@ -146,6 +146,8 @@ def _lost_at(events: Stream[ClientEvent], lost_at: float | None) -> float | None
     Raises:
         CommandError: No further state will arrive: a client that only watches would wait forever.
     """
+    from urlab_client.events import PlayEnded, ServerLost, ServerReconnected, SessionLost
+
     now = asyncio.get_running_loop().time()
     while (event := events.receive_nowait()) is not None:
         match event:

@@ -15,8 +15,8 @@ import webbrowser
 from argparse import Namespace
 from datetime import UTC, datetime
 
+from urlab_client import aio
 from urlab_client._installation import install_command
-from urlab_client.aio import URLabClient
 from urlab_client.cli._arguments import (
     PAGE,
     WATCHER,
@@ -98,7 +98,9 @@ async def _serve(arguments: Namespace) -> None:
 
     access = Access(hosts=host_names(arguments), keys=_keys())
     # Each camera is streamed while a browser shows it.
-    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
+    client = make_client(
+        aio.URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver()
+    )
     async with client:
         with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
             url = page_url(arguments, listener.getsockname()[1])

@@ -12,8 +12,8 @@ import contextlib
 import logging
 from argparse import Namespace
 
+from urlab_client import aio
 from urlab_client._installation import conflict
-from urlab_client.aio import URLabClient
 from urlab_client.aio.client_types import Diagnosis
 from urlab_client.cli._arguments import WATCHER, address_usage, handshake, make_client
 from urlab_client.cli._common import import_mujoco, json_line
@@ -49,7 +49,7 @@ def run(arguments: Namespace) -> int:
 async def _diagnose(arguments: Namespace) -> Diagnosis:
 
     client = make_client(
-        URLabClient,
+        aio.URLabClient,
         arguments.address,
         arguments,
         step_mode=arguments.step_mode,

@@ -18,7 +18,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.aio.launch import with_model_options, with_option
 from urlab_client.cli._arguments import POLICY, TASK, policy_task
 from urlab_client.cli._common import CommandError, aligned, import_mujoco, json_line, progress_bar, refusing
@@ -121,7 +121,7 @@ async def _on_robot(arguments: Namespace, declared: Randomisation | None, option
         logger.warning("nothing varies, so all episodes are the same; --randomise varies the robot")
     else:
         address = with_option(address, "randomise", declared.to_json())
-    async with URLabClient(address, step_mode="direct", mujoco_version_check=False) as client:
+    async with aio.URLabClient(address, step_mode="direct", mujoco_version_check=False) as client:
         await client.discover()
         return await evaluate_on(client, policy, articulation=actor, seconds=arguments.seconds or 10.0, **options)
 

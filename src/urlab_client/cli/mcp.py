@@ -22,7 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.cli._arguments import PAGE, WATCHER, address_usage, check_page, host_names, make_client, page_url
 from urlab_client.cli._common import CommandError, import_mujoco, sigterm_interrupts
 from urlab_client.enums import StepMode
@@ -100,7 +100,7 @@ async def _serve(arguments: Namespace) -> None:
     from urlab_client.mcp.transports import serve_stdio
 
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
-    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
         handshake = None if arguments.handshake is None else arguments.handshake.read_bytes
         session = ConsoleSession(client, recordings=arguments.recordings, handshake=handshake)

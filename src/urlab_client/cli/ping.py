@@ -15,7 +15,7 @@ from argparse import Namespace
 from contextlib import suppress
 from typing import Any
 
-from urlab_client.aio import URLabArticulation, URLabClient
+from urlab_client import aio
 from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
 from urlab_client.cli._arguments import SESSIONLESS, address_usage, make_client
@@ -84,7 +84,7 @@ async def _registered(arguments: Namespace) -> list[dict[str, Any]]:
 
 
 async def _answers(address: str, timeout: float) -> bool:
-    async with URLabClient(address, rcv_timeout_ms=_milliseconds(timeout), local_model=False) as client:
+    async with aio.URLabClient(address, rcv_timeout_ms=_milliseconds(timeout), local_model=False) as client:
         try:
             await client.meta(timeout=timeout)
         except (URLabConnectionError, URLabTimeoutError):
@@ -113,7 +113,7 @@ def _list(servers: list[dict[str, Any]]) -> str:
 async def _ping(arguments: Namespace) -> dict[str, Any]:
     """Return the report; `server` is None without a session."""
     options: dict[str, Any] = {"rcv_timeout_ms": _milliseconds(arguments.timeout)}
-    async with make_client(URLabClient, arguments.address, arguments, **options) as client:
+    async with make_client(aio.URLabClient, arguments.address, arguments, **options) as client:
         ops = len(await client.meta(timeout=arguments.timeout))
         trips = await _round_trips(client, arguments)
         report = {"address": arguments.address, "ops": ops, "round_trip_ms": trips, "server": None}
@@ -123,7 +123,9 @@ async def _ping(arguments: Namespace) -> dict[str, Any]:
             await client.discover()
             return {**report, "server": await _identity(client)}
         except URLabVersionMismatch:
-            async with make_client(URLabClient, arguments.address, arguments, local_model=False, **options) as other:
+            async with make_client(
+                aio.URLabClient, arguments.address, arguments, local_model=False, **options
+            ) as other:
                 await other.discover()
                 return {**report, "server": await _identity(other)}
 
@@ -132,7 +134,7 @@ def _milliseconds(timeout: float) -> int:
     return max(1, round(timeout * 1000))
 
 
-async def _round_trips(client: URLabClient, arguments: Namespace) -> dict[str, float]:
+async def _round_trips(client: aio.URLabClient, arguments: Namespace) -> dict[str, float]:
     times: list[float] = []
     for _ in range(arguments.count):
         start = time.perf_counter()
@@ -142,7 +144,7 @@ async def _round_trips(client: URLabClient, arguments: Namespace) -> dict[str, f
     return {"count": len(times), **{name: round(value, 3) for name, value in spread.items()}}
 
 
-async def _identity(client: URLabClient) -> dict[str, Any]:
+async def _identity(client: aio.URLabClient) -> dict[str, Any]:
     import mujoco
 
     local = mujoco.mj_versionString()
@@ -157,7 +159,7 @@ async def _identity(client: URLabClient) -> dict[str, Any]:
     }
 
 
-def _articulation(articulation: URLabArticulation, with_model: bool) -> dict[str, Any]:
+def _articulation(articulation: aio.URLabArticulation, with_model: bool) -> dict[str, Any]:
     """Return what an articulation has; joints and sensors are None if the model could not be loaded locally."""
     controller = articulation.controller
     return {
@@ -171,7 +173,7 @@ def _articulation(articulation: URLabArticulation, with_model: bool) -> dict[str
     }
 
 
-async def _play(client: URLabClient) -> dict[str, Any]:
+async def _play(client: aio.URLabClient) -> dict[str, Any]:
     """Return the state of play; `step_mode` is None if only the driving client knows it."""
     play = {"state": "off", "sim_time": None, "physics": None, "step_mode": None, "step_mode_pinned": False}
     try:
@@ -192,7 +194,7 @@ async def _play(client: URLabClient) -> dict[str, Any]:
     }
 
 
-async def _pinned_mode(client: URLabClient) -> str | None:
+async def _pinned_mode(client: aio.URLabClient) -> str | None:
     """Return the mode the server is pinned to; no op reads the mode, but a pinned server names it in its refusal."""
     try:
         await client.call(SetMode(mode="?"))  # not a mode, so it changes nothing on any server

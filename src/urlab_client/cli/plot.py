@@ -135,7 +135,9 @@ def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves],
         least = _least_range(panel.values)
         if high - low < least:
             axis.set_ylim((low + high - least) / 2, (low + high + least) / 2)
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+        legend = axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+        for handle in legend.legend_handles:
+            handle.set_linestyle("-")  # it is shorter than the gap of a dashed one
     figure.align_ylabels(axes)
     axes[-1].set_xlabel("simulation time (s)")
     with replaced(path) as temporary:

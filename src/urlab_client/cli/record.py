@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.cli._arguments import (
     CAMERA,
     CAMERA_HZ,
@@ -117,7 +117,7 @@ def _record_task(arguments: Namespace) -> Recorder:
 async def _record(arguments: Namespace) -> AsyncRecorder:
     from urlab_client.integrations.record import record
 
-    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
         with announced_wait(client):
             await client.discover()

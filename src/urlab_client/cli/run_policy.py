@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, make_client, policy_task
 from urlab_client.cli._common import (
@@ -129,7 +129,7 @@ async def _run(arguments: Namespace, policy: Policy) -> dict[str, PolicyRun]:
 
     address, articulation = _where(arguments, policy)
     step_mode = arguments.step_mode or policy.spec.step_modes[0]
-    client = make_client(URLabClient, address, arguments, step_mode=step_mode)
+    client = make_client(aio.URLabClient, address, arguments, step_mode=step_mode)
     actors = {**(_baselines(policy) if arguments.compare else {}), "policy": policy}
     runs: dict[str, PolicyRun] = {}
     async with client:

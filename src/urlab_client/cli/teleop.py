@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, RECORD, TASK, address_usage, make_client, task_named
 from urlab_client.cli._common import CommandError, check_recording, import_mujoco, refusing
@@ -76,7 +76,7 @@ async def _teleoperate(arguments: Namespace, task: Task | None, keys: Callable[[
     address = arguments.address
     if address is None:
         address = "tcp://localhost" if task is None else with_model_options(task.scene_address)
-    client = make_client(URLabClient, address, arguments, step_mode="direct")
+    client = make_client(aio.URLabClient, address, arguments, step_mode="direct")
     async with client:
         await client.discover()
         hand = HandControl(

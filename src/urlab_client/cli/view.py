@@ -1,18 +1,21 @@
-"""`urlab view`: show a simulation in MuJoCo's window, in a browser, in Rerun or in Foxglove.
+"""`urlab view`: show a simulation or a recording in MuJoCo's window, in a browser, in Rerun or in Foxglove.
 
 Show a play session while it runs. In live mode, physics runs by itself and this command watches; in direct mode, this
 command resets and steps it, with all set-points zero. Opens a session, which takes the server over from the client that
 drives it; your own program can call rerun_view(client) or one of its siblings instead. Ctrl-C ends it. --rerun needs
-the extra 'urlab-client[rerun]', --foxglove 'urlab-client[foxglove]', --web 'urlab-client[web]'.
+the extra 'urlab-client[rerun]', --foxglove 'urlab-client[foxglove]', --web 'urlab-client[web]'. A recording needs no
+server, but the extra 'urlab-client[mcap]': Rerun gets all of it at once, the others show it at its own pace, again and
+again. MuJoCo does not check the model in it, so show only recordings from sources that you trust.
 """
 
 from __future__ import annotations
 
 import asyncio
 from argparse import Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.aio import URLabClient
+from urlab_client import aio
 from urlab_client.cli import console
 from urlab_client.cli._arguments import (
     CAMERA,
@@ -21,6 +24,7 @@ from urlab_client.cli._arguments import (
     STEP_MODE,
     Parser,
     add_usage,
+    address,
     address_usage,
     cameras,
     make_client,
@@ -30,13 +34,13 @@ from urlab_client.cli._watching import announced_wait, interruptible, run_sessio
 from urlab_client.enums import StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.integrations.view import AsyncView
+    from urlab_client.integrations.view import ViewStats
+    from urlab_client.integrations.view.view import ViewBackend
 
-_FOXGLOVE_PORT = 8765
-_RERUN_PORT = 9090
+_PORTS = {"foxglove": 8765, "rerun": 9090}
 
 USAGE = f"""
-{address_usage()}
+{address_usage(or_else="; or FILE.mcap, a recording")}
 | --viewer  MuJoCo's own window, which needs a display (default)
 | --web  the console's page with MuJoCo's web viewer, for browsers
 | --rerun  Rerun's window; with --save a file, with --connect another viewer, with --page a page for browsers
@@ -57,7 +61,16 @@ urlab view sim://quadruped  MuJoCo's window
 urlab view --rerun --camera all  the server on this machine in Rerun, with every camera
 urlab view sim://arm --rerun --save arm.rrd --seconds 5  five seconds as a Rerun file
 urlab view --foxglove  a server that Foxglove connects to
+urlab view run.mcap  a recording in MuJoCo's window
+urlab view run.mcap --rerun --page  a recording in Rerun's page, for browsers
 """
+
+
+def _shown(text: str) -> str | Path:
+    return Path(text) if text.endswith(".mcap") and "://" not in text else address(text)
+
+
+KINDS = {"address": _shown}
 
 
 def run(arguments: Namespace) -> int:
@@ -67,7 +80,13 @@ def run(arguments: Namespace) -> int:
         raise CommandError("--save, --connect and --page require --rerun")
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
         raise CommandError("give one of --save, --connect and --page")
+    recorded = isinstance(arguments.address, Path)
     if arguments.where == "web":
+        if recorded:
+            raise CommandError(
+                "--web shows a recording beside the robots that run: use `urlab console sim://MODEL --recordings "
+                "FOLDER`; without a server, --rerun --page"
+            )
         return _show_console(arguments)
     if arguments.where == "viewer":
         from urlab_client.integrations.view.view import missing_for_window
@@ -78,7 +97,8 @@ def run(arguments: Namespace) -> int:
     else:
         import_mujoco()
     with refusing(KeyError, ValueError):
-        asyncio.run(_view(arguments))
+        stats = asyncio.run((_view_recording if recorded else _view)(arguments))
+    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states skipped")
     return 0
 
 
@@ -92,49 +112,63 @@ def _show_console(arguments: Namespace) -> int:
     return console.run(parser.parse_args([arguments.address], arguments))  # the rest has its default
 
 
-async def _view(arguments: Namespace) -> None:
+async def _view(arguments: Namespace) -> ViewStats:
+    from urlab_client.integrations.view import AsyncView
 
-    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
         with announced_wait(client):
             await client.discover()
         if arguments.step_mode == StepMode.DIRECT:
             await client.reset()
-        view = _make(client, arguments)
+        options: dict[str, Any] = {"camera_hz": arguments.camera_hz, "max_hz": arguments.max_hz, "contacts": True}
+        view = AsyncView(client, _backend(arguments), "urlab view", cameras=cameras(arguments.camera), **options)
         with interruptible() as stop:
             async with view:
-                print(_announcement(arguments, view), flush=True)
+                _announce(arguments, view.address)
                 await run_session(client, arguments.seconds, over=lambda: stop.is_set() or view.closed)
     if view.error is not None:
         raise CommandError(f"the view ended: {view.error}")
-    stats = view.stats
-    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states skipped")
+    return view.stats
 
 
-def _make(client: URLabClient, arguments: Namespace) -> AsyncView:
-    from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
+async def _view_recording(arguments: Namespace) -> ViewStats:
+    from urlab_client.integrations.record import read_run
+    from urlab_client.integrations.view.view import show_recording
 
+    run, backend = read_run(arguments.address), _backend(arguments)
+    chosen = cameras(arguments.camera or ["all"] * (arguments.where != "viewer"))
+    with interruptible() as stop:
+        return await asyncio.to_thread(
+            show_recording,
+            run,
+            backend,
+            opened=lambda: _announce(arguments, backend.address),
+            over=stop.is_set,
+            paced=arguments.where != "rerun",
+            cameras=run.cameras() if chosen == "all" else chosen,
+            max_hz=arguments.max_hz,
+            seconds=arguments.seconds,
+        )
+
+
+def _backend(arguments: Namespace) -> ViewBackend:
     if arguments.where == "viewer":
-        return window_view(client, max_hz=arguments.max_hz)
-    options: dict[str, Any] = {
-        "cameras": cameras(arguments.camera),
-        "camera_hz": arguments.camera_hz,
-        "sensors": arguments.sensors,
-        "max_hz": arguments.max_hz,
-    }
+        from urlab_client.integrations.view.view import WindowBackend
+
+        return WindowBackend()
+    port = _PORTS[arguments.where] if arguments.port is None else arguments.port
     if arguments.where == "foxglove":
-        return foxglove_view(client, port=_FOXGLOVE_PORT if arguments.port is None else arguments.port, **options)
-    return rerun_view(
-        client,
-        save=arguments.save,
-        connect=arguments.connect,
-        web=arguments.page,
-        web_port=_RERUN_PORT if arguments.port is None else arguments.port,
-        **options,
-    )
+        from urlab_client.integrations.view.foxglove_view import FoxgloveBackend
+
+        return FoxgloveBackend(host="127.0.0.1", port=port, sensors=arguments.sensors)
+    from urlab_client.integrations.view.rerun_view import RerunBackend
+
+    target: dict[str, Any] = {"save": arguments.save, "connect": arguments.connect, "web": arguments.page}
+    return RerunBackend(**target, web_port=port, sensors=arguments.sensors)
 
 
-def _announcement(arguments: Namespace, view: AsyncView) -> str:
-    where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
+def _announce(arguments: Namespace, address: str) -> None:
+    where = arguments.save or arguments.connect or address or f"the {arguments.where} window"
     exposure = " Rerun serves it on every interface of this machine, to anyone." if arguments.page else ""
-    return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{exposure}"
+    print(f"{arguments.address} is shown: {where}; Ctrl-C ends it.{exposure}", flush=True)

@@ -27,7 +27,6 @@ from urlab_client.console.pictures import OF_SCENE, Cameras
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
-from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.messages.streams import StateSnapshot
 
 if TYPE_CHECKING:
@@ -135,7 +134,7 @@ class Replay:
             for moment in np.linspace(max(0.0, at - seconds), at, _PAST_STATES).tolist():
                 state = run.state_at(start + moment)
                 if state is not None and state.time not in found:
-                    found[state.time] = _snapshot(state, _present(state, robots), state.time - start)
+                    found[state.time] = state.snapshot(state.time - start, _present(state, robots))
             return [*found.values()]
 
         return await anyio.to_thread.run_sync(read)
@@ -235,7 +234,7 @@ class Replay:
             self._state = state
             robots = _present(state, self._robots)
             targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
-            self._view.show(_snapshot(state, robots, state.time - self._start), targets)
+            self._view.show(state.snapshot(state.time - self._start, robots), targets)
 
     async def _show_pictures(self) -> None:
         """Show recorded pictures; those of the simulation while its robots are placed, too."""
@@ -301,31 +300,3 @@ def _values(state: RecordedState, robot: _Robot) -> RecordedArticulation | None:
         # Of velocities it is not known where they are among those of all joints.
         found = replace(found, qpos=found.qpos[robot.places], qvel=np.zeros(0))
     return found if found is not None and len(found.qpos) == robot.size else None
-
-
-def _snapshot(state: RecordedState, robots: Mapping[str, RecordedArticulation], at: float) -> StateSnapshot:
-    clock = Clock(sec=int(at), nsec=int(at % 1.0 * 1e9))
-    return StateSnapshot(
-        time=at,
-        step=state.step,
-        sim_time=clock,
-        wall_time=Clock(sec=0, nsec=0),
-        recv_wall_time_ns=time.time_ns(),
-        per_articulation={
-            key: ArticulationState(
-                qpos=values.qpos,
-                qvel=values.qvel,
-                ctrl=values.ctrl if len(values.ctrl) else None,
-                sensors={name: reading.tolist() for name, reading in values.sensors.items()} or None,
-            )
-            for key, values in robots.items()
-        },
-        entities={
-            name: EntityState(
-                xpos=tuple(entity.position.tolist()),
-                xquat=tuple(entity.orientation.tolist()),
-                qpos=np.concatenate((entity.position, entity.orientation)),
-            )
-            for name, entity in state.entities.items()
-        },
-    )

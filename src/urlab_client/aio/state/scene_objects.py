@@ -228,7 +228,7 @@ def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
         return Examined(prefixes, {key: ArticulationLayout() for key in keys}, entities)
     try:
         layouts = articulation_layouts(model, prefixes)
-        return Examined(prefixes, layouts, entities or _entities_of(model, frozenset(prefixes.values())))
+        return Examined(prefixes, layouts, entities or entities_of(model, frozenset(prefixes.values())))
     except UnicodeDecodeError as error:
         raise _refused(f"a name in its model is not text: {error}") from error
 
@@ -262,7 +262,7 @@ def _check_entity(name: str, info: EntityInfo, model: mujoco.MjModel | None) -> 
         raise _refused(f"entity {name!r} has joint and offsets {reported}, but in its model they are {places}")
 
 
-def _entities_of(model: mujoco.MjModel, keys: frozenset[str]) -> dict[str, EntityInfo]:
+def entities_of(model: mujoco.MjModel, keys: frozenset[str]) -> dict[str, EntityInfo]:
     """Find the dynamic bodies outside articulations in the model, because the plugin does not list them."""
     bodies, joints = model_names(model, "body"), model_names(model, "joint")
     found: dict[str, EntityInfo] = {}

@@ -271,7 +271,7 @@ class Follower(ClientObserver):
 
     async def _follow_camera(self, camera: CameraLayout) -> None:
         schedule = Schedule(self._camera_ns)
-        async with camera.view.frames("latest", timeout=None) as frames:
+        async with self._client.camera(camera.name).frames("latest", timeout=None) as frames:
             while True:
                 try:
                     sample = await frames.receive(timeout=None)

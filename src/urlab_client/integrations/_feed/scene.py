@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -15,6 +15,7 @@ from urlab_client.aio.articulation import URLabArticulation, compiled_prefixes
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
+from urlab_client.aio.state.scene_objects import entities_of
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -46,7 +47,7 @@ class SceneLayout(Struct, kw_only=True):
     """Name of each value of an articulation, in the order of the message's arrays; empty without a local model.
 
     `slides` are the names of slide joints, whose positions are metres, or None if unknown. `sensors` has the kind of
-    each sensor by name, as in MJCF (`accelerometer`).
+    each sensor by name, as in MJCF (`accelerometer`). With `prefix` its names begin in the compiled model.
     """
 
     qpos: list[str] = []
@@ -55,6 +56,18 @@ class SceneLayout(Struct, kw_only=True):
     act: list[str] = []
     slides: list[str] | None = None
     sensors: dict[str, str] = {}
+    prefix: str = ""
+
+
+class RecordedCamera(NamedTuple):
+    """What a recording says of a camera, as `URLabCameraView` does of a client's."""
+
+    mode: str
+    resolution: tuple[int, int]
+    fovy: float
+
+
+Lens = URLabCameraView | RecordedCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +76,12 @@ class CameraLayout:
 
     Attributes:
         name: `ARTICULATION/CAMERA`, or the name of a scene-level camera.
-        view: The client's camera.
+        view: The client's camera, or what a recording says of one.
         model_id: Id in the compiled model; -1 if missing.
     """
 
     name: str
-    view: URLabCameraView
+    view: Lens
     model_id: int
 
 
@@ -95,29 +108,43 @@ class FollowedScene:
     variation: Variation | None
 
     @classmethod
-    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> FollowedScene:
-        model, arts = client.model, client.articulations
-        prefixes = compiled_prefixes(arts)
-        layouts = {key: ArticulationLayout() for key in arts}
+    def of(cls, client: URLabClient, cameras: Sequence[tuple[str, Lens]]) -> FollowedScene:
+        plain = {name: one for name, one in client.entities.items() if not isinstance(one, URLabArticulation)}
+        bodies = {name: (one.body_id, one.qpos_offset, one.qvel_offset) for name, one in plain.items()}
+        scene = cls._made(client.model, compiled_prefixes(client.articulations), bodies, cameras)
+        model = scene.model
+        return scene if model is None else replace(scene, variation=server_variation(client, model, scene.layouts))
+
+    @classmethod
+    def recorded(
+        cls, model: mujoco.MjModel, prefixes: Mapping[str, str], cameras: Sequence[tuple[str, Lens]]
+    ) -> FollowedScene:
+        """Return the scene of a recording from its model and what its articulations' names begin with there."""
+        infos = entities_of(model, frozenset(prefixes.values()))
+        bodies = {name: (info.id, info.qpos_offset, info.qvel_offset) for name, info in infos.items()}
+        return cls._made(model, NameMap(prefixes), bodies, cameras)
+
+    @classmethod
+    def _made(
+        cls,
+        model: mujoco.MjModel | None,
+        prefixes: NameMap[str],
+        bodies: Mapping[str, tuple[int, int | None, int | None]],
+        cameras: Sequence[tuple[str, Lens]],
+    ) -> FollowedScene:
+        layouts = {key: ArticulationLayout() for key in prefixes}
+        mocap: dict[str, int] = {}
         if model is not None:
             layouts = articulation_layouts(model, prefixes)
-        entities: dict[str, tuple[int, int] | None] = {}
-        mocap: dict[str, int] = {}
-        for name, entity in client.entities.items():
-            if isinstance(entity, URLabArticulation):
-                continue
-            offsets = entity.qpos_offset, entity.qvel_offset
-            entities[name] = None if offsets[0] is None or offsets[1] is None else (offsets[0], offsets[1])
-            if model is not None and entity.body_id >= 0 and model.body_mocapid[entity.body_id] >= 0:
-                mocap[name] = int(model.body_mocapid[entity.body_id])
+            mocap = {name: int(model.body_mocapid[body]) for name, (body, _, _) in bodies.items() if body >= 0}
         return cls(
             model=model,
             layouts=layouts,
-            names={key: _layout(model, layout) for key, layout in layouts.items()},
-            entities=entities,
-            mocap=mocap,
-            cameras={id(view): CameraLayout(name, view, _camera_id(model, prefixes, name)) for name, view in cameras},
-            variation=None if model is None else server_variation(client, model, layouts),
+            names={key: _layout(model, layout, prefixes[key]) for key, layout in layouts.items()},
+            entities={name: None if q is None or v is None else (q, v) for name, (_, q, v) in bodies.items()},
+            mocap={name: number for name, number in mocap.items() if number >= 0},
+            cameras={id(view): CameraLayout(name, view, camera_id(model, prefixes, name)) for name, view in cameras},
+            variation=None,
         )
 
 
@@ -262,7 +289,7 @@ def _transform(time: Time, child: str, position: list[float], rotation: list[flo
     return FrameTransform(time, "world", child, Vector3(*position), Quaternion(x, y, z, w))
 
 
-def _camera_id(model: mujoco.MjModel | None, prefixes: NameMap[str], name: str) -> int:
+def camera_id(model: mujoco.MjModel | None, prefixes: Mapping[str, str], name: str) -> int:
     """Return the id of `ARTICULATION/CAMERA`, or of a camera of the scene; -1 if the model does not have it."""
     if model is None:
         return -1
@@ -271,7 +298,7 @@ def _camera_id(model: mujoco.MjModel | None, prefixes: NameMap[str], name: str) 
     return next((i for i in range(model.ncam) if cleaned_name(model.cam(i).name) == wanted), -1)
 
 
-def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLayout:
+def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout, prefix: str) -> SceneLayout:
     if model is None:
         return SceneLayout()
     qpos: list[str] = []
@@ -293,7 +320,7 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
     slides = [name for name, joint in layout.joints.items() if int(model.jnt_type[joint]) == _SLIDE]
     kinds = _sensor_kinds()
     sensors = {name: kinds.get(int(model.sensor_type[sensor]), "") for name, sensor in layout.sensors.items()}
-    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl), slides=slides, sensors=sensors)
+    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl), slides=slides, sensors=sensors, prefix=prefix)
 
 
 def _sensor_kinds() -> dict[int, str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +18,8 @@ from urlab_client.enums import CameraMode
 from urlab_client.integrations._feed.messages import CompressedImage, EpisodeMessage, OutcomeMessage, RawImage
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.pictures import Pixels, shown_png, without_alpha
 
 TASK: Final = "task"
@@ -234,6 +237,40 @@ class RecordedState:
     episode: int
     articulations: dict[str, RecordedArticulation]
     entities: dict[str, RecordedEntity]
+
+    def snapshot(self, at: float, articulations: Mapping[str, RecordedArticulation] | None = None) -> StateSnapshot:
+        """Return the state as a server publishes it.
+
+        Args:
+            at: Its simulation time, seconds.
+            articulations: Articulations instead of the state's own.
+        """
+        return StateSnapshot(
+            time=at,
+            step=self.step,
+            sim_time=Clock(sec=int(at), nsec=int(at % 1.0 * 1e9)),
+            wall_time=Clock(sec=0, nsec=0),
+            recv_wall_time_ns=time.time_ns(),
+            per_articulation={
+                key: ArticulationState(
+                    qpos=values.qpos,
+                    qvel=values.qvel,
+                    ctrl=values.ctrl if len(values.ctrl) else None,
+                    act=values.act if len(values.act) else None,
+                    sensors={name: reading.tolist() for name, reading in values.sensors.items()} or None,
+                )
+                for key, values in (self.articulations if articulations is None else articulations).items()
+            },
+            entities={
+                name: EntityState(
+                    xpos=tuple(entity.position.tolist()),
+                    xquat=tuple(entity.orientation.tolist()),
+                    qpos=np.concatenate((entity.position, entity.orientation)),
+                    qvel=entity.qvel if len(entity.qvel) else None,
+                )
+                for name, entity in self.entities.items()
+            },
+        )
 
 
 def describe_topic(name: str, schema: str, times: NDArray[np.int64]) -> Topic:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -52,10 +52,11 @@ _BACKLOG = 64  # queue length per browser; older messages are dropped
 _JOINING_S = 1.0  # how long after a subscription the newest state is sent again
 
 
-class _Foxglove(ViewBackend):
+class FoxgloveBackend(ViewBackend):
     """Shows states to all connected clients."""
 
     def __init__(self, *, host: str, port: int, sensors: bool) -> None:
+        need("foxglove", "PIL", extra="foxglove")
         self._host, self._port = host, port
         self._sensors = sensors
         self._server: WebSocketServer | None = None
@@ -219,15 +220,6 @@ def foxglove_view(
     Entering the block raises `URLabError` if the port cannot be used, before `discover()` or without a local model,
     and `KeyError` for an unknown camera.
     """
-    need("foxglove", "PIL", extra="foxglove")
-    return in_flavour(
-        client,
-        AsyncView,
-        View,
-        _Foxglove(host=host, port=port, sensors=sensors),
-        "foxglove_view",
-        cameras=cameras,
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-    )
+    backend = FoxgloveBackend(host=host, port=port, sensors=sensors)
+    options: dict[str, Any] = {"cameras": cameras, "camera_hz": camera_hz, "max_hz": max_hz, "contacts": contacts}
+    return in_flavour(client, AsyncView, View, backend, "foxglove_view", **options)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
 import numpy as np
 
@@ -29,12 +30,13 @@ _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 
 
-class _Rerun(ViewBackend):
+class RerunBackend(ViewBackend):
     """Shows states in Rerun."""
 
     def __init__(
-        self, *, save: Path | None, connect: str | None, web: bool, web_port: int, grpc_port: int, sensors: bool
+        self, *, save: Path | None, connect: str | None, web: bool, web_port: int, grpc_port: int = 9876, sensors: bool
     ) -> None:
+        need("rerun", "PIL", extra="rerun")
         self._save, self._connect, self._web = save, connect, web
         self._web_port, self._grpc_port = web_port, grpc_port
         self._sensors = sensors
@@ -44,7 +46,9 @@ class _Rerun(ViewBackend):
 
     @property
     def address(self) -> str:
-        return f"http://127.0.0.1:{self._web_port}" if self._web else ""
+        # Without the address of the data the page shows Rerun's welcome.
+        data = quote(f"rerun+http://127.0.0.1:{self._grpc_port}/proxy", safe="")
+        return f"http://127.0.0.1:{self._web_port}/?url={data}" if self._web else ""
 
     @property
     def _recording(self) -> rerun.RecordingStream:
@@ -245,19 +249,9 @@ def rerun_view(
     Entering the block raises `OSError` if the file cannot be created, `KeyError` for an unknown camera, and
     `URLabError` before `discover()` or without a local model.
     """
-    need("rerun", "PIL", extra="rerun")
     if (save is not None) + (connect is not None) + web > 1:
         raise ValueError("give one of save, connect and web")
     path = None if save is None else Path(save)
-    backend = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return in_flavour(
-        client,
-        AsyncView,
-        View,
-        backend,
-        "rerun_view",
-        cameras=cameras,
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-    )
+    backend = RerunBackend(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
+    options: dict[str, Any] = {"cameras": cameras, "camera_hz": camera_hz, "max_hz": max_hz, "contacts": contacts}
+    return in_flavour(client, AsyncView, View, backend, "rerun_view", **options)

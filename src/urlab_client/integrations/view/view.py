@@ -9,7 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,7 +23,7 @@ from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
-from urlab_client.integrations._feed.scene import FollowedScene, Simulation
+from urlab_client.integrations._feed.scene import FollowedScene, Lens, RecordedCamera, Simulation, camera_id
 from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import EntityState, StepOk
@@ -34,9 +34,15 @@ from urlab_client.values.plain import Serializable
 if TYPE_CHECKING:
     import mujoco
 
+    from urlab_client.integrations.record.contents import RecordedState
+    from urlab_client.integrations.record.reader import Run
+
 log: logging.Logger = logging.getLogger("urlab_client.view")
 
 _NS = 1_000_000_000
+_ROUNDING_S = 1e-6  # a picture may be a nanosecond later than its state
+_PAUSE_S = 1.0  # at the end of a recording, before it begins again
+_FOVY = 45.0  # MuJoCo's, for recorded cameras that the model lacks
 
 
 class ViewStats(Serializable, Struct, kw_only=True, frozen=True):
@@ -294,6 +300,94 @@ class Viewing(Block):
         self._counts["states"] += 1
 
 
+def show_recording(
+    run: Run,
+    backend: ViewBackend,
+    *,
+    max_hz: float = 30.0,
+    contacts: bool = True,
+    cameras: Sequence[str] | None = None,
+    seconds: float | None = None,
+    paced: bool = True,
+    opened: Callable[[], None] = lambda: None,
+    over: Callable[[], bool] = lambda: False,
+) -> ViewStats:
+    """Show a recording with the model that is in it, which MuJoCo does not check, and close the display.
+
+    It is shown at the pace of its clock and again from its start until `over()`, or else at once, and once. `max_hz`
+    and `seconds` are those of its clock; `opened` is called when the display is open.
+
+    Raises:
+        OSError: The file cannot be read, or the display not opened.
+        KeyError: The file has no pictures of a camera.
+        URLabError: The recording has no model, or is damaged; or the display cannot be opened.
+    """
+    model, prefixes, (start, end) = run.model(), run.prefixes(), run.time_range()
+    end = end if seconds is None else min(end, start + seconds)
+    firsts = {name: run.encoded_picture_at(name, start) for name in (run.cameras() if cameras is None else cameras)}
+    lenses: list[tuple[str, Lens]] = []
+    for name, first in firsts.items():
+        height, width = first.pixels().shape[:2]
+        number = camera_id(model, prefixes, name)
+        fovy = float(model.cam_fovy[number]) if number >= 0 else _FOVY
+        lenses.append((name, RecordedCamera(first.mode, (width, height), fovy)))
+    scene = FollowedScene.recorded(model, prefixes, lenses)
+    simulation, clock, counts = Simulation(scene, model), SampleClock(), {"states": 0, "frames": 0}
+    times: dict[str, float] = {}  # of what is shown
+    backend.open()
+    try:
+        backend.use(simulation, scene)
+        opened()
+        for moment in _moments(start, end, 1 / max_hz, paced=paced, stays=bool(backend.address)):
+            if over() or not backend.idle():
+                break
+            state = run.state_at(moment + _ROUNDING_S)
+            if state is not None and times.get("") != state.time:
+                times[""] = state.time
+                backend.show(_moment(state, scene, simulation, clock, contacts=contacts))
+                counts["states"] += 1
+            for camera in scene.cameras.values():
+                picture = run.encoded_picture_at(camera.name, moment + _ROUNDING_S)
+                if times.get(camera.name) != picture.time <= moment + _ROUNDING_S:
+                    times[camera.name], ns = picture.time, clock.last or 0
+                    wall_ns = 0 if state is None else state.wall_ns
+                    backend.show_picture(CameraPicture(camera, picture.pixels(), ns, wall_ns), ns)
+                    counts["frames"] += 1
+    finally:
+        backend.close()
+    return ViewStats(**counts, dropped_states=0, dropped_frames=0)
+
+
+def _moments(start: float, end: float, period: float, *, paced: bool, stays: bool) -> Iterator[float]:
+    """Yield the times to show, seconds on the recording's clock; at its pace, the end stays for a second."""
+    if not paced:
+        yield from np.append(np.arange(start, end, period), end).tolist()
+    while stays and not paced:  # for those who come later
+        time.sleep(_PAUSE_S / 4)
+        yield end
+    began = time.monotonic()
+    while paced:
+        yield min(start + (time.monotonic() - began) % (end - start + _PAUSE_S), end)
+        time.sleep(min(period, _PAUSE_S))
+
+
+def _moment(
+    state: RecordedState, scene: FollowedScene, simulation: Simulation, clock: SampleClock, *, contacts: bool
+) -> Moment:
+    """Return a recorded state as one to show, without robots that have other joints than the model's."""
+    robots = {
+        key: values
+        for key, values in state.articulations.items()
+        if key in scene.layouts and len(values.qpos) == len(scene.layouts[key].qpos_adr)
+    }
+    reply = state.snapshot(state.sim_time, robots)
+    simulation.take(reply.per_articulation, reply.entities or {}, forces=contacts)
+    set_points = {key: values.set_points.tolist() for key, values in robots.items()}
+    ns = clock.advance(round(state.time * _NS), restarts=False)
+    shown = State(scene, reply, set_points, ns, False, state.wall_ns, False)
+    return Moment(ns, state.wall_ns, state.step, scene, simulation, state.episode, contacts, shown)
+
+
 class AsyncView(Viewing, AsyncBlock):
     """A view that is open for the duration of an `async with` block. Created by `rerun_view` and similar functions."""
 
@@ -311,7 +405,7 @@ def missing_for_window() -> str:
     return ""
 
 
-class _Window(ViewBackend):
+class WindowBackend(ViewBackend):
     """Shows states in `mujoco.viewer`'s window, which is reopened for another scene."""
 
     def __init__(self) -> None:
@@ -368,5 +462,5 @@ def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> A
     Entering the block raises `URLabError` if no window can be opened; the message says what is missing.
     """
     return in_flavour(
-        client, AsyncView, View, _Window(), "window_view", cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True
+        client, AsyncView, View, WindowBackend(), "window_view", cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True
     )
