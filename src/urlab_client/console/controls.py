@@ -8,9 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
+import anyio.to_thread
 import msgspec
+import numpy as np
 from msgspec import Struct, structs
 
+from urlab_client.console.description import home_of, torque_motors
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
 from urlab_client.console.pictures import Cameras
@@ -42,12 +45,19 @@ from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, St
 from urlab_client.protocol.registry import OPS
 
 if TYPE_CHECKING:
+    import mujoco
+
     from urlab_client.aio import URLabArticulation, URLabClient
+    from urlab_client.protocol.base import Floats
 
 SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is not Hello}
 """The ops that viewers may perform, by name; the console itself holds the session."""
 
 _PERIOD_S = 1 / 60
+_STIFF = 60.0, 0.7
+_SOFT = 30.0, 0.5  # holds with states that are 50 ms old, as on a busy machine
+"""Frequency in rad/s and damping ratio of a joint that holds its pose."""
+_SETTLES_S = 1.0
 
 
 def parse(op: Op, body: bytes) -> Request[Any]:
@@ -67,6 +77,40 @@ class SteppedTo(Struct):
     step: int
 
 
+class PoseHold:
+    """A PD law that holds a robot with torque motors in its home pose, about the torques that this pose takes."""
+
+    def __init__(self, model: mujoco.MjModel, art: URLabArticulation) -> None:
+        import mujoco
+
+        pairs = torque_motors(art)
+        motors, joints = [actuator.id for actuator, _ in pairs], [joint.id for _, joint in pairs]
+        self.ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
+        self._qpos = [joint.qpos_local_offset for _, joint in pairs]
+        self._qvel = [joint.qvel_local_offset for _, joint in pairs]
+        qpos, qvel = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        self._home = home_of(model, art)[qpos]
+        self._strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
+        self._inertia = model.dof_M0[qvel]
+        limited = model.actuator_ctrllimited[motors].astype(bool)
+        self._low, self._high = np.where(limited, model.actuator_ctrlrange[motors].T, ((-np.inf,), (np.inf,)))
+        self._ctrl = np.zeros(len(pairs))  # that carry the robot, found by a stiff law that is never late
+        data = mujoco.MjData(model)
+        data.qpos[qpos] = self._home
+        for _ in range(int(_SETTLES_S / model.opt.timestep)):
+            data.ctrl[motors] = self._law(data.qpos[qpos], data.qvel[qvel], *_STIFF)
+            mujoco.mj_step(model, data)
+        self._ctrl = data.ctrl[motors].copy()
+
+    def set_points(self, art: URLabArticulation) -> Floats:
+        """Return the set-points of its motors for the newest state."""
+        return self._law(art.qpos_array[self._qpos], art.qvel_array[self._qvel], *_SOFT)
+
+    def _law(self, qpos: Floats, qvel: Floats, frequency: float, damping: float) -> Floats:
+        torque = self._inertia * (frequency**2 * (self._home - qpos) - 2 * damping * frequency * qvel)
+        return np.clip(self._ctrl + torque / self._strength, self._low, self._high)
+
+
 class Controls:
     """The controls of one console, and settings that the server does not report.
 
@@ -75,6 +119,7 @@ class Controls:
         speed: Pacing of live mode, percent, if a viewer has set it.
         source: The control source, if a viewer has chosen it.
         twists: Commanded velocities by articulation: x, y, yaw.
+        holding: The robots that hold their home pose, until set-points come for them.
     """
 
     def __init__(
@@ -89,6 +134,7 @@ class Controls:
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
+        self.holding: dict[str, PoseHold] = {}
         self._client = client
         self._lease = lease
         self._view = view
@@ -98,11 +144,13 @@ class Controls:
         self._seeded: set[str] = set()
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
+        self._held = asyncio.Event()
 
     def begin_anew(self) -> None:
         """Discard the state of the previous play session."""
         self._seeded.clear()
         self.twists.clear()
+        self.holding.clear()
 
     def commands(self, key: str) -> bool:
         """Return whether a viewer has commanded this articulation since play began."""
@@ -152,10 +200,50 @@ class Controls:
                 art.actuators[name]  # raises
         self._lease.use(viewer)
         for key, (art, given) in found.items():
+            self.holding.pop(key, None)
             self._seed(key, art)
             art.set_ctrl(given)
-            self._pending.add(key)
+            self._send(key)
+
+    def _send(self, key: str) -> None:
+        self._pending.add(key)
         self._commanded.set()
+
+    async def hold(self, key: str, holding: bool) -> None:
+        """Make a robot with torque motors hold its home pose, or let it go."""
+        art, model = self._client.articulations[key], self._client.model
+        if not holding:
+            if self.holding.pop(key, None):
+                art.ctrl_array[:] = 0.0
+                self._send(key)
+        elif model is None or not torque_motors(art):
+            raise ValueError(f"{key} cannot hold a pose: that needs torque motors on its joints, and a local model")
+        else:
+            hold = await anyio.to_thread.run_sync(PoseHold, model, art)
+            if self._client.model is model:
+                self._seed(key, art)
+                self.holding[key] = hold
+                self._held.set()
+        self._view.notify()
+
+    async def keep_holding(self) -> None:
+        """Renew the set-points of robots that hold their pose, in live mode with each state."""
+        while True:
+            if not self.holding:
+                self._held.clear()
+                await self._held.wait()
+            async with self._client.state_stream("latest", timeout=None) as states:
+                while self.holding:
+                    await states.receive(timeout=None)
+                    if self._client.step_mode is StepMode.LIVE:
+                        for key in self._renew():
+                            self._send(key)
+
+    def _renew(self) -> list[str]:
+        for key, hold in self.holding.items():
+            art = self._client.articulations[key]
+            art.ctrl_array[hold.ctrl] = hold.set_points(art)
+        return list(self.holding)
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -201,10 +289,18 @@ class Controls:
     async def _step(self, n_steps: int) -> SteppedTo:
         for key, art in self._client.articulations.items():
             self._seed(key, art)
-        self._before_step()
-        watched = dict.fromkeys(self._cameras.watched(), "latest")
-        reply = await self._client.step(n_steps, include_cameras=watched or False)
-        return SteppedTo(reply.time, reply.step)
+        while True:
+            self._before_step()
+            taken = min(n_steps, self._per_period) if self._renew() else n_steps
+            watched = dict.fromkeys(self._cameras.watched(), "latest")
+            reply = await self._client.step(taken, include_cameras=watched or False)
+            n_steps -= taken
+            if not n_steps:
+                return SteppedTo(reply.time, reply.step)
+
+    @property
+    def _per_period(self) -> int:
+        return max(1, round(_PERIOD_S / (self._view.world.timestep or _PERIOD_S)))
 
     async def run(self, viewer: Viewer, running: bool) -> None:
         """Run or stop physics in any mode; any viewer may stop it."""
@@ -230,7 +326,7 @@ class Controls:
             began = time.monotonic()
             stepped = False
             try:
-                await self._step(max(1, round(_PERIOD_S / (self._view.world.timestep or _PERIOD_S))))
+                await self._step(self._per_period)
                 stepped = True
             except (URLabError, ValueError, KeyError) as error:  # the program that mounts the console may write a NaN
                 self._view.note("error", "console", "step", str(error))

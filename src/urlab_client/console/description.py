@@ -12,7 +12,7 @@ from urlab_client.console.mujoco_viewer import no_view
 if TYPE_CHECKING:
     import mujoco
 
-    from urlab_client.aio import Actuator, URLabArticulation, URLabCameraView, URLabClient
+    from urlab_client.aio import Actuator, Joint, URLabArticulation, URLabCameraView, URLabClient
 
 
 class ActuatorView(Struct):
@@ -71,7 +71,7 @@ class ControllerView(Struct):
 
 
 class ArticulationView(Struct):
-    """One articulation."""
+    """One articulation. `can_hold`: its torque motors can hold a pose."""
 
     key: str
     actor_id: str
@@ -80,6 +80,7 @@ class ArticulationView(Struct):
     sensors: list[SensorView]
     cameras: list[CameraDescription]
     controller: ControllerView | None
+    can_hold: bool
 
 
 class WorldDescription(Struct):
@@ -129,7 +130,17 @@ def _articulation(client: URLabClient, art: URLabArticulation) -> ArticulationVi
         controller=None
         if controller is None
         else ControllerView(str(controller.kind), dict(controller.params), dict(controller.schema)),
+        can_hold=client.model is not None and not client.config.read_only and bool(torque_motors(art)),
     )
+
+
+def torque_motors(art: URLabArticulation) -> list[tuple[Actuator, Joint]]:
+    """Return the actuators of which a set-point is a force on one joint, with that joint."""
+    return [
+        (actuator, art.joints[actuator.joint])
+        for actuator in art.actuators.values()
+        if actuator.joint is not None and actuator.describe().takes == "force"
+    ]
 
 
 def _camera(view: URLabCameraView, path: str) -> CameraDescription:
@@ -145,14 +156,15 @@ def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -
         limits = joint.limits
     home, model = 0.0, client.model
     if model is not None and said.takes == "position" and joint is not None:
-        home = float(_home(model)[int(model.jnt_qposadr[joint.id])])
+        home = float(home_of(model, art)[int(model.jnt_qposadr[joint.id])])
     place = actuator.ctrl_local.start
     return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
 
 
-def _home(model: mujoco.MjModel) -> Any:
-    """Return the positions of the keyframe `home`, under whatever prefix it was compiled, or where the model starts."""
-    for key in range(model.nkey):
-        if re.search(r"(^|[_/])home$", model.key(key).name):
-            return model.key_qpos[key]
+def home_of(model: mujoco.MjModel, art: URLabArticulation) -> Any:
+    """Return all positions of the robot's keyframe `home`, or where the model starts."""
+    for name in (rf"{re.escape(art.compiled_prefix)}[_/]?home", r"(.*[_/])?home"):
+        for key in range(model.nkey):
+            if re.fullmatch(name, model.key(key).name):
+                return model.key_qpos[key]
     return model.qpos0

@@ -44,6 +44,13 @@ class StepRequest(Struct):
 _ONE_STEP = StepRequest()
 
 
+class HoldRequest(Struct):
+    """A robot, and whether it is to hold its home pose."""
+
+    articulation: str
+    holding: bool = True
+
+
 class LoginRequest(Struct):
     """A token, which is good for one use."""
 
@@ -206,6 +213,13 @@ async def run(call: Call, body: RunRequest) -> None:
 async def step_many(call: Call, body: StepRequest = _ONE_STEP) -> SteppedTo:
     """Step in direct mode: `{n_steps: int}`. Requires the controls."""
     return await call.console.controls.step(call.viewer, body.n_steps)
+
+
+@endpoint("POST", "/api/hold", drives=True)
+async def hold(call: Call, body: HoldRequest) -> None:
+    """Hold the home pose with torque motors until set-points come, or let go: `{articulation: str, holding: bool}`."""
+    await call.console.controls.hold(body.articulation, body.holding)
+    call.note("hold pose" if body.holding else "let go", body.articulation)
 
 
 # Bodies
