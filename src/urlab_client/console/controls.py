@@ -170,8 +170,8 @@ class Controls:
             self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
             raise
         if op.effect is not Effect.READ:
-            arguments = encode(structs.asdict(request)).decode()
-            self._view.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
+            given = {name: value for name, value in structs.asdict(request).items() if name != "session_id"}
+            self._view.note("call", viewer.name, op.name, encode(given).decode(), 1e3 * (time.perf_counter() - began))
         self._follow(request, reply)
         return reply
 
