@@ -99,8 +99,12 @@ def _print_links(new_link: Callable[[], str]) -> None:
     if hasattr(signal, "SIGTTIN"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})  # in the background, reading fails instead
     with contextlib.suppress(OSError):
-        for _ in sys.stdin:
+        while os.read(sys.stdin.fileno(), 1024):  # not a method of stdin, whose lock would hinder the program's end
             print(f"{new_link()} (good for one browser)", flush=True)
+
+
+def _note_failure(error: BaseException) -> None:
+    logging.getLogger("urlab_client.web").warning("Enter prints no more links: %s", error)
 
 
 async def _serve(arguments: Namespace) -> None:
@@ -126,7 +130,7 @@ async def _serve(arguments: Namespace) -> None:
                 if arguments.open:
                     webbrowser.open(link)
                 if more:
-                    daemon("urlab-console-links", lambda: _print_links(new_link))
+                    daemon("urlab-console-links", _print_links, new_link, failed=_note_failure).start()
 
             site = app(
                 client,

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
-import anyio.to_thread
 import msgspec
 import numpy as np
 from msgspec import Struct, structs
@@ -54,10 +53,8 @@ SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is n
 """The ops that viewers may perform, by name; the console itself holds the session."""
 
 _PERIOD_S = 1 / 60
-_STIFF = 60.0, 0.7
-_SOFT = 30.0, 0.5  # holds with states that are 50 ms old, as on a busy machine
+_FREQUENCY, _DAMPING = 40.0, 0.4
 """Frequency in rad/s and damping ratio of a joint that holds its pose."""
-_SETTLES_S = 1.0
 
 
 def parse(op: Op, body: bytes) -> Request[Any]:
@@ -78,37 +75,26 @@ class SteppedTo(Struct):
 
 
 class PoseHold:
-    """A PD law that holds a robot with torque motors in its home pose, about the torques that this pose takes."""
+    """A PD law that holds a robot with torque motors in its home pose, with gains for one new torque per period."""
 
     def __init__(self, model: mujoco.MjModel, art: URLabArticulation) -> None:
-        import mujoco
-
         pairs = torque_motors(art)
         motors, joints = [actuator.id for actuator, _ in pairs], [joint.id for _, joint in pairs]
-        self.ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
+        self._ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
         self._qpos = [joint.qpos_local_offset for _, joint in pairs]
         self._qvel = [joint.qvel_local_offset for _, joint in pairs]
-        qpos, qvel = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-        self._home = home_of(model, art)[qpos]
-        self._strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
-        self._inertia = model.dof_M0[qvel]
+        self._home = home_of(model, art)[model.jnt_qposadr[joints]]
+        # Control per acceleration of the joint.
+        strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
+        self._gain = model.dof_M0[model.jnt_dofadr[joints]] / strength
         limited = model.actuator_ctrllimited[motors].astype(bool)
         self._low, self._high = np.where(limited, model.actuator_ctrlrange[motors].T, ((-np.inf,), (np.inf,)))
-        self._ctrl = np.zeros(len(pairs))  # that carry the robot, found by a stiff law that is never late
-        data = mujoco.MjData(model)
-        data.qpos[qpos] = self._home
-        for _ in range(int(_SETTLES_S / model.opt.timestep)):
-            data.ctrl[motors] = self._law(data.qpos[qpos], data.qvel[qvel], *_STIFF)
-            mujoco.mj_step(model, data)
-        self._ctrl = data.ctrl[motors].copy()
 
-    def set_points(self, art: URLabArticulation) -> Floats:
-        """Return the set-points of its motors for the newest state."""
-        return self._law(art.qpos_array[self._qpos], art.qvel_array[self._qvel], *_SOFT)
-
-    def _law(self, qpos: Floats, qvel: Floats, frequency: float, damping: float) -> Floats:
-        torque = self._inertia * (frequency**2 * (self._home - qpos) - 2 * damping * frequency * qvel)
-        return np.clip(self._ctrl + torque / self._strength, self._low, self._high)
+    def renew(self, art: URLabArticulation) -> None:
+        """Write the set-points for the newest state."""
+        error = self._home - art.qpos_array[self._qpos]
+        wanted = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * art.qvel_array[self._qvel]
+        art.ctrl_array[self._ctrl] = np.clip(self._gain * wanted, self._low, self._high)
 
 
 class Controls:
@@ -144,7 +130,6 @@ class Controls:
         self._seeded: set[str] = set()
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
-        self._held = asyncio.Event()
 
     def begin_anew(self) -> None:
         """Discard the state of the previous play session."""
@@ -184,6 +169,8 @@ class Controls:
                 self.source = reply.source
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
+            case SetMode() if reply.current_mode != StepMode.DIRECT:
+                self.holding.clear()
             case ConfigureController():
                 self._view.describe_world()
             case _:
@@ -203,47 +190,24 @@ class Controls:
             self.holding.pop(key, None)
             self._seed(key, art)
             art.set_ctrl(given)
-            self._send(key)
-
-    def _send(self, key: str) -> None:
-        self._pending.add(key)
+            self._pending.add(key)
         self._commanded.set()
 
-    async def hold(self, key: str, holding: bool) -> None:
-        """Make a robot with torque motors hold its home pose, or let it go."""
+    async def hold(self, viewer: Viewer, key: str, holding: bool) -> None:
+        """Make a robot with torque motors hold its home pose, or let it go.
+
+        A law that balances a robot must not be late, so this needs direct mode, and chooses it.
+        """
         art, model = self._client.articulations[key], self._client.model
         if not holding:
             if self.holding.pop(key, None):
                 art.ctrl_array[:] = 0.0
-                self._send(key)
         elif model is None or not torque_motors(art):
             raise ValueError(f"{key} cannot hold a pose: that needs torque motors on its joints, and a local model")
         else:
-            hold = await anyio.to_thread.run_sync(PoseHold, model, art)
-            if self._client.model is model:
-                self._seed(key, art)
-                self.holding[key] = hold
-                self._held.set()
-        self._view.notify()
-
-    async def keep_holding(self) -> None:
-        """Renew the set-points of robots that hold their pose, in live mode with each state."""
-        while True:
-            if not self.holding:
-                self._held.clear()
-                await self._held.wait()
-            async with self._client.state_stream("latest", timeout=None) as states:
-                while self.holding:
-                    await states.receive(timeout=None)
-                    if self._client.step_mode is StepMode.LIVE:
-                        for key in self._renew():
-                            self._send(key)
-
-    def _renew(self) -> list[str]:
-        for key, hold in self.holding.items():
-            art = self._client.articulations[key]
-            art.ctrl_array[hold.ctrl] = hold.set_points(art)
-        return list(self.holding)
+            if self._client.step_mode is not StepMode.DIRECT:
+                await self.do(viewer, SetMode(mode=StepMode.DIRECT))
+            self.holding[key] = PoseHold(model, art)
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -291,7 +255,9 @@ class Controls:
             self._seed(key, art)
         while True:
             self._before_step()
-            taken = min(n_steps, self._per_period) if self._renew() else n_steps
+            for key, hold in self.holding.items():
+                hold.renew(self._client.articulations[key])
+            taken = min(n_steps, self._per_period) if self.holding else n_steps
             watched = dict.fromkeys(self._cameras.watched(), "latest")
             reply = await self._client.step(taken, include_cameras=watched or False)
             n_steps -= taken

@@ -111,7 +111,6 @@ class ConsoleSession:
             self._pulse,
             self.controls.send_set_points,
             self.controls.keep_stepping,
-            self.controls.keep_holding,
             self.hands.keep_driving,
             self.replay.keep_playing,
         )

@@ -35,8 +35,8 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="view
 <title>URLab console</title><body><h1>{title}</h1><p>{text}</p></body></html>"""
 
 _ADVICE = (
-    "Open the link that `urlab console` printed; it works for one browser. For another link, press Enter in that "
-    "terminal, or Invite on a page that is open."
+    "Open the link that `urlab console` printed; it works for one browser. Enter in that terminal prints another link, "
+    "and Invite on an open page makes one."
 )
 
 _Refusal: TypeAlias = tuple[int, str, str]

@@ -217,8 +217,8 @@ async def step_many(call: Call, body: StepRequest = _ONE_STEP) -> SteppedTo:
 
 @endpoint("POST", "/api/hold", drives=True)
 async def hold(call: Call, body: HoldRequest) -> None:
-    """Hold the home pose with torque motors until set-points come, or let go: `{articulation: str, holding: bool}`."""
-    await call.console.controls.hold(body.articulation, body.holding)
+    """Hold the home pose with torque motors until set-points come, or let go. Holding chooses direct mode."""
+    await call.console.controls.hold(call.viewer, body.articulation, body.holding)
     call.note("hold pose" if body.holding else "let go", body.articulation)
 
 

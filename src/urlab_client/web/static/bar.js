@@ -115,7 +115,7 @@ export function makeBar() {
       h("span", { class: "space" }),
       ui.driver,
       h("span", { class: "acts" }, ui.drive,
-        h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
+        h("button", { id: "invite", class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
     h("div", { class: "row controls acts" }, ui.play, ui.stop, ui.sheet, ui.more));
   const place = () => (PHONE.matches ? $("sheet").prepend(ui.more) : document.querySelector(".controls").append(ui.more));

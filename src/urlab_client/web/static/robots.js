@@ -17,7 +17,7 @@ class Robot {
     const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
     this.said = h("span", {});
-    this.hold = h("button", { "aria-pressed": "false", title: "Drive the joints to the home pose, and keep them there",
+    this.hold = h("button", { "aria-pressed": "false", title: "Keep the joints at the home pose; this needs mode direct, and chooses it",
       onclick: () => hold(art.key, this.hold.getAttribute("aria-pressed") !== "true") }, "Hold pose");
     // Once shown, it keeps its place: what is below must not move from under a finger.
     this.still = h("div", { class: "line still", hidden: !art.can_hold }, this.said, h("span", { class: "space" }), art.can_hold ? this.hold : null);
