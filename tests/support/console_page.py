@@ -116,8 +116,8 @@ class Page:
             ".flatMap(one => one.violations ?? [])"
         )
         # A refused request is also an error to the browser; the page tells its user of those.
-        said = [one["message"] for one in self.driver.get_log("browser") if one["source"] != "network"]
-        return [*found, *said]
+        log = self.driver.get_log("browser")
+        return [*found, *(one["message"] for one in log if one["level"] == "SEVERE" and one["source"] != "network")]
 
     def invitation(self) -> str:
         """Return a link for one more browser."""

@@ -109,19 +109,19 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
         return float(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"][2])
 
     assert http.get("/api/world").json()["articulations"][0]["can_hold"]
-    assert http.post("/api/hold", json={"articulation": "quadruped"}).status_code == 200
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
     assert http.get("/api/status").json()["holding"] == ["quadruped"]
     assert height() > 0.28
     assert height() > 0.28, "also in steps that are longer than a law with one torque would stand"
     assert http.post("/api/ctrl", json={"quadruped": {"FL_thigh": 1.0}}).status_code == 200
     assert http.get("/api/status").json()["holding"] == []
     http.post("/api/ops/reset", json={})
-    assert http.post("/api/hold", json={"articulation": "quadruped"}).status_code == 200
-    assert http.post("/api/hold", json={"articulation": "quadruped", "holding": False}).status_code == 200
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+    assert http.post("/api/hold", json={"quadruped": False}).status_code == 200
     assert height() < 0.2
     said = [entry["what"] for entry in http.get("/api/log").json() if entry["kind"] == "call"]
     assert said[-2:] == ["hold pose", "let go"]
-    assert "'quadruped'" in refusal(http.post("/api/hold", json={"articulation": "nobody"}))
+    assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
 
 
 def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:

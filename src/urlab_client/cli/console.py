@@ -1,8 +1,8 @@
 """`urlab console`: a page in the browser that shows a simulation and lets people interact with it.
 
 Serve a page that shows a simulation and lets you interact with it, only on this machine, and print a link that admits
-one browser. Enter in the terminal prints another link, and the page can create more; a key in URLAB_CONSOLE_KEY admits programs, such as Prometheus. Exits with
-code 0 on SIGINT (Ctrl-C) and SIGTERM.
+one browser. Enter in the terminal prints another link, and the page can create more; a key in URLAB_CONSOLE_KEY admits
+programs, such as Prometheus. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
 """
 
 from __future__ import annotations
@@ -103,10 +103,6 @@ def _print_links(new_link: Callable[[], str]) -> None:
             print(f"{new_link()} (good for one browser)", flush=True)
 
 
-def _note_failure(error: BaseException) -> None:
-    logging.getLogger("urlab_client.web").warning("Enter prints no more links: %s", error)
-
-
 async def _serve(arguments: Namespace) -> None:
     from prometheus_client import REGISTRY
 
@@ -126,11 +122,14 @@ async def _serve(arguments: Namespace) -> None:
 
             def started() -> None:
                 link, more = new_link(), " Enter prints another link," if sys.stdin.isatty() else ""
-                print(f"{arguments.address} is shown at {link} (good for one browser);{more} Ctrl-C ends it.", flush=True)
+                print(
+                    f"{arguments.address} is shown at {link} (good for one browser);{more} Ctrl-C ends it.", flush=True
+                )
                 if arguments.open:
                     webbrowser.open(link)
                 if more:
-                    daemon("urlab-console-links", _print_links, new_link, failed=_note_failure).start()
+                    failed = logging.getLogger("urlab_client.web").exception
+                    daemon("urlab-console-links", _print_links, new_link, failed=failed).start()
 
             site = app(
                 client,

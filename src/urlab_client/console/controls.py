@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 import msgspec
-import numpy as np
 from msgspec import Struct, structs
 
 from urlab_client.console.description import home_of, torque_motors
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.aio import URLabArticulation, URLabClient
-    from urlab_client.protocol.base import Floats
 
 SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is not Hello}
 """The ops that viewers may perform, by name; the console itself holds the session."""
@@ -74,29 +72,6 @@ class SteppedTo(Struct):
     step: int
 
 
-class PoseHold:
-    """A PD law that holds a robot with torque motors in its home pose, with gains for one new torque per period."""
-
-    def __init__(self, model: mujoco.MjModel, art: URLabArticulation) -> None:
-        pairs = torque_motors(art)
-        motors, joints = [actuator.id for actuator, _ in pairs], [joint.id for _, joint in pairs]
-        self._ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
-        self._qpos = [joint.qpos_local_offset for _, joint in pairs]
-        self._qvel = [joint.qvel_local_offset for _, joint in pairs]
-        self._home = home_of(model, art)[model.jnt_qposadr[joints]]
-        # Control per acceleration of the joint.
-        strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
-        self._gain = model.dof_M0[model.jnt_dofadr[joints]] / strength
-        limited = model.actuator_ctrllimited[motors].astype(bool)
-        self._low, self._high = np.where(limited, model.actuator_ctrlrange[motors].T, ((-np.inf,), (np.inf,)))
-
-    def renew(self, art: URLabArticulation) -> None:
-        """Write the set-points for the newest state."""
-        error = self._home - art.qpos_array[self._qpos]
-        wanted = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * art.qvel_array[self._qvel]
-        art.ctrl_array[self._ctrl] = np.clip(self._gain * wanted, self._low, self._high)
-
-
 class Controls:
     """The controls of one console, and settings that the server does not report.
 
@@ -120,7 +95,7 @@ class Controls:
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
-        self.holding: dict[str, PoseHold] = {}
+        self.holding: dict[str, Callable[[], None]] = {}
         self._client = client
         self._lease = lease
         self._view = view
@@ -207,7 +182,7 @@ class Controls:
         else:
             if self._client.step_mode is not StepMode.DIRECT:
                 await self.do(viewer, SetMode(mode=StepMode.DIRECT))
-            self.holding[key] = PoseHold(model, art)
+            self.holding[key] = _pose_hold(model, art)
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -255,8 +230,8 @@ class Controls:
             self._seed(key, art)
         while True:
             self._before_step()
-            for key, hold in self.holding.items():
-                hold.renew(self._client.articulations[key])
+            for renew in self.holding.values():
+                renew()
             taken = min(n_steps, self._per_period) if self.holding else n_steps
             watched = dict.fromkeys(self._cameras.watched(), "latest")
             reply = await self._client.step(taken, include_cameras=watched or False)
@@ -299,6 +274,25 @@ class Controls:
             finally:
                 self.running = self.running and stepped
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
+
+
+def _pose_hold(model: mujoco.MjModel, art: URLabArticulation) -> Callable[[], None]:
+    """Return what writes set-points by which torque motors hold the home pose, if it is called in each period."""
+    pairs = torque_motors(art)
+    motors, joints = [actuator.id for actuator, _ in pairs], [joint.id for _, joint in pairs]
+    ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
+    qpos = [joint.qpos_local_offset for _, joint in pairs]
+    qvel = [joint.qvel_local_offset for _, joint in pairs]
+    home = home_of(model, art)[model.jnt_qposadr[joints]]
+    strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
+    inertia = model.dof_M0[model.jnt_dofadr[joints]]
+
+    def renew() -> None:
+        error, velocity = home - art.qpos_array[qpos], art.qvel_array[qvel]
+        acceleration = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * velocity
+        art.ctrl_array[ctrl] = inertia * acceleration / strength  # physics clamps it
+
+    return renew
 
 
 async def _perform(client: URLabClient, request: Request[Any]) -> object:

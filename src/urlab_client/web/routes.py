@@ -44,13 +44,6 @@ class StepRequest(Struct):
 _ONE_STEP = StepRequest()
 
 
-class HoldRequest(Struct):
-    """A robot, and whether it is to hold its home pose."""
-
-    articulation: str
-    holding: bool = True
-
-
 class LoginRequest(Struct):
     """A token, which is good for one use."""
 
@@ -216,10 +209,11 @@ async def step_many(call: Call, body: StepRequest = _ONE_STEP) -> SteppedTo:
 
 
 @endpoint("POST", "/api/hold", drives=True)
-async def hold(call: Call, body: HoldRequest) -> None:
-    """Hold the home pose with torque motors until set-points come, or let go. Holding chooses direct mode."""
-    await call.console.controls.hold(call.viewer, body.articulation, body.holding)
-    call.note("hold pose" if body.holding else "let go", body.articulation)
+async def hold(call: Call, body: dict[str, bool]) -> None:
+    """Hold the home pose with torque motors, in direct mode, until set-points come: `{articulation: holding}`."""
+    for key, holding in body.items():
+        await call.console.controls.hold(call.viewer, key, holding)
+        call.note("hold pose" if holding else "let go", key)
 
 
 # Bodies

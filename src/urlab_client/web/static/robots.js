@@ -129,7 +129,7 @@ class Robot {
   }
 }
 
-const hold = (articulation, holding) => ask("POST", "api/hold", { articulation, holding });
+const hold = (articulation, holding) => ask("POST", "api/hold", { [articulation]: holding });
 
 /** Before physics runs: make those robots hold their pose that would collapse. */
 export const steady = () => Promise.all(robots.filter((robot) => limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key))
