@@ -175,7 +175,7 @@ window.viewed = 0;
 view.requestAnimationFrame = (callback) => draw((now) => { window.viewed += 1; callback(now); });
 """
 LOADED = """return [window, document.querySelector('#view iframe').contentWindow]
-  .flatMap((one) => [...one.performance.getEntriesByType('navigation'), ...one.performance.getEntriesByType('resource')])
+  .flatMap(({performance: one}) => [...one.getEntriesByType('navigation'), ...one.getEntriesByType('resource')])
   .reduce(([sent, whole], one) => [sent + one.transferSize, whole + one.decodedBodySize], [0, 0])"""
 
 

@@ -189,7 +189,7 @@ def test_the_first_play_leaves_a_robot_with_torque_motors_standing(still: Page) 
     still.until("document.querySelector('[data-robot=quadruped] .still')?.textContent.includes('Play makes it hold')")
     before = still.look(TOP)
     still.click("#play")
-    still.asked("api/state", lambda state: state["time"] > 2)
+    still.asked("api/state", lambda state: state["time"] > 0.7)
     assert height(still.ask("api/state")) > 0.25
     hold = "document.querySelector('[data-robot=quadruped] .still button').getAttribute('aria-pressed')"
     still.until(f"{hold} === 'true'")

@@ -105,6 +105,7 @@ class Controls:
         self._seeded: set[str] = set()
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
+        self._pictures_due = 0.0
 
     def begin_anew(self) -> None:
         """Discard the state of the previous play session."""
@@ -223,6 +224,7 @@ class Controls:
         if self._client.step_mode is not StepMode.DIRECT:
             raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
+        self._pictures_due = 0.0
         return await self._step(n_steps)
 
     async def _step(self, n_steps: int) -> SteppedTo:
@@ -233,8 +235,11 @@ class Controls:
             for renew in self.holding.values():
                 renew()
             taken = min(n_steps, self._per_period) if self.holding else n_steps
-            watched = dict.fromkeys(self._cameras.watched(), "latest")
+            began = time.monotonic()
+            watched = dict.fromkeys(self._cameras.watched(), "latest") if began >= self._pictures_due else {}
             reply = await self._client.step(taken, include_cameras=watched or False)
+            if watched:  # they take half of the time at most: drawing may be slower than physics
+                self._pictures_due = 2 * time.monotonic() - began
             n_steps -= taken
             if not n_steps:
                 return SteppedTo(reply.time, reply.step)
