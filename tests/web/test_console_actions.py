@@ -15,6 +15,7 @@ from starlette.routing import Mount
 from starlette.testclient import TestClient
 
 from urlab_client.aio import URLabClient
+from urlab_client.console.description import describe
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -122,6 +123,17 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
     said = [entry["what"] for entry in http.get("/api/log").json() if entry["kind"] == "call"]
     assert said[-2:] == ["hold pose", "let go"]
     assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
+
+
+async def test_each_of_several_robots_has_its_own_home(tmp_path: Path) -> None:
+    async with (
+        SimulatedServer("quadruped", "arm", play=True) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        await client.discover()
+        robots = {art.key: art for art in describe(client, 1).articulations}
+    assert {one.name: one.home for one in robots["arm"].actuators}["gripper"] == pytest.approx(0.04)
+    assert [robots[key].can_hold for key in ("arm", "quadruped")] == [False, True]
 
 
 def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:
