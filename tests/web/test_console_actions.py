@@ -16,6 +16,8 @@ from starlette.testclient import TestClient
 
 from urlab_client.aio import URLabClient
 from urlab_client.console.description import describe
+from urlab_client.console.lease import Viewer
+from urlab_client.console.session import ConsoleSession
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -109,7 +111,6 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
         assert http.post("/api/step", json={"n_steps": 1000}).status_code == 200
         return float(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"][2])
 
-    assert http.get("/api/world").json()["articulations"][0]["can_hold"]
     assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
     assert http.get("/api/status").json()["holding"] == ["quadruped"]
     assert height() > 0.28
@@ -133,7 +134,13 @@ async def test_each_of_several_robots_has_its_own_home(tmp_path: Path) -> None:
         await client.discover()
         robots = {art.key: art for art in describe(client, 1).articulations}
     assert {one.name: one.home for one in robots["arm"].actuators}["gripper"] == pytest.approx(0.04)
-    assert [robots[key].can_hold for key in ("arm", "quadruped")] == [False, True]
+
+
+async def test_a_robot_without_torque_motors_says_why_it_holds_no_pose(tmp_path: Path) -> None:
+    async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
+        await client.discover()
+        with pytest.raises(ValueError, match="arm cannot hold a pose: that needs torque motors"):
+            await ConsoleSession(client, recordings=tmp_path).controls.hold(Viewer("key", "me"), "arm", True)
 
 
 def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:

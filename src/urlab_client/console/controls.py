@@ -11,7 +11,7 @@ import anyio
 import msgspec
 from msgspec import Struct, structs
 
-from urlab_client.console.description import home_of, torque_motors
+from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
 from urlab_client.console.pictures import Cameras
@@ -174,16 +174,14 @@ class Controls:
 
         A law that balances a robot must not be late, so this needs direct mode, and chooses it.
         """
-        art, model = self._client.articulations[key], self._client.model
-        if not holding:
-            if self.holding.pop(key, None):
-                art.ctrl_array[:] = 0.0
-        elif model is None or not torque_motors(art):
-            raise ValueError(f"{key} cannot hold a pose: that needs torque motors on its joints, and a local model")
-        else:
+        art = self._client.articulations[key]
+        if holding:
+            renew = _pose_hold(self._client.model, art)
             if self._client.step_mode is not StepMode.DIRECT:
                 await self.do(viewer, SetMode(mode=StepMode.DIRECT))
-            self.holding[key] = _pose_hold(model, art)
+            self.holding[key] = renew
+        elif self.holding.pop(key, None):
+            art.ctrl_array[:] = 0.0
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -281,16 +279,18 @@ class Controls:
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
 
 
-def _pose_hold(model: mujoco.MjModel, art: URLabArticulation) -> Callable[[], None]:
+def _pose_hold(model: mujoco.MjModel | None, art: URLabArticulation) -> Callable[[], None]:
     """Return what writes set-points by which torque motors hold the home pose, if it is called in each period."""
-    pairs = torque_motors(art)
-    motors, joints = [actuator.id for actuator, _ in pairs], [joint.id for _, joint in pairs]
-    ctrl = [actuator.ctrl_local.start for actuator, _ in pairs]
-    qpos = [joint.qpos_local_offset for _, joint in pairs]
-    qvel = [joint.qvel_local_offset for _, joint in pairs]
-    home = home_of(model, art)[model.jnt_qposadr[joints]]
-    strength = model.actuator_gainprm[motors, 0] * model.actuator_gear[motors, 0]
-    inertia = model.dof_M0[model.jnt_dofadr[joints]]
+    motors = [one for one in art.actuators.values() if one.joint is not None and one.describe().takes == "force"]
+    if model is None or not motors:
+        raise ValueError(f"{art.prefix} cannot hold a pose: that needs torque motors on its joints, and a local model")
+    joints = [art.joints[one.joint or ""] for one in motors]
+    ctrl, qpos = [one.ctrl_local.start for one in motors], [one.qpos_local_offset for one in joints]
+    qvel = [one.qvel_local_offset for one in joints]
+    driving, driven = [one.id for one in motors], [one.id for one in joints]
+    home = home_of(model, art)[model.jnt_qposadr[driven]]
+    strength = model.actuator_gainprm[driving, 0] * model.actuator_gear[driving, 0]
+    inertia = model.dof_M0[model.jnt_dofadr[driven]]
 
     def renew() -> None:
         error, velocity = home - art.qpos_array[qpos], art.qvel_array[qvel]

@@ -12,7 +12,7 @@ from urlab_client.console.mujoco_viewer import no_view
 if TYPE_CHECKING:
     import mujoco
 
-    from urlab_client.aio import Actuator, Joint, URLabArticulation, URLabCameraView, URLabClient
+    from urlab_client.aio import Actuator, URLabArticulation, URLabCameraView, URLabClient
 
 
 class ActuatorView(Struct):
@@ -71,7 +71,7 @@ class ControllerView(Struct):
 
 
 class ArticulationView(Struct):
-    """One articulation. `can_hold`: its torque motors can hold a pose."""
+    """One articulation."""
 
     key: str
     actor_id: str
@@ -80,7 +80,6 @@ class ArticulationView(Struct):
     sensors: list[SensorView]
     cameras: list[CameraDescription]
     controller: ControllerView | None
-    can_hold: bool
 
 
 class WorldDescription(Struct):
@@ -130,17 +129,7 @@ def _articulation(client: URLabClient, art: URLabArticulation) -> ArticulationVi
         controller=None
         if controller is None
         else ControllerView(str(controller.kind), dict(controller.params), dict(controller.schema)),
-        can_hold=client.model is not None and not client.config.read_only and bool(torque_motors(art)),
     )
-
-
-def torque_motors(art: URLabArticulation) -> list[tuple[Actuator, Joint]]:
-    """Return the actuators of which a set-point is a force on one joint, with that joint."""
-    return [
-        (actuator, art.joints[actuator.joint])
-        for actuator in art.actuators.values()
-        if actuator.joint is not None and actuator.describe().takes == "force"
-    ]
 
 
 def _camera(view: URLabCameraView, path: str) -> CameraDescription:

@@ -104,8 +104,11 @@ export function actuatorTable(group, rows) {
     rows.map((row) => row.element));
 }
 
+/** Whether torque motors of a robot can hold its joints in a pose. */
+export const canHold = (art) => art.actuators.some((actuator) => actuator.takes === "force" && actuator.joint);
+
 /** Whether a robot that stands on its own would collapse when physics runs, because nobody has commanded it yet. */
-export const limp = (art, state) => art.can_hold && !state?.targets && art.joints.some((joint) => joint.kind === "free")
+export const limp = (art, state) => canHold(art) && !state?.targets && art.joints.some((joint) => joint.kind === "free")
   && art.actuators.every((actuator) => !state?.ctrl?.[actuator.index]);
 
 /** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */

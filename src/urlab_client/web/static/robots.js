@@ -1,6 +1,6 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, actuatorTable, groups, limp, share, stillness } from "./actuators.js";
+import { ActuatorRow, actuatorTable, canHold, groups, limp, share, stillness } from "./actuators.js";
 import { now } from "./bar.js";
 import { $, h, number, text } from "./dom.js";
 import { ask, on, op } from "./link.js";
@@ -20,7 +20,7 @@ class Robot {
     this.hold = h("button", { "aria-pressed": "false", title: "Keep the joints at the home pose; this needs mode direct, and chooses it",
       onclick: () => hold(art.key, this.hold.getAttribute("aria-pressed") !== "true") }, "Hold pose");
     // Once shown, it keeps its place: what is below must not move from under a finger.
-    this.still = h("div", { class: "line still", hidden: !art.can_hold }, this.said, h("span", { class: "space" }), art.can_hold ? this.hold : null);
+    this.still = h("div", { class: "line still", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
     const why = h("button", { class: "quiet", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
     const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
