@@ -167,6 +167,7 @@ def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[P
         driver.get(link)
         page = Page(driver)
         yield page
-        assert page.troubles() == []
+        troubles = page.troubles()
+        assert troubles == [], troubles
     finally:
         driver.quit()

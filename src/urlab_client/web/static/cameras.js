@@ -72,11 +72,11 @@ class CameraView {
     if (time === this.still?.time || performance.now() - (this.still?.at ?? -Infinity) < STILL_MS) return;
     this.still = { time, at: performance.now() };
     text(this.state, "Taking a picture …");
-    const answer = await fetch(`api/cameras/${this.camera.path}.jpg`).catch(() => null);
-    if (!answer?.ok) this.still.time = null; // try again
-    if (!answer?.ok || !paused() || this.replay) return;
+    const jpeg = await fetch(`api/cameras/${this.camera.path}.jpg`).then((answer) => (answer.ok ? answer.blob() : null)).catch(() => null);
+    if (!jpeg && this.still) this.still.time = null; // try again
+    if (!jpeg || !paused() || this.replay) return;
     this.head = { received: Date.now() + clock.offset, sim_time: time, recorded: false };
-    await this.draw(await answer.blob());
+    await this.draw(jpeg);
   }
 
   enlarge() {

@@ -29,6 +29,7 @@ export function makeView() {
   $("view").append(box);
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
+  hint.hidden = unable !== "";
   if (unable) showInstead(instead);
 
   /** The reason why there is no picture yet, or an empty string. */
@@ -69,7 +70,7 @@ export function makeView() {
     }
     bodies.hear(data);
   });
-  const explain = () => text(hint, unable ? "" : TOUCH.matches ? WITH_FINGERS : WITH_MOUSE);
+  const explain = () => text(hint, TOUCH.matches ? WITH_FINGERS : WITH_MOUSE);
   TOUCH.addEventListener("change", explain);
   explain();
   UPRIGHT.addEventListener("change", () => requestAnimationFrame(bodies.fit)); // a phone was turned
