@@ -1,10 +1,12 @@
 """How well the console keeps up: states and pictures a second as a viewer gets them, their age, what it costs.
 
-    python tools/check_console.py [--seconds 10] [--viewers 1] [--browser]
+    python tools/check_console.py [--seconds 10] [--viewers 1] [--browser | --view]
 
 Three robots that are driven, two cameras watched, all on this machine: a simulated server, the console, and viewers
 that say of each state and picture that they have it. With `--browser` one more viewer is a headless Chromium, which
-draws everything but the 3-D view; its states count when they are drawn. Prints figures only.
+draws everything but the 3-D view; its states count when they are drawn. With `--view` only that browser watches, and
+draws the 3-D view, without a graphics card if there is none: what it loads, how long the first picture takes, and how
+many follow. Prints figures only.
 """
 
 from __future__ import annotations
@@ -27,14 +29,17 @@ from urllib.parse import urlsplit
 from selenium import webdriver
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.support.ui import WebDriverWait
 from websockets.asyncio.client import ClientConnection, connect
 
 ROBOTS = "sim://arm?model=quadruped&model=arm&play&unpaused&camera-size=320x240"
 CAMERAS = ("arm/overview", "quadruped/side")
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-3d-apis", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--window-size=1300,900",
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1300,900",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+FLAT = ("--disable-gpu", "--disable-3d-apis")
+SOLID = ("--enable-unsafe-swiftshader",)
 
 
 @contextmanager
@@ -162,15 +167,28 @@ frame();
 """
 
 
+# The same in the frame of the 3-D view.
+COUNT_VIEW = """
+const view = document.querySelector('#view iframe').contentWindow;
+const draw = view.requestAnimationFrame;
+window.viewed = 0;
+view.requestAnimationFrame = (callback) => draw((now) => { window.viewed += 1; callback(now); });
+"""
+LOADED = """return [window, document.querySelector('#view iframe').contentWindow]
+  .flatMap(({performance: one}) => [...one.getEntriesByType('navigation'), ...one.getEntriesByType('resource')])
+  .reduce(([sent, whole], one) => [sent + one.transferSize, whole + one.decodedBodySize], [0, 0])"""
+
+
 @contextmanager
-def browser(link: str) -> Iterator[webdriver.Chrome]:
+def browser(link: str, *flags: str) -> Iterator[webdriver.Chrome]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         options = Options()
         options.binary_location = os.environ.get("CHROMIUM", "/usr/bin/chromium")
-        for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        for flag in (*FLAGS, *flags, f"--user-data-dir={profile}"):
             options.add_argument(flag)
         driver = webdriver.Chrome(options, Service(os.environ.get("CHROMEDRIVER", "/usr/bin/chromedriver")))
         try:
+            driver.set_script_timeout(240)  # without a graphics card a frame may take long
             driver.get(link)
             driver.execute_script(COUNT)
             yield driver
@@ -182,7 +200,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--viewers", type=int, default=1)
-    parser.add_argument("--browser", action="store_true")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--browser", action="store_true")
+    what.add_argument("--view", action="store_true")
     arguments = parser.parse_args()
     seconds: float = arguments.seconds
     print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f} before")
@@ -190,8 +210,10 @@ def main() -> None:
         key = enter(link)
         base = f"ws://{urlsplit(link).netloc}"
         asyncio.run(ready(base, key))
-        if arguments.browser:
-            with browser(invited(link, key)) as driver:
+        if arguments.view:
+            look(invited(link, key), seconds)
+        elif arguments.browser:
+            with browser(invited(link, key), *FLAT) as driver:
                 measure(process.pid, base, key, arguments.viewers, seconds)
                 driver.execute_script("window.counted = {ages: [], frames: 0}")
                 time.sleep(seconds)
@@ -202,6 +224,21 @@ def main() -> None:
         else:
             measure(process.pid, base, key, arguments.viewers, seconds)
     print(f"load {os.getloadavg()[0]:.1f} after")
+
+
+def look(link: str, seconds: float) -> None:
+    began = time.perf_counter()
+    with browser(link, *SOLID) as driver:
+        shown = "const cover = document.querySelector('#view .cover'); return Boolean(cover && cover.hidden)"
+        WebDriverWait(driver, 240, 0.05).until(lambda _: driver.execute_script(shown))
+        first = time.perf_counter() - began
+        sent, whole = driver.execute_script(LOADED)
+        driver.execute_script(COUNT_VIEW)
+        counting = time.perf_counter()
+        time.sleep(seconds)
+        frames = driver.execute_script("return window.viewed") / (time.perf_counter() - counting)
+    print(f"3-D view: first picture {first:.1f} s after the browser's start, then {frames:.1f} frames/s")
+    print(f"loaded: {sent / 1e6:.1f} MB, {whole / 1e6:.1f} MB when unpacked")
 
 
 def measure(pid: int, base: str, key: str, viewers: int, seconds: float) -> None:

@@ -140,7 +140,7 @@ def take_all(page: Photographer, server: subprocess.Popen[str]) -> None:
     driver.execute_script("document.querySelector('#replay-end').click()")
     page.until("document.querySelector('#replay').hidden")
     server.kill()
-    page.until("document.querySelector('#banner').innerText.includes('not reachable for 4 s')")
+    page.until("document.querySelector('#banner').innerText.includes('for 4 s')")
     page.shoot("console_error")
 
 

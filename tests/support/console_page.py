@@ -29,6 +29,13 @@ PATIENCE_S = 120
 RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
 SLIDER = "[data-robot=arm] [data-actuator=elbow]"
 
+VIOLATIONS = """window.violations = [];
+document.addEventListener("securitypolicyviolation", ({violatedDirective, blockedURI}) =>
+  window.violations.push(`${violatedDirective}: ${blockedURI}`));
+window.addEventListener("error", ({message}) => window.violations.push(message));
+window.addEventListener("unhandledrejection", ({reason}) => window.violations.push(String(reason)));"""
+"""Collects in each page and frame what its security policy refuses, and errors that no code handles."""
+
 PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
 
 
@@ -102,6 +109,16 @@ class Page:
             SLIDER, value,
         )  # fmt: skip
 
+    def troubles(self) -> list[str]:
+        """Return what the policies of the page and its frames refused, and errors in its programs."""
+        found = self.look(
+            "[window, ...[...document.querySelectorAll('iframe')].map(one => one.contentWindow)]"
+            ".flatMap(one => one.violations ?? [])"
+        )
+        # A refused request is also an error to the browser; the page tells its user of those.
+        log = self.driver.get_log("browser")
+        return [*found, *(one["message"] for one in log if one["level"] == "SEVERE" and one["source"] != "network")]
+
     def invitation(self) -> str:
         """Return a link for one more browser."""
         return str(
@@ -146,7 +163,11 @@ def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[P
     driver = webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
     driver.set_script_timeout(PATIENCE_S)
     try:
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": VIOLATIONS})
         driver.get(link)
-        yield Page(driver)
+        page = Page(driver)
+        yield page
+        troubles = page.troubles()
+        assert troubles == [], troubles
     finally:
         driver.quit()

@@ -57,6 +57,10 @@ class Terminal:
         assert self._process.stderr is not None
         return self._process.stdout.readline().rstrip("\n") or self._process.stderr.read()
 
+    def type(self, text: str) -> None:
+        """Type on the keyboard."""
+        os.write(self._keyboard, text.encode())
+
     def press_ctrl_c(self) -> None:
         """Interrupt all processes in the foreground."""
         os.write(self._keyboard, b"\x03")

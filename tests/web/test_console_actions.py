@@ -15,6 +15,9 @@ from starlette.routing import Mount
 from starlette.testclient import TestClient
 
 from urlab_client.aio import URLabClient
+from urlab_client.console.description import describe
+from urlab_client.console.lease import Viewer
+from urlab_client.console.session import ConsoleSession
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -101,6 +104,43 @@ def recording(folder: Path, name: str, robots: dict[str, int]) -> None:
     folder.mkdir(exist_ok=True)
     samples = ({key: Robot([0.0] * size) for key, size in robots.items()} for _ in range(100))
     write_recording(folder / name, ((robot, {}) for robot in samples))
+
+
+def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_it(http: TestClient) -> None:
+    def height() -> float:
+        assert http.post("/api/step", json={"n_steps": 1000}).status_code == 200
+        return float(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"][2])
+
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+    assert http.get("/api/status").json()["holding"] == ["quadruped"]
+    assert height() > 0.28
+    assert height() > 0.28, "also in steps that are longer than a law with one torque would stand"
+    assert http.post("/api/ctrl", json={"quadruped": {"FL_thigh": 1.0}}).status_code == 200
+    assert http.get("/api/status").json()["holding"] == []
+    http.post("/api/ops/reset", json={})
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+    assert http.post("/api/hold", json={"quadruped": False}).status_code == 200
+    assert height() < 0.2
+    said = [entry["what"] for entry in http.get("/api/log").json() if entry["kind"] == "call"]
+    assert said[-2:] == ["hold pose", "let go"]
+    assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
+
+
+async def test_each_of_several_robots_has_its_own_home(tmp_path: Path) -> None:
+    async with (
+        SimulatedServer("quadruped", "arm", play=True) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        await client.discover()
+        robots = {art.key: art for art in describe(client, 1).articulations}
+    assert {one.name: one.home for one in robots["arm"].actuators}["gripper"] == pytest.approx(0.04)
+
+
+async def test_a_robot_without_torque_motors_says_why_it_holds_no_pose(tmp_path: Path) -> None:
+    async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
+        await client.discover()
+        with pytest.raises(ValueError, match="arm cannot hold a pose: that needs torque motors"):
+            await ConsoleSession(client, recordings=tmp_path).controls.hold(Viewer("key", "me"), "arm", True)
 
 
 def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:

@@ -162,6 +162,28 @@ async def test_behind_nginx_with_tls_and_a_path(tmp_path: Path, certificate: Pat
                 pass
 
 
+def test_enter_in_the_terminal_prints_another_link_for_one_browser() -> None:
+    from terminal import Terminal  # needs a pseudoterminal
+
+    program = """
+        import sys
+        os.dup2(os.open("/dev/tty", os.O_RDWR), 0)
+        from urlab_client.cli import main
+        sys.exit(main(["console", "sim://ball", "--port", "0"]))
+    """
+    with Terminal(program) as terminal:
+        first = terminal.line()
+        assert "Enter prints another link" in first
+        terminal.type("\n")
+        second = terminal.line()
+        links = [re.findall(r"http://\S+token=\S+", line) for line in (first, second)]
+        assert len({link for found in links for link in found}) == 2
+        assert httpx2.get(links[1][0]).status_code == 303
+        assert httpx2.get(links[1][0]).status_code == 401
+        terminal.press_ctrl_c()
+        assert terminal.end()[0] == 0
+
+
 def test_service_and_container_run_commands_that_exist() -> None:
     unit = configparser.ConfigParser(interpolation=None)
     unit.optionxform = str  # type: ignore[assignment, method-assign]

@@ -669,8 +669,8 @@ def test_the_viewer_s_files_are_sent_once(http: TestClient) -> None:
     script = http.get("/viewer/web_client.js")
     again = http.get("/viewer/web_client.js", headers={"if-none-match": script.headers["etag"]})
     assert (script.status_code, again.status_code) == (200, 304)
-    for large in ("web_client.wasm", "assets/pbr.filamat"):
-        sent = http.get(f"/viewer/{large}", headers={"accept-encoding": "gzip"})
+    for large in ("viewer/web_client.wasm", "viewer/assets/pbr.filamat", "static/bar.js", "static/style.css"):
+        sent = http.get(f"/{large}", headers={"accept-encoding": "gzip"})
         assert sent.headers["content-encoding"] == "gzip", large
 
 

@@ -1,22 +1,27 @@
 """`urlab console`: a page in the browser that shows a simulation and lets people interact with it.
 
 Serve a page that shows a simulation and lets you interact with it, only on this machine, and print a link that admits
-one browser. The page can create more links; a key in URLAB_CONSOLE_KEY admits programs, such as Prometheus. Exits with
-code 0 on SIGINT (Ctrl-C) and SIGTERM.
+one browser. Enter in the terminal prints another link, and the page can create more; a key in URLAB_CONSOLE_KEY admits
+programs, such as Prometheus. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import os
+import signal
+import sys
 import webbrowser
 from argparse import Namespace
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 from urlab_client import aio
 from urlab_client._installation import install_command
+from urlab_client._platform.threads import daemon
 from urlab_client.cli._arguments import (
     PAGE,
     WATCHER,
@@ -89,6 +94,15 @@ class _JsonLines(logging.Formatter):
         return json.dumps(line)
 
 
+def _print_links(new_link: Callable[[], str]) -> None:
+    """Print a link for each line that somebody enters in the terminal."""
+    if hasattr(signal, "SIGTTIN"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})  # in the background, reading fails instead
+    with contextlib.suppress(OSError):
+        while os.read(sys.stdin.fileno(), 1024):  # not a method of stdin, whose lock would hinder the program's end
+            print(f"{new_link()} (good for one browser)", flush=True)
+
+
 async def _serve(arguments: Namespace) -> None:
     from prometheus_client import REGISTRY
 
@@ -104,12 +118,20 @@ async def _serve(arguments: Namespace) -> None:
     async with client:
         with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
             url = page_url(arguments, listener.getsockname()[1])
-            link = f"{url}/?token={access.invite()}"
+
+            def new_link() -> str:
+                return f"{url}/?token={access.invite()}"
 
             def started() -> None:
-                print(f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.", flush=True)
+                link, more = new_link(), " Enter prints another link," if sys.stdin.isatty() else ""
+                print(
+                    f"{arguments.address} is shown at {link} (good for one browser);{more} Ctrl-C ends it.", flush=True
+                )
                 if arguments.open:
                     webbrowser.open(link)
+                if more:
+                    failed = logging.getLogger("urlab_client.web").exception
+                    daemon("urlab-console-links", _print_links, new_link, failed=failed).start()
 
             site = app(
                 client,

@@ -11,6 +11,7 @@ import anyio
 import msgspec
 from msgspec import Struct, structs
 
+from urlab_client.console.description import home_of
 from urlab_client.console.lease import DrivingLease, Viewer
 from urlab_client.console.messages import encode
 from urlab_client.console.pictures import Cameras
@@ -42,12 +43,16 @@ from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, St
 from urlab_client.protocol.registry import OPS
 
 if TYPE_CHECKING:
+    import mujoco
+
     from urlab_client.aio import URLabArticulation, URLabClient
 
 SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is not Hello}
 """The ops that viewers may perform, by name; the console itself holds the session."""
 
 _PERIOD_S = 1 / 60
+_FREQUENCY, _DAMPING = 40.0, 0.4
+"""Frequency in rad/s and damping ratio of a joint that holds its pose."""
 
 
 def parse(op: Op, body: bytes) -> Request[Any]:
@@ -75,6 +80,7 @@ class Controls:
         speed: Pacing of live mode, percent, if a viewer has set it.
         source: The control source, if a viewer has chosen it.
         twists: Commanded velocities by articulation: x, y, yaw.
+        holding: The robots that hold their home pose, until set-points come for them.
     """
 
     def __init__(
@@ -89,6 +95,7 @@ class Controls:
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
+        self.holding: dict[str, Callable[[], None]] = {}
         self._client = client
         self._lease = lease
         self._view = view
@@ -98,11 +105,13 @@ class Controls:
         self._seeded: set[str] = set()
         self._pending: set[str] = set()
         self._commanded = asyncio.Event()
+        self._pictures_due = 0.0
 
     def begin_anew(self) -> None:
         """Discard the state of the previous play session."""
         self._seeded.clear()
         self.twists.clear()
+        self.holding.clear()
 
     def commands(self, key: str) -> bool:
         """Return whether a viewer has commanded this articulation since play began."""
@@ -122,8 +131,8 @@ class Controls:
             self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
             raise
         if op.effect is not Effect.READ:
-            arguments = encode(structs.asdict(request)).decode()
-            self._view.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
+            given = {name: value for name, value in structs.asdict(request).items() if name != "session_id"}
+            self._view.note("call", viewer.name, op.name, encode(given).decode(), 1e3 * (time.perf_counter() - began))
         self._follow(request, reply)
         return reply
 
@@ -136,6 +145,8 @@ class Controls:
                 self.source = reply.source
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
+            case SetMode() if reply.current_mode != StepMode.DIRECT:
+                self.holding.clear()
             case ConfigureController():
                 self._view.describe_world()
             case _:
@@ -152,10 +163,25 @@ class Controls:
                 art.actuators[name]  # raises
         self._lease.use(viewer)
         for key, (art, given) in found.items():
+            self.holding.pop(key, None)
             self._seed(key, art)
             art.set_ctrl(given)
             self._pending.add(key)
         self._commanded.set()
+
+    async def hold(self, viewer: Viewer, key: str, holding: bool) -> None:
+        """Make a robot with torque motors hold its home pose, or let it go.
+
+        A law that balances a robot must not be late, so this needs direct mode, and chooses it.
+        """
+        art = self._client.articulations[key]
+        if holding:
+            renew = _pose_hold(self._client.model, art)
+            if self._client.step_mode is not StepMode.DIRECT:
+                await self.do(viewer, SetMode(mode=StepMode.DIRECT))
+            self.holding[key] = renew
+        elif self.holding.pop(key, None):
+            art.ctrl_array[:] = 0.0
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -196,15 +222,29 @@ class Controls:
         if self._client.step_mode is not StepMode.DIRECT:
             raise ValueError(f"stepping needs direct mode, not {self._client.step_mode}")
         self._lease.use(viewer)
+        self._pictures_due = 0.0
         return await self._step(n_steps)
 
     async def _step(self, n_steps: int) -> SteppedTo:
         for key, art in self._client.articulations.items():
             self._seed(key, art)
-        self._before_step()
-        watched = dict.fromkeys(self._cameras.watched(), "latest")
-        reply = await self._client.step(n_steps, include_cameras=watched or False)
-        return SteppedTo(reply.time, reply.step)
+        while True:
+            self._before_step()
+            for renew in self.holding.values():
+                renew()
+            taken = min(n_steps, self._per_period) if self.holding else n_steps
+            began = time.monotonic()
+            watched = dict.fromkeys(self._cameras.watched(), "latest") if began >= self._pictures_due else {}
+            reply = await self._client.step(taken, include_cameras=watched or False)
+            if watched:  # they take half of the time at most: drawing may be slower than physics
+                self._pictures_due = 2 * time.monotonic() - began
+            n_steps -= taken
+            if not n_steps:
+                return SteppedTo(reply.time, reply.step)
+
+    @property
+    def _per_period(self) -> int:
+        return max(1, round(_PERIOD_S / (self._view.world.timestep or _PERIOD_S)))
 
     async def run(self, viewer: Viewer, running: bool) -> None:
         """Run or stop physics in any mode; any viewer may stop it."""
@@ -230,13 +270,34 @@ class Controls:
             began = time.monotonic()
             stepped = False
             try:
-                await self._step(max(1, round(_PERIOD_S / (self._view.world.timestep or _PERIOD_S))))
+                await self._step(self._per_period)
                 stepped = True
             except (URLabError, ValueError, KeyError) as error:  # the program that mounts the console may write a NaN
                 self._view.note("error", "console", "step", str(error))
             finally:
                 self.running = self.running and stepped
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
+
+
+def _pose_hold(model: mujoco.MjModel | None, art: URLabArticulation) -> Callable[[], None]:
+    """Return what writes set-points by which torque motors hold the home pose, if it is called in each period."""
+    motors = [one for one in art.actuators.values() if one.joint is not None and one.describe().takes == "force"]
+    if model is None or not motors:
+        raise ValueError(f"{art.prefix} cannot hold a pose: that needs torque motors on its joints, and a local model")
+    joints = [art.joints[one.joint or ""] for one in motors]
+    ctrl, qpos = [one.ctrl_local.start for one in motors], [one.qpos_local_offset for one in joints]
+    qvel = [one.qvel_local_offset for one in joints]
+    driving, driven = [one.id for one in motors], [one.id for one in joints]
+    home = home_of(model, art)[model.jnt_qposadr[driven]]
+    strength = model.actuator_gainprm[driving, 0] * model.actuator_gear[driving, 0]
+    inertia = model.dof_M0[model.jnt_dofadr[driven]]
+
+    def renew() -> None:
+        error, velocity = home - art.qpos_array[qpos], art.qvel_array[qvel]
+        acceleration = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * velocity
+        art.ctrl_array[ctrl] = inertia * acceleration / strength  # physics clamps it
+
+    return renew
 
 
 async def _perform(client: URLabClient, request: Request[Any]) -> object:

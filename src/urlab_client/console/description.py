@@ -145,14 +145,15 @@ def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -
         limits = joint.limits
     home, model = 0.0, client.model
     if model is not None and said.takes == "position" and joint is not None:
-        home = float(_home(model)[int(model.jnt_qposadr[joint.id])])
+        home = float(home_of(model, art)[int(model.jnt_qposadr[joint.id])])
     place = actuator.ctrl_local.start
     return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
 
 
-def _home(model: mujoco.MjModel) -> Any:
-    """Return the positions of the keyframe `home`, under whatever prefix it was compiled, or where the model starts."""
-    for key in range(model.nkey):
-        if re.search(r"(^|[_/])home$", model.key(key).name):
-            return model.key_qpos[key]
+def home_of(model: mujoco.MjModel, art: URLabArticulation) -> Any:
+    """Return all positions of the robot's keyframe `home`, or where the model starts."""
+    for name in (rf"{re.escape(art.compiled_prefix)}[_/]?home", r"(.*[_/])?home"):
+        for key in range(model.nkey):
+            if re.fullmatch(name, model.key(key).name):
+                return model.key_qpos[key]
     return model.qpos0

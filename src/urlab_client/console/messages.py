@@ -118,8 +118,9 @@ class ReplayView(Struct):
 class Status(Struct, tag_field="type", tag="status"):
     """Connection, play, time, recording, replay and driver, from one viewer's view; sent whenever it changes.
 
-    `rate` is simulation time relative to real time, `speed` the pacing of live mode in percent, `mine` whether this
-    viewer drives, and `lease_left` for how many seconds the driver keeps the controls without using them.
+    `rate` is simulation time relative to real time, `speed` the pacing of live mode in percent, `holding` the robots
+    that hold their home pose, `mine` whether this viewer drives, and `lease_left` for how many seconds the driver keeps
+    the controls without using them.
     """
 
     link: Link
@@ -135,6 +136,7 @@ class Status(Struct, tag_field="type", tag="status"):
     conversions: list[Conversion]
     replay: ReplayView | None
     twists: dict[str, tuple[float, float, float]]
+    holding: list[str]
     viewers: int
     driver: str | None
     mine: bool

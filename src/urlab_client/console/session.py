@@ -338,6 +338,7 @@ class ConsoleSession:
             conversions=[structs.replace(conversion) for conversion in self.recordings.conversions],
             replay=replay.view,
             twists=dict(controls.twists),
+            holding=list(controls.holding),
             viewers=len(self.viewers),
             driver=None if holder is None else holder.name,
             mine=False,
@@ -377,6 +378,6 @@ class _SimulationClock:
 
 
 def _text_of(event: ClientEvent) -> str:
-    hidden = {"seq", "dropped", "gap", "recv_wall_time_ns"}
+    hidden = {"seq", "dropped", "gap", "recv_wall_time_ns", "session_id"}
     said = {name: value for name, value in structs.asdict(event).items() if name not in hidden}
     return ", ".join(f"{name} {value}" for name, value in said.items() if value)

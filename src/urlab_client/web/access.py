@@ -34,7 +34,10 @@ _HEADERS = {
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>URLab console</title><body><h1>{title}</h1><p>{text}</p></body></html>"""
 
-_ADVICE = "Open the link that `urlab console` printed; it works for one browser."
+_ADVICE = (
+    "Open the link that `urlab console` printed; it works for one browser. Enter in that terminal prints another link, "
+    "and Invite on an open page makes one."
+)
 
 _Refusal: TypeAlias = tuple[int, str, str]
 
@@ -160,7 +163,7 @@ class Guarded:
             return None
         key = self._access.admit(token[0])
         if key is None and self._access.key_of(Headers(scope=scope)) is None:
-            return _denied(scope, (401, "bad_token", "This link has been used. Ask for another one."))
+            return _denied(scope, (401, "bad_token", f"This link has been used, or the console restarted. {_ADVICE}"))
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(

@@ -195,7 +195,7 @@ def _routes(site: Site) -> list[Route | WebSocketRoute | Mount]:
         Route("/", page),
         *routes([*documented, *undocumented], site),
         *(_socket(one.path, one.serve, site) for one in live.SOCKETS),
-        Mount("/static", StaticFiles(directory=_STATIC)),
+        Mount("/static", _compressed(_STATIC)),
         *_viewer_routes(site),
     ]
 

@@ -208,6 +208,14 @@ async def step_many(call: Call, body: StepRequest = _ONE_STEP) -> SteppedTo:
     return await call.console.controls.step(call.viewer, body.n_steps)
 
 
+@endpoint("POST", "/api/hold", drives=True)
+async def hold(call: Call, body: dict[str, bool]) -> None:
+    """Hold the home pose with torque motors, in direct mode, until set-points come: `{articulation: holding}`."""
+    for key, holding in body.items():
+        await call.console.controls.hold(call.viewer, key, holding)
+        call.note("hold pose" if holding else "let go", key)
+
+
 # Bodies
 
 

@@ -50,7 +50,7 @@ export class ActuatorRow {
         h("small", { class: "high" }, actuator.range ? shortly(range[1]) : "no limit")),
       this.box, this.measured,
       h("span", { class: "few" },
-        h("button", { class: "tiny", title: `${name} to zero`, "aria-label": `${name} to zero`, onclick: () => this.zero() }, "0"),
+        h("button", { class: "tiny", title: `${name} to 0`, "aria-label": `${name} to 0`, onclick: () => this.zero() }, "0"),
         h("button", { class: "tiny", title: `${name} home`, "aria-label": `${name} home`, onclick: () => this.home() }, "⌂")));
   }
 
@@ -99,20 +99,29 @@ export function actuatorTable(group, rows) {
       h("span", { class: "name" }, `${MEANINGS[group.takes]}${group.unit ? ` · ${group.unit}` : ""}`),
       h("span", {}, "set-point"), h("span", {}, "command"), h("span", { class: "right" }, rows.some((row) => row.joint) ? "measured" : "applied"),
       h("span", { class: "few" },
-        h("button", { class: "tiny", title: "All to zero", "aria-label": "All to zero", onclick: () => act("zero") }, "0"),
+        h("button", { class: "tiny", title: "All to 0", "aria-label": "All to 0", onclick: () => act("zero") }, "0"),
         h("button", { class: "tiny", title: "All home", "aria-label": "All home", onclick: () => act("home") }, "⌂"))),
     rows.map((row) => row.element));
 }
 
-/** The reason why a robot does not move, as far as its state shows it, or an empty string. */
+/** Whether torque motors of a robot can hold its joints in a pose. */
+export const canHold = (art) => art.actuators.some((actuator) => actuator.takes === "force" && actuator.joint);
+
+/** Whether a robot that stands on its own would collapse when physics runs, because nobody has commanded it yet. */
+export const limp = (art, state) => canHold(art) && !state?.targets && art.joints.some((joint) => joint.kind === "free")
+  && art.actuators.every((actuator) => !state?.ctrl?.[actuator.index]);
+
+/** What holds a robot, or the reason why it does not move, as far as its state shows it; or an empty string. */
 export function stillness(art, state, status) {
+  if (status?.holding.includes(art.key)) return "It holds its home pose until you move a slider.";
   if (!art.actuators.length) return "It has no actuators: only gravity and contacts move it.";
   if (status?.source === "ui") return "The editor's panel drives it (control “ui”): set-points from here have no effect.";
   const limits = Object.values(art.controller?.params.torque_limit ?? {});
   if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");
   if (forces.length === art.actuators.length && forces.every((actuator) => !state.ctrl?.[actuator.index])) {
-    return "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
+    return limp(art, state) ? "Nothing drives it yet. Play makes it hold its pose."
+      : "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
   }
   return "";
 }

@@ -1,8 +1,9 @@
 // The bar at the top: connection, age, time, play and stop, modes, driver.
 
-import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
+import { $, announce, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
 import { pauseReplay, toggleReplay } from "./replay.js";
+import { steady } from "./robots.js";
 
 export const now = { status: null, state: null, socket: false };
 const ui = {};
@@ -34,9 +35,13 @@ export const reset = (keyframe) => op("reset", keyframe ? { keyframe_name: keyfr
 export const drive = () =>
   now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
 
-export function toggleRun() {
+export async function toggleRun() {
   if (now.status?.replay) toggleReplay();
-  else if (now.status) run(!now.status.running);
+  else if (now.status) {
+    const { running } = now.status;
+    if (!running) await steady();
+    run(!running);
+  }
 }
 
 /** Stop whatever moves: physics, and a replay. */
@@ -54,13 +59,15 @@ async function restartPlay() {
 async function invite() {
   const answer = await ask("POST", "api/invitations", {});
   if (!answer) return;
-  const link = new URL(answer.path, location.href).href;
-  try {
-    await navigator.clipboard.writeText(link);
-    toast("Copied a link for one more browser.", "good");
-  } catch {
-    toast(`Link for one more browser: ${link}`, "good");
-  }
+  const link = h("input", { readonly: true, size: 48, "aria-label": "Link for one more browser", value: new URL(answer.path, location.href).href, onfocus: () => link.select() });
+  const copy = h("button", { class: "primary", onclick: async () => {
+    const copied = await navigator.clipboard?.writeText(link.value).then(() => true, () => false);
+    text(copy, copied ? "Copied" : "Select the link, and copy it");
+  } }, "Copy");
+  $("invitation").replaceChildren(h("h2", {}, "Invite one more browser"),
+    h("p", { class: "hint" }, "This link is good for one browser, once. Whoever opens it can watch, and take the controls while they are free."),
+    h("div", { class: "row" }, link, copy, h("form", { method: "dialog" }, h("button", {}, "Close"))));
+  $("invitation").showModal();
 }
 
 export function makeBar() {
@@ -99,7 +106,7 @@ export function makeBar() {
 
   $("bar").append(
     h("div", { class: "row" },
-      h("h1", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), h("span", {}, "URLab console")),
+      h("h1", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), h("span", { class: "title" }, "URLab console")),
       ui.link, ui.address,
       h("span", { class: "facts" },
         h("span", { title: "Age of the state shown" }, "age ", ui.age),
@@ -108,7 +115,7 @@ export function makeBar() {
       h("span", { class: "space" }),
       ui.driver,
       h("span", { class: "acts" }, ui.drive,
-        h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
+        h("button", { id: "invite", class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
     h("div", { class: "row controls acts" }, ui.play, ui.stop, ui.sheet, ui.more));
   const place = () => (PHONE.matches ? $("sheet").prepend(ui.more) : document.querySelector(".controls").append(ui.more));
@@ -129,7 +136,7 @@ export function makeBar() {
       const age = Date.now() + clock.offset - now.state.made;
       const replayed = now.status?.replay != null;
       text(ui.age, replayed ? "replay" : paused() ? "paused" : duration(age));
-      ui.age.classList.toggle("old", !replayed && !paused() && age > 1000);
+      ui.age.classList.toggle("old", !replayed && now.status?.moving && age > 1000);
       text(ui.time, `${now.state.time.toFixed(2)} s`);
     }
     if (!now.socket || now.status?.link.state !== "connected") banner();
@@ -174,17 +181,19 @@ function banner() {
   const link = now.status?.link;
   const box = $("banner");
   let said = null;
+  let since = "";
   let button = null;
   let title = "";
   if (!now.socket) {
-    said = `The console has not answered for ${whole(Date.now() - (now.since ?? Date.now()))}. Retrying. If it was restarted, open its new link.`;
+    said = "The console does not answer. Retrying. If it was restarted, open its new link.";
+    since = whole(Date.now() - (now.since ?? Date.now()));
   } else if (link && link.state !== "connected") {
-    const since = whole(Date.now() + clock.offset - link.since * 1000);
+    since = whole(Date.now() + clock.offset - link.since * 1000);
     if (link.state === "taken_over") {
-      said = `Another program took the session over ${since} ago.`;
+      said = "Another program took the session over.";
       button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
-    } else if (link.state === "silent") said = `The server has not answered for ${since}. Waiting.`;
-    else said = now.state ? `Server unreachable for ${since}. Retrying.` : `Connecting to the server for ${since}.`;
+    } else if (link.state === "silent") said = "The server does not answer. Waiting.";
+    else said = now.state ? "The server is unreachable. Retrying." : "Connecting to the server.";
     title = link.reason;
   } else if (now.status && !now.status.playing) {
     said = "No play session is running.";
@@ -192,8 +201,12 @@ function banner() {
   }
   document.body.classList.toggle("stale", !now.socket || (link && !["connected", "taken_over"].includes(link.state)));
   box.hidden = said === null;
-  if (said !== null && box.dataset.said !== said) {
-    box.dataset.said = said;
-    box.replaceChildren(h("span", { title }, said), ...(button ? [button] : []));
-  } else if (said === null) delete box.dataset.said;
+  // Over the page, which must not move when it goes; but without play there is nothing below to cover.
+  box.classList.toggle("floating", since !== "");
+  if ((box.dataset.said ?? "") !== (said ?? "")) {
+    announce(said ?? (box.dataset.said ? "Connected." : ""));
+    box.dataset.said = said ?? "";
+    box.replaceChildren(h("span", { title }, said ?? ""), h("span", { class: "num" }), ...(button ? [button] : []));
+  }
+  if (box.children[1]) text(box.children[1], since && `for ${since}`);
 }

@@ -1,25 +1,31 @@
-// Cameras: one WebSocket per visible camera. The console sends the next picture when the last one has been shown.
+// Cameras: one WebSocket per visible camera. The console sends the next picture when the last one has been shown. While
+// physics stands still, a visible camera fetches one picture for each change of the state.
 // During a replay they show the recorded pictures; cameras that were not recorded stay live and are marked.
 
-import { paused } from "./bar.js";
-import { $, duration, h, text } from "./dom.js";
+import { now, paused } from "./bar.js";
+import { $, choices, duration, h, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
 import { clockTime } from "./recording.js";
 
 const views = new Map();
+const STILL_MS = 1000;
+const TICK_MS = 250;
 
 class CameraView {
   constructor(camera, owner) {
     this.camera = camera;
-    this.image = h("canvas", { width: camera.width, height: camera.height });
+    const title = `${owner ? `${owner} / ` : ""}${camera.name}`;
+    this.image = h("canvas", { width: camera.width, height: camera.height, role: "img", "aria-label": `Picture of ${title}` });
+    this.larger = h("button", { class: "tiny", title: "Enlarge", "aria-label": `Enlarge ${title}`, "aria-pressed": false, onclick: () => this.enlarge() }, "⤢");
     this.note = h("span", { class: "num" }, "waiting");
     this.origin = h("span", { class: "origin" });
     this.replay = null;
-    this.state = h("span", { class: "waiting" }, "No picture yet. Cameras send pictures while physics runs live.");
+    this.state = h("span", { class: "waiting" }, "No picture yet.");
+    this.still = null; // the simulation time of a picture that was fetched, and when
     this.element = h("figure", { class: "camera", "data-camera": camera.path },
-      h("div", { class: "frame", onclick: () => this.element.classList.toggle("large") }, this.image, this.state),
-      h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode), this.origin,
-        h("span", { class: "space" }), this.note));
+      h("div", { class: "frame", onclick: () => this.enlarge() }, this.image, this.state),
+      h("figcaption", {}, h("b", {}, title), h("span", { class: "tag" }, camera.mode), this.origin,
+        h("span", { class: "space" }), this.note, this.larger));
     this.frames = [];
     this.closed = false;
     this.watcher = new IntersectionObserver(([entry]) => (entry.isIntersecting ? this.open() : this.shut()));
@@ -33,13 +39,7 @@ class CameraView {
     socket.onmessage = async ({ data }) => {
       const length = new DataView(data).getUint32(0, true);
       this.head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-      const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" }));
-      if (this.image.width !== bitmap.width || this.image.height !== bitmap.height) {
-        Object.assign(this.image, { width: bitmap.width, height: bitmap.height });
-      }
-      this.image.getContext("2d").drawImage(bitmap, 0, 0);
-      bitmap.close();
-      this.label();
+      await this.draw(new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" }));
       this.frames = [...this.frames.filter((at) => at > performance.now() - 1000), performance.now()];
       if (socket.readyState === WebSocket.OPEN) socket.send("shown");
     };
@@ -56,6 +56,33 @@ class CameraView {
     socket?.close();
   }
 
+  async draw(jpeg) {
+    const bitmap = await createImageBitmap(jpeg);
+    if (this.image.width !== bitmap.width || this.image.height !== bitmap.height) {
+      Object.assign(this.image, { width: bitmap.width, height: bitmap.height });
+    }
+    this.image.getContext("2d").drawImage(bitmap, 0, 0);
+    bitmap.close();
+    this.label();
+  }
+
+  /** Fetch a picture of a state that stands still, as none is streamed then. */
+  async fetchStill() {
+    const { time } = now.state;
+    if (time === this.still?.time || performance.now() - (this.still?.at ?? -Infinity) < STILL_MS) return;
+    this.still = { time, at: performance.now() };
+    text(this.state, "Taking a picture …");
+    const jpeg = await fetch(`api/cameras/${this.camera.path}.jpg`).then((answer) => (answer.ok ? answer.blob() : null)).catch(() => null);
+    if (!jpeg && this.still) this.still.time = null; // try again
+    if (!jpeg || !paused() || this.replay) return;
+    this.head = { received: Date.now() + clock.offset, sim_time: time, recorded: false };
+    await this.draw(jpeg);
+  }
+
+  enlarge() {
+    this.larger.setAttribute("aria-pressed", this.element.classList.toggle("large"));
+  }
+
   /** Show whether the picture is recorded; cover one that remains from a replay that has ended. */
   label() {
     const recorded = this.head?.recorded ?? false;
@@ -65,7 +92,14 @@ class CameraView {
     this.state.hidden = this.head !== undefined && (this.replay !== null || !recorded);
   }
 
+  show(replay) {
+    this.replay = replay;
+    this.label();
+  }
+
   tick() {
+    if (!paused()) this.still = null;
+    else if (this.socket && now.state && !this.replay) this.fetchStill();
     if (!this.head) return;
     if (this.head.recorded) {
       text(this.note, this.replay ? `at ${clockTime(this.head.sim_time)}` : "waiting");
@@ -74,8 +108,8 @@ class CameraView {
     }
     const age = Date.now() + clock.offset - this.head.received;
     const rate = this.frames.filter((at) => at > performance.now() - 1000).length;
-    text(this.note, age <= 1500 ? `${rate} fps · ${duration(age)}` : paused() ? "paused" : `${duration(age)} old`);
-    this.note.classList.toggle("old", age > 1500 && !paused());
+    text(this.note, age <= 1500 && rate ? `${rate} fps · ${duration(age)}` : paused() ? "paused" : `${duration(age)} old`);
+    this.note.classList.toggle("old", age > 1500 && now.status?.moving);
   }
 
   end() {
@@ -85,13 +119,45 @@ class CameraView {
   }
 }
 
+const SCENIC = /overview|side|scene|track|follow|front/i;
+
+/** Show one camera of the world in `place`, for a browser that cannot draw the 3-D view. */
+export function showInstead(place) {
+  let view = null;
+  let world = null;
+  const list = h("select", { id: "camera-instead", "aria-label": "Camera instead of the 3-D view", onchange: show });
+  const found = () => camerasOf(world).find(([{ path }]) => path === list.value);
+
+  function show() {
+    const [camera, owner] = found() ?? [];
+    if (JSON.stringify(camera) === JSON.stringify(view?.camera)) return;
+    view?.end();
+    view = camera ? new CameraView(camera, owner) : null;
+    view?.larger.remove();
+    place.replaceChildren(...(view ? [list, view.element] : []));
+  }
+
+  on("world", (message) => {
+    const before = list.options.length;
+    world = message.world;
+    const cameras = camerasOf(world);
+    choices(list, cameras.map(([{ name, path }, owner]) => [path, owner ? `${owner} / ${name}` : name]));
+    if (!before && cameras.length) list.value = (cameras.find(([{ name }]) => SCENIC.test(name)) ?? cameras[0])[0].path;
+    show();
+  });
+  on("status", ({ replay }) => view?.show(replay));
+  setInterval(() => view?.tick(), TICK_MS);
+}
+
+/** The cameras of the scene and of the robots, each with its owner. */
+const camerasOf = (world) => [...world.cameras.map((camera) => [camera, ""]),
+  ...world.articulations.flatMap((art) => art.cameras.map((camera) => [camera, art.key]))];
+
 export function makeCameras() {
   const grid = h("div", { class: "cameras" });
   $("cameras").append(h("h2", {}, "Cameras"), grid);
   on("world", ({ world }) => {
-    const wanted = new Map();
-    for (const art of world.articulations) for (const camera of art.cameras) wanted.set(camera.path, [camera, art.key]);
-    for (const camera of world.cameras) wanted.set(camera.path, [camera, ""]);
+    const wanted = new Map(camerasOf(world).map(([camera, owner]) => [camera.path, [camera, owner]]));
     for (const [path, view] of views) {
       const [camera] = wanted.get(path) ?? [];
       if (camera && JSON.stringify(camera) === JSON.stringify(view.camera)) continue;
@@ -107,11 +173,6 @@ export function makeCameras() {
     }
     $("cameras").classList.toggle("empty", wanted.size === 0);
   });
-  on("status", ({ replay }) => {
-    for (const view of views.values()) {
-      view.replay = replay;
-      view.label();
-    }
-  });
-  setInterval(() => views.forEach((view) => view.tick()), 250);
+  on("status", ({ replay }) => views.forEach((view) => view.show(replay)));
+  setInterval(() => views.forEach((view) => view.tick()), TICK_MS);
 }

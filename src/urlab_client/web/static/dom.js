@@ -6,6 +6,7 @@ export function h(tag, attributes = {}, ...children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else if (name.startsWith(".")) element[name.slice(1)] = value;
+    else if (name.startsWith("aria-") && value != null) element.setAttribute(name, value);
     else if (value === true) element.setAttribute(name, "");
     else if (value !== false && value != null) element.setAttribute(name, value);
   }
@@ -73,6 +74,9 @@ export function confirmed(attributes, label, question, act) {
   settle();
   return button;
 }
+
+/** Tell a screen reader what changed. */
+export const announce = (message) => text($("announcements"), message);
 
 export function toast(message, kind = "error") {
   const box = h("div", { class: `toast ${kind}` }, message);

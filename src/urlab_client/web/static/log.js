@@ -1,10 +1,9 @@
-// The log of calls, errors and events, in words; immediate repetitions are counted.
+// The log of calls, errors and events, in sentences; immediate repetitions are counted.
 
 import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
 
 const KEPT = 300;
-const plural = (names) => names.join(", ");
 
 /** The text of each connection event. */
 const EVENTS = {
@@ -19,18 +18,63 @@ const EVENTS = {
   session_lost: () => "Another program took the session over.",
 };
 
-/** Words for an op and its arguments: `set_sim_speed {"percent":50}` is `set sim speed: percent 50`. */
-function words(entry) {
-  let given = entry.text;
+/** What the console's own troubles mean for who watches; their details are in the line's title. */
+const TROUBLES = {
+  connect: "The server cannot be reached. Retrying.",
+  state: "States stopped arriving. Trying again.",
+  step: "A step failed, so physics was stopped.",
+  "set-points": "Set-points did not reach the server.",
+};
+
+/** What viewers do most, in words; `given` are the arguments. */
+const CALLS = {
+  set_paused: (given) => (given.paused ? "paused physics" : "let physics run"),
+  run: () => "let physics run",
+  stop: () => "stopped physics",
+  reset: (given) => `reset the simulation${given.keyframe_name ? ` to ${given.keyframe_name}` : ""}`,
+  set_mode: (given) => `chose step mode ${given.mode}`,
+  set_sim_speed: (given) => `set the speed to ${shortly(given.percent)} %`,
+  set_control_source: (given) => `gave control to ${given.source}`,
+  begin_pie: () => "began play",
+  stop_pie: () => "ended play",
+  set_twist: (given) => `commanded ${given.articulation} to move`,
+  spawn_actor: (given) => `added ${given.actor_id || "an actor"}`,
+  duplicate_actor: (given) => `added ${given.new_actor_id}, a copy of ${given.target}`,
+  destroy_actor: (given) => `removed ${given.target}`,
+  set_actor_transform: (given) => `moved ${given.target}`,
+  ensure_manager: () => "added a manager to the level",
+  "hold pose": (given) => `made ${given} hold its home pose`,
+  "let go": (given) => `let ${given} go`,
+  record: (given) => `began recording ${given}`,
+  "stop recording": (given) => `finished recording ${given}`,
+  "import model": (given) => `imported ${given}`,
+};
+
+const shortly = (value) => (typeof value === "number" ? `${+value.toPrecision(4)}` : typeof value === "string" ? value
+  : JSON.stringify(value, (_, one) => (typeof one === "number" ? +one.toPrecision(4) : one)));
+
+/** The arguments of an op, or a sentence as it is. */
+function argumentsOf(entry) {
   try {
-    given = plural(Object.entries(JSON.parse(entry.text)).filter(([, value]) => value !== null)
-      .map(([name, value]) => `${name.replaceAll("_", " ")} ${typeof value === "object" ? JSON.stringify(value) : value}`));
-  } catch { /* it is a sentence */ }
-  return given;
+    return JSON.parse(entry.text);
+  } catch {
+    return entry.text;
+  }
+}
+
+/** An entry as a sentence: `set_sim_speed {"percent":50}` is `set the speed to 50 %`. */
+function words(entry) {
+  if (entry.kind === "event") return EVENTS[entry.what]?.(entry.text) ?? `${entry.what.replaceAll("_", " ")}: ${entry.text}`;
+  if (entry.kind === "error") return (entry.who === "console" && TROUBLES[entry.what]) || `${entry.what.replaceAll("_", " ")}: ${entry.text}`;
+  const given = argumentsOf(entry);
+  if (CALLS[entry.what]) return CALLS[entry.what](given);
+  const shown = typeof given === "string" ? given : Object.entries(given).filter(([, value]) => value !== null)
+    .map(([name, value]) => `${name.replaceAll("_", " ")} ${shortly(value)}`).join(", ");
+  return [entry.what.replaceAll("_", " "), shown].filter(Boolean).join(": ");
 }
 
 export function makeLog() {
-  const list = h("ol", { class: "entries", "aria-label": "Log" });
+  const list = h("ol", { class: "entries", tabindex: 0, "aria-label": "Log" });
   const only = h("input", { type: "checkbox", onchange: () => list.classList.toggle("errors", only.checked) });
   $("log").append(h("h2", {}, "Log", h("span", { class: "space" }), h("label", { class: "check hint" }, only, " errors only")), list);
   let newest = -1;
@@ -38,9 +82,8 @@ export function makeLog() {
   on("closed", () => { newest = -1; last = null; list.replaceChildren(); });
 
   function add(entry) {
-    const event = entry.kind === "event";
-    const said = event ? EVENTS[entry.what]?.(entry.text) ?? words(entry) : words(entry);
-    const same = JSON.stringify([entry.kind, entry.who, entry.what, entry.kind === "error" ? said : null, event ? said : null]);
+    const said = words(entry);
+    const same = JSON.stringify([entry.kind, entry.who, entry.what, entry.kind === "call" || said]);
     if (last?.same === same) {
       last.times += 1;
       text(last.count, `×${last.times}`);
@@ -50,8 +93,7 @@ export function makeLog() {
     last = { same, times: 1, count: h("span", { class: "tag" }), said: h("span", { class: "said", title: `${entry.what} ${entry.text}` }, said) };
     list.append(h("li", { class: entry.kind },
       h("time", {}, new Date(entry.at * 1000).toLocaleTimeString([], { hour12: false })),
-      h("span", { class: "who" }, entry.who), event ? null : h("b", {}, entry.what.replaceAll("_", " ")), last.said, last.count,
-      h("span", { class: "num" }, entry.ms == null ? "" : `${entry.ms.toFixed(1)} ms`)));
+      h("span", { class: "who" }, entry.who), last.said, last.count));
   }
 
   on("log", ({ entries }) => {

@@ -3,6 +3,7 @@
 import { drive, makeBar, now, reset, step, stop, toggleRun } from "./bar.js";
 import { makeCameras } from "./cameras.js";
 import { $, h } from "./dom.js";
+import { makeLayout, resetLayout } from "./layout.js";
 import { connect } from "./link.js";
 import { makeLog } from "./log.js";
 import { makeRecording } from "./recording.js";
@@ -22,13 +23,14 @@ const KEYS = [
   ["?", "?", "show this help", () => $("help").showModal()],
 ];
 
-for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeTeleop, makeScene, makeRecording, makeReplay, makeContacts, makeLog]) make();
+for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeTeleop, makeScene, makeRecording, makeReplay, makeContacts, makeLog, makeLayout]) make();
 
 $("help").append(h("h2", {}, "Keys"),
   h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),
     h("dt", {}, h("kbd", {}, "← →")), h("dd", {}, "move the focused slider"),
     h("dt", {}, h("kbd", {}, "w a s d")), h("dd", {}, "command a twist while the pad has focus")),
-  h("form", { method: "dialog" }, h("button", {}, "Close")));
+  h("p", { class: "hint" }, "Panels move by the grip at their top edge: drag it, or focus it and use the arrow keys."),
+  h("form", { method: "dialog", class: "row" }, h("button", {}, "Close"), h("button", { id: "reset-layout", onclick: resetLayout }, "Reset the layout")));
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || document.querySelector("dialog[open]")) return;

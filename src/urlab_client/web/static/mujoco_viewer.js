@@ -8,7 +8,7 @@
 //   the surrounding page shares the thread.
 // - It neither exposes its camera nor accepts another one. Here the camera is ours (viewer_pointer.js) and overwrites
 //   the viewer's before each frame. The selection and the overlays are written into each state likewise.
-// - It takes the keyboard once it is clicked; here the keys go to the surrounding page, the console.
+// - It takes the keyboard once it is clicked; here arrows move the camera, other keys go to the surrounding page.
 
 {
   const beside = new URL(".", location.href);
@@ -158,6 +158,7 @@
   for (const type of ["keydown", "keyup"]) {
     window.addEventListener(type, (event) => {
       event.stopImmediatePropagation();
+      if (type === "keydown" && viewerPointer.key(event)) return event.preventDefault();
       const { key, code, ctrlKey, metaKey, altKey, shiftKey, repeat } = event;
       const again = new KeyboardEvent(type, { key, code, ctrlKey, metaKey, altKey, shiftKey, repeat, bubbles: true, cancelable: true });
       if (!window.parent.document.body.dispatchEvent(again)) event.preventDefault();

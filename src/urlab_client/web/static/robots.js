@@ -1,6 +1,6 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
-import { ActuatorRow, actuatorTable, groups, share, stillness } from "./actuators.js";
+import { ActuatorRow, actuatorTable, canHold, groups, limp, share, stillness } from "./actuators.js";
 import { now } from "./bar.js";
 import { $, h, number, text } from "./dom.js";
 import { ask, on, op } from "./link.js";
@@ -16,7 +16,11 @@ class Robot {
     this.boxes = [];
     const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
-    this.still = h("p", { class: "still", hidden: true });
+    this.said = h("span", {});
+    this.hold = h("button", { "aria-pressed": "false", title: "Keep the joints at the home pose; this needs mode direct, and chooses it",
+      onclick: () => hold(art.key, this.hold.getAttribute("aria-pressed") !== "true") }, "Hold pose");
+    // Once shown, it keeps its place: what is below must not move from under a finger.
+    this.still = h("div", { class: "line still", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
     const why = h("button", { class: "quiet", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
     const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
@@ -76,7 +80,7 @@ class Robot {
 
   twist() {
     const knob = h("i", {});
-    const pad = h("div", { class: "pad", tabindex: 0, title: "Drag to command forward speed and turn rate, or use W A S D while focused" }, knob);
+    const pad = h("div", { class: "pad", tabindex: 0, role: "application", "aria-label": "Twist: W A S D", title: "Drag to command forward speed and turn rate, or use W A S D while focused" }, knob);
     const shown = h("span", { class: "num" }, "0 m/s · 0 rad/s");
     let waiting = false;
     let next = null;
@@ -118,10 +122,18 @@ class Robot {
   draw(state) {
     for (const row of this.rows) row(state);
     const said = stillness(this.art, state, now.status);
-    this.still.hidden = !said;
-    text(this.still, said);
+    if (said) this.still.hidden = false;
+    this.still.classList.toggle("over", !said);
+    text(this.said, said);
+    this.hold.setAttribute("aria-pressed", now.status?.holding.includes(this.key) ?? false);
   }
 }
+
+const hold = (articulation, holding) => ask("POST", "api/hold", { [articulation]: holding });
+
+/** Before physics runs: make those robots hold their pose that would collapse. */
+export const steady = () => Promise.all(robots.filter((robot) => limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key))
+  .map((robot) => hold(robot.key, true)));
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 
@@ -142,6 +154,8 @@ export function fold(title, open, ...content) {
 }
 
 export function makeRobots() {
+  const list = h("div", { class: "list" });
+  $("robots").append(list);
   on("world", ({ world }) => {
     const open = new Set([...document.querySelectorAll(".robot details[open]")].map(place));
     const before = document.querySelector(".robot") !== null;
@@ -149,7 +163,7 @@ export function makeRobots() {
     robots = world.articulations.map((art) => old.find((robot) => robot.shape === shape(art)) ?? new Robot(art));
     robots.forEach((robot, i) => robot.update(world.articulations[i]));
     if (old.length === robots.length && old.every((robot, i) => robot === robots[i])) return;
-    $("robots").replaceChildren(...robots.map((robot) => robot.element));
+    list.replaceChildren(...robots.map((robot) => robot.element));
     if (before) for (const details of document.querySelectorAll(".robot details")) details.open = open.has(place(details));
   });
   on("state", (state) => {

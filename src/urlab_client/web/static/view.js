@@ -2,19 +2,20 @@
 // removed when the view is closed. Its cover shows what it waits for.
 
 import { makeBodies } from "./bodies.js";
+import { showInstead } from "./cameras.js";
 import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
 
 const OPEN = "urlab-view";
 const TOUCH = window.matchMedia("(pointer: coarse)");
 const UPRIGHT = window.matchMedia("(orientation: portrait)");
-const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it; press Push, or hold Ctrl, and drag to push it.";
+const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it; press Push, or hold Ctrl, and drag to push it. With the view in focus, the arrow keys rotate, with Shift they pan, + and − zoom.";
 const WITH_FINGERS = "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it; press Push and drag to push it.";
 
 /** The reason why this browser cannot show the view, or an empty string. */
 function lacking() {
-  if (!window.crossOriginIsolated) return "Browsers show the 3-D view only on this machine or over HTTPS.";
-  if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3-D view needs.";
+  if (!window.crossOriginIsolated) return "Browsers show the 3-D view only on this machine or over HTTPS. A camera shows the scene instead.";
+  if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3-D view needs. A camera shows the scene instead.";
   return "";
 }
 
@@ -23,11 +24,13 @@ export function makeView() {
   const stage = h("div", { class: "stage" }, cover);
   const bodies = makeBodies(() => stage.querySelector("iframe")?.contentWindow);
   const hint = h("p", { class: "hint" });
-  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), bodies.bar, stage,
-    hint);
+  const instead = h("div", { class: "instead" });
+  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), bodies.bar, stage, instead, hint);
   $("view").append(box);
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
+  hint.hidden = unable !== "";
+  if (unable) showInstead(instead);
 
   /** The reason why there is no picture yet, or an empty string. */
   function waiting() {

@@ -103,6 +103,17 @@ const viewerPointer = (() => {
     camera.distance = Math.max(0.02, Math.min(1e4, camera.distance * factor));
   }
 
+  /** Handle a key as a drag or a turn of the wheel; return whether it was one. */
+  function key({ key: name, shiftKey, ctrlKey, metaKey, altKey }) {
+    const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[name];
+    if (!pointer.found || ctrlKey || metaKey || altKey || !(way || "+-=".includes(name))) return false;
+    const step = window.innerHeight / 24;
+    if (!way) zoom(name === "-" ? 1.1 : 1 / 1.1);
+    else if (shiftKey) move(step * way[0], step * way[1]);
+    else turn(step * way[0], step * way[1]);
+    return true;
+  }
+
   /** Show a sphere. */
   function fit({ center, radius }) {
     const narrow = Math.atan(half() * Math.min(1, window.innerWidth / window.innerHeight));
@@ -207,6 +218,6 @@ const viewerPointer = (() => {
     }
   });
 
-  const pointer = { found: false, undressed: false, learn: (one) => { layout = one; }, seek, aim, dress, ray };
+  const pointer = { found: false, undressed: false, learn: (one) => { layout = one; }, seek, aim, dress, ray, key };
   return pointer;
 })();

@@ -1,0 +1,254 @@
+"""The console's page for people who are new to it, who use no mouse, or who do not see it, in a real Chromium."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import urllib.request
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from console_page import RUNNING, SLIDER, Page, command, link_in, opened
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
+
+AXE = Path(sys.prefix, "axe", "axe_playwright_python", "axe.min.js")
+"""The rules of axe-core, as .ci/run installs them."""
+
+FIND = """const done = arguments[0]; axe.run({resultTypes: ["violations"]}).then(({violations}) => done(
+  violations.flatMap((one) => one.nodes.map((node) => `${one.help}: ${node.html} (${node.failureSummary})`))))"""
+FOLD = "document.querySelectorAll('main details').forEach((one) => { one.open = arguments[0]; })"
+PANELS = "[...document.querySelectorAll('.column')].map((one) => [...one.children].map(({id}) => id))"
+SPOKEN = "document.querySelector('#announcements').textContent"
+TOP = f"document.querySelector('{SLIDER}').getBoundingClientRect().top"
+MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+ROCK = """<mujoco><asset><mesh name="rock" file="meshes/rock.obj"/></asset><worldbody><body name="rock">
+<freejoint/><geom type="mesh" mesh="rock" mass="1"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A page before a quadruped with torque motors and an arm, which stand still."""
+    ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+    with contextlib.ExitStack() as stack:
+        robots = ("quadruped", "arm", "--play", "--camera-size", "64x48")
+        _, line = stack.enter_context(command("serve", *robots, "--json", *ports))
+        ready = json.loads(line)
+        ours = [f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}", "--port=0"]
+        folder = tmp_path_factory.mktemp("recordings")
+        _, said = stack.enter_context(command("console", ready["address"], *ours, f"--recordings={folder}"))
+        one = stack.enter_context(opened(tmp_path_factory.mktemp("page"), link_in(said)))
+        one.until(
+            f"document.querySelector('{SLIDER}') !== null && document.querySelector('#time').textContent.includes('s')"
+        )
+        yield one
+
+
+@pytest.fixture
+def still(page: Page) -> Iterator[Page]:
+    """The page with physics stopped, the robots as at first, and the panels where they were."""
+    page.ask("api/run", {"running": False})
+    page.until(f"!({RUNNING})")
+    page.ask("api/hold", {"quadruped": False})
+    page.ask("api/ops/reset", {})
+    yield page
+    page.driver.execute_script("document.querySelectorAll('dialog[open]').forEach((one) => one.close())")
+
+
+def tab_to(page: Page, name: str) -> None:
+    """Press Tab until the control of this name has the focus, and see that it shows."""
+    page.driver.execute_script("document.activeElement.blur()")
+    for _ in range(200):
+        ActionChains(page.driver).send_keys(Keys.TAB).perform()
+        found = page.look(
+            "[document.activeElement.getAttribute('aria-label') || document.activeElement.textContent.trim(),"
+            "getComputedStyle(document.activeElement).outlineStyle]"
+        )
+        if found[0] == name:
+            assert found[1] == "solid"
+            return
+    raise AssertionError(f"Tab does not lead to {name!r}")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("small", [False, True], ids=["desk", "phone"])
+def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
+    if not AXE.exists():
+        pytest.skip(f"needs axe-core: pip install --no-deps --target {AXE.parents[1]} axe-playwright-python")
+    driver = still.driver
+    driver.execute_cdp_cmd(
+        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    )
+    driver.execute_script(AXE.read_text("utf-8"))
+    with contextlib.ExitStack() as stack:
+        if small:
+            stack.enter_context(still.phone())
+            assert driver.execute_async_script(FIND) == []
+            still.click("#sheet-toggle")
+            still.until("getComputedStyle(document.querySelector('#sheet')).opacity === '1'")
+            stack.callback(still.click, "#sheet-toggle")
+        assert driver.execute_async_script(FIND) == []
+        driver.execute_script(FOLD, True)
+        stack.callback(driver.execute_script, FOLD, False)
+        assert driver.execute_async_script(FIND) == []
+        for opens, dialog in (
+            ("[aria-label=Keys]", "help"),
+            ("#invite", "invitation"),
+            (".robot h2 button", "findings"),
+        ):
+            still.click(opens)
+            still.until(f"document.querySelector('#{dialog}').open")
+            assert driver.execute_async_script(FIND) == []
+            driver.execute_script(f"document.querySelector('#{dialog}').close()")
+
+
+def test_a_screen_reader_has_a_name_for_every_control_and_hears_whether_it_is_pressed(still: Page) -> None:
+    still.driver.execute_cdp_cmd("Accessibility.enable", {})
+    still.driver.execute_script(FOLD, True)
+    nodes = still.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    still.driver.execute_script(FOLD, False)
+    roles = {"button", "slider", "spinbutton", "combobox", "checkbox", "textbox", "image", "region", "application"}
+    controls = [one for one in nodes if not one["ignored"] and one["role"]["value"] in roles]
+    assert len(controls) > 100
+    assert [one for one in controls if not one["name"]["value"]] == []
+    names = {one["name"]["value"] for one in controls}
+    assert {"▶ Play", "■ Stop", "elbow set-point, rad", "Picture of quadruped / side", "Twist: W A S D"} <= names
+    pressed = {
+        one["name"]["value"]: next((p["value"]["value"] for p in one["properties"] if p["name"] == "pressed"), None)
+        for one in controls
+        if one["role"]["value"] == "button"
+    }
+    assert pressed["Hold pose"] == "false"
+    legend = [value for name, value in pressed.items() if name[0] in "xyz" and not name[1:2].isalpha()]
+    assert legend
+    assert all(value == "true" for value in legend), pressed
+
+
+def test_everything_is_done_by_keys_alone(still: Page) -> None:
+    def press(*keys: str) -> None:
+        ActionChains(still.driver).send_keys(*keys).perform()
+
+    tab_to(still, "▶ Play")
+    press(Keys.ENTER)
+    still.until(RUNNING)
+    tab_to(still, "elbow set-point, rad")
+    value = still.look(f"+document.querySelector('{SLIDER}').value")
+    press(*[Keys.ARROW_RIGHT] * 30)
+    still.until(f"+document.querySelector('{SLIDER}').value > {value} + 0.05")
+    tab_to(still, "Enlarge quadruped / side")
+    press(Keys.ENTER)
+    large = "document.querySelector('[data-camera=\"quadruped/side\"].large')"
+    still.until(f"{large} !== null")
+    press(Keys.ENTER)
+    still.until(f"{large} === null")
+    press(Keys.ESCAPE)
+    still.until(f"!({RUNNING})")
+
+
+def test_panels_are_moved_by_keys_and_by_the_mouse_and_stay_there(still: Page) -> None:
+    first = still.look(PANELS)
+    tab_to(still, "Move Log")
+    ActionChains(still.driver).send_keys(Keys.ARROW_RIGHT, Keys.ARROW_UP).perform()
+    assert "log" not in still.look(PANELS)[0]
+    place = still.look(PANELS)[1].index("log")
+    assert place < len(first[1])
+    assert still.look(SPOKEN).startswith("Log: place ")
+    assert still.look("document.activeElement.getAttribute('aria-label')") == "Move Log"
+    still.driver.execute_script("window.scrollTo(0, 0)")
+    grip, title = still.find("#cameras > .grip"), still.find(".robot h2")
+    ActionChains(still.driver).click_and_hold(grip).move_to_element(title).perform()
+    assert still.look("document.querySelector('.column .drop') !== null"), "where it would go is shown"
+    ActionChains(still.driver).release().perform()
+    moved = still.look(PANELS)
+    assert moved[1][0] == "cameras"
+    still.driver.refresh()
+    still.until(f"document.querySelector('{SLIDER}') !== null")
+    assert still.look(PANELS) == moved
+    still.click("[aria-label=Keys]")
+    still.click("#reset-layout")
+    assert still.look(PANELS) == first
+    still.driver.refresh()
+    still.until(f"document.querySelector('{SLIDER}') !== null")
+    assert still.look(PANELS) == first
+
+
+def test_the_first_play_leaves_a_robot_with_torque_motors_standing(still: Page) -> None:
+    def height(state: Any) -> float:
+        return float(state["articulations"]["quadruped"]["qpos"][2])
+
+    # As nobody has commanded it since play began.
+    still.ask("api/ops/stop_pie", {})
+    still.ask("api/ops/begin_pie", {})
+    still.until(f"document.querySelector('{SLIDER}') !== null")
+    still.until("document.querySelector('[data-robot=quadruped] .still')?.textContent.includes('Play makes it hold')")
+    before = still.look(TOP)
+    still.click("#play")
+    still.asked("api/state", lambda state: state["time"] > 0.7)
+    assert height(still.ask("api/state")) > 0.25
+    hold = "document.querySelector('[data-robot=quadruped] .still button').getAttribute('aria-pressed')"
+    still.until(f"{hold} === 'true'")
+    still.driver.execute_script(
+        "const one = document.querySelector('[data-robot=quadruped] [data-actuator=FL_hip]'); one.value = 3;"
+        "one.dispatchEvent(new Event('input', {bubbles: true}))"
+    )
+    still.until(f"{hold} === 'false'")
+    assert still.look(TOP) == before, "what the page says of a robot must not move a slider from under a finger"
+    still.ask("api/ops/reset", {})
+    still.click("[data-robot=quadruped] .still button")
+    still.until(f"{hold} === 'true'")
+    still.click("[data-robot=quadruped] .still button")
+    still.until(f"{hold} === 'false'")
+    still.asked("api/state", lambda state: height(state) < 0.2)
+
+
+@pytest.mark.opengl
+def test_a_simulation_that_stands_still_shows_pictures_also_instead_of_the_3d_view(still: Page) -> None:
+    still.until("document.querySelector('#age').textContent === 'paused'")
+    pixels = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
+    drawn = f"(canvas => canvas && {pixels}.some((value, i) => i % 4 === 1 && value > 90))"
+    still.driver.execute_script("document.querySelector('#view').scrollIntoView()")
+    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
+    chosen = still.look("document.querySelector('.instead .camera').dataset.camera")
+    options = still.look("[...document.querySelector('#camera-instead').options].map(({value}) => value)")
+    other = next(one for one in options if one != chosen)
+    still.choose("#camera-instead", other)
+    still.until(f"document.querySelector('.instead .camera').dataset.camera === '{other}'")
+    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
+    assert not still.look("document.querySelector('.instead .num').classList.contains('old')")
+
+
+def test_an_invitation_shows_its_link_which_admits_one_browser(still: Page) -> None:
+    still.click("#invite")
+    still.until("document.querySelector('#invitation').open")
+    link = still.look("document.querySelector('#invitation input').value")
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with opener.open(link) as answer:
+        assert "URLab console" in answer.read().decode()
+    with pytest.raises(urllib.request.HTTPError, match="401") as refused:
+        urllib.request.urlopen(urllib.request.Request(link, headers={"accept": "text/html"}))
+    said = refused.value.read().decode()
+    assert "has been used" in said
+    assert "Enter" in said
+
+
+def test_a_model_with_meshes_is_imported_and_spawned(still: Page, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "rock.zip", "w") as archive:
+        archive.writestr("rock.xml", ROCK)
+        archive.writestr("meshes/rock.obj", MESH)
+    still.find("#model-file").send_keys(str(tmp_path / "rock.zip"))
+    still.until("document.querySelector('#blueprint').selectedOptions[0]?.text === 'rock'")
+    still.click("#spawn")
+    still.until("document.querySelector('[data-actor=rock]') !== null")
+    still.driver.execute_script("for (let i = 0; i < 2; i++) document.querySelector('#restart').click()")
+    still.until("document.querySelector('[data-robot=rock]') !== null")
+    bodies = still.ask("api/bodies")["bodies"]
+    assert any(one["robot"] == "rock" for one in bodies)
+    log = still.look("document.querySelector('#log').innerText")
+    assert "imported rock" in log
+    assert "added rock" in log
