@@ -1,0 +1,208 @@
+"""Evaluates networks of `examples/train_walk.py`, on a batch and over the wire, and draws how they learned and walk.
+
+    pip install -e '.[gym,onnx,mcap,demo]'
+    python tools/walk_figures.py runs/*         # folders of trainings; prints the figures
+    python tools/walk_figures.py runs/* --ship  # also the network in examples/policies, and docs/images/walk.png
+
+Everything walks in the same episodes of `urlab/Walk-v0`, none of them seen in training, with friction, masses, damping,
+strength and starts that vary. The trot that `urlab demo` shows takes strides that suit the command, and keeps its own
+gains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import matplotlib as mpl
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from urlab_client.aio import URLabClient
+from urlab_client.cli.demo import Trot
+from urlab_client.integrations.gym import States, URLabBatchEnv, URLabVectorEnv, Walk
+from urlab_client.integrations.policy import OnnxNetwork, evaluate_in, load, run
+from urlab_client.integrations.record import read_run, record
+from urlab_client.randomise.declaration import MODEST
+
+mpl.use("agg")
+import matplotlib.pyplot as plt  # after the backend was chosen
+
+__all__ = ["main"]
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = ROOT / "examples/policies/walk.onnx"
+PICTURE = ROOT / "docs/images/walk.png"
+SINE, COMMAND = 45, slice(47, 50)  # in an observation of the task: of the stride's phase, and of the command
+COMMAND_SCALE = 3.0
+TRACK_M = 0.155  # from the middle to a foot
+THEIR_GAINS = Walk.scene_address.replace("kp=60,kv=2", f"kp={Trot.KP:g},kv={Trot.KD:g}")
+ROUTE = {0.0: (0.0, 0.0, 0.0), 2.0: (0.4, 0.0, 0.0), 5.0: (0.8, 0.0, 0.0), 8.0: (0.4, 0.0, 0.5), 11.0: (-0.3, 0.0, 0.0)}
+"""Commands by the second from which they hold: vx, vy (m/s), yaw rate (rad/s)."""
+SECONDS = 14.0
+
+Floats = NDArray[np.float64]
+Act = Callable[[Any], Floats]
+"""One observation of the task, shape (50,), to an action, shape (12,)."""
+
+
+class Noted(Walk):
+    """Walking, with a note of each episode: its return, its mean velocity error in m/s, and whether the robot fell."""
+
+    memory: ClassVar[Any] = {**Walk.memory, "error": ()}
+
+    def __init__(self) -> None:
+        self.episodes: list[tuple[float, float, bool]] = []
+        self._errors: dict[int, float] = {}
+
+    def update(self, states: States) -> None:
+        """See `Task.update`."""
+        super().update(states)
+        wrong = states.memory["velocity"] - states.goal["command"]
+        states.memory["error"] += np.linalg.norm(wrong[:, :2], axis=1)
+        self._errors.update(zip(states.index.tolist(), states.memory["error"].tolist(), strict=True))
+
+    def ended(self, episode: Any) -> None:
+        """See `Task.ended`."""
+        self.episodes.append((episode.total, self._errors[episode.index] / episode.steps, episode.terminated))
+
+
+def still(_: Any) -> Floats:
+    """Return the action that stands."""
+    return np.zeros(12)
+
+
+def trot(observation: Any) -> Floats:
+    """Return the action of the trot that `urlab demo` shows, with strides that suit the command."""
+    phase = math.atan2(observation[SINE], observation[SINE + 1]) / (2.0 * math.pi)
+    ahead, _, turn = observation[COMMAND] / COMMAND_SCALE
+    strides = Trot.ON_GROUND / Trot.STRIDES_PER_S * (ahead + TRACK_M * turn * Trot.SIDES)
+    lift = 1.0 if observation[COMMAND].any() else 0.0
+    return Trot.angles(phase / Trot.STRIDES_PER_S, strides, lift) / np.tile([0.3, 0.6, 0.8], 4)
+
+
+def evaluate(act: Act, address: str = Walk.scene_address, *, servers: int = 0, episodes: int = 100) -> dict[str, Any]:
+    """Return how well something walks, on a batch, or on as many servers as are given."""
+    task = Noted()
+    options: dict[str, Any] = {"task": task, "randomise": MODEST, "autoreset_mode": AutoresetMode.DISABLED}
+    env = (
+        URLabVectorEnv(address, servers, **options)
+        if servers
+        else URLabBatchEnv(address, min(episodes, 100), **options)
+    )
+    try:
+        found = evaluate_in(env, act, episodes=episodes)
+    finally:
+        env.close()
+    total, error, fell = np.mean(task.episodes, axis=0).tolist()
+    success = found.success_rate
+    return {
+        "episodes": episodes,
+        "error": round(error, 3),
+        "falls": round(fell * episodes),
+        "return": round(total, 1),
+        "success": None if success is None else round(success.value, 2),
+    }
+
+
+async def walk(network: Path, recording: Path) -> tuple[Floats, Floats]:
+    """Walk the route on a server, recorded; return the times, and the forward velocity and yaw rate, shape (n, 2)."""
+    policy, times, moved = load(network), list[float](), list[Any]()
+    async with URLabClient(f"{Walk.scene_address}&camera-size=320x240", step_mode="direct") as client:
+        await client.discover()
+        robot = client.articulations["quadruped"]
+
+        def steer(so_far: Any) -> None:
+            times.append(so_far.sim_time)
+            w, _, _, z = robot.root_quat_w
+            heading = 2.0 * math.atan2(z, w)
+            velocity = robot.qvel_array
+            ahead = velocity[0] * math.cos(heading) + velocity[1] * math.sin(heading)
+            moved.append([ahead, velocity[5]])
+            policy.command = [values for start, values in ROUTE.items() if so_far.sim_time >= start][-1]
+
+        policy.command = ROUTE[0.0]
+        async with record(client, recording, cameras=["quadruped/side"], camera_hz=1.0, overwrite=True):
+            await run(client, policy, seconds=SECONDS, on_action=steer)
+    return np.array(times), np.array(moved)
+
+
+def draw(runs: Sequence[dict[str, Any]], baselines: dict[str, dict[str, Any]], network: Path, file: Path) -> None:
+    """Draw frames of a walk, how all trainings learned, and how the network follows its commands."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "walk.mcap"
+        times, moved = asyncio.run(walk(network, recording))
+        frames = [frame.pixels for frame in read_run(recording).frames("quadruped/side")]
+    figure = plt.figure(figsize=(11, 4.8), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[1, 1.8])
+    shown = (3, 4, 6, 7, 9, 12)
+    for second, axes in zip(shown, above.subplots(1, len(shown)), strict=True):
+        axes.imshow(frames[second])
+        axes.set_title(f"{second} s", fontsize=9)
+        axes.axis("off")
+    learning, following = below.subplots(1, 2)
+    for each in runs:
+        curve = each["curve"]
+        learning.plot([row["steps"] / 1e6 for row in curve], [row["reward"] for row in curve], color="C0", lw=0.8)
+    for name, style in (("zero", ":"), ("trot", "--")):
+        mean = baselines[name]["return"] / (Walk.max_episode_steps or 1)
+        learning.axhline(mean, color="grey", ls=style, label="zero output" if name == "zero" else "hand-written trot")
+    learning.plot([], [], color="C0", lw=0.8, label=f"PPO, exploring, {len(runs)} seeds")
+    learning.set(xlabel="environment steps (millions)", ylabel="reward per action", title="learning")
+    learning.legend(frameon=False, fontsize=8)
+    share = 1.0 / 25  # a stride has 25 actions
+    smooth = np.stack([np.convolve(column, np.full(25, share), mode="same") for column in moved.T], axis=1)
+    starts = [*ROUTE, SECONDS]
+    for column, (index, name) in enumerate(((0, "forward (m/s)"), (2, "turning (rad/s)"))):
+        following.plot(times, smooth[:, column], color=f"C{column}", label=name)
+        for (begin, command), end in zip(ROUTE.items(), starts[1:], strict=True):
+            following.plot([begin, end], [command[index]] * 2, color=f"C{column}", ls="--", lw=1)
+    following.set(xlabel="s", title="following commands (dashed)")
+    following.legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=110)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Evaluate, print and draw; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path, metavar="DIR", help="folders that train_walk.py wrote")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--servers", type=int, default=4, help="for the episodes over the wire (default: %(default)s)")
+    parser.add_argument("--ship", action="store_true", help="copy the best to examples/policies, and draw the picture")
+    arguments = parser.parse_args(argv)
+    episodes = arguments.episodes
+    found = {"zero": evaluate(still, episodes=episodes), "trot": evaluate(trot, THEIR_GAINS, episodes=episodes)}
+    print(json.dumps(found), flush=True)
+    trained: list[dict[str, Any]] = []
+    for folder in arguments.runs:
+        row = evaluate(OnnxNetwork(folder / "walk.onnx"), episodes=episodes)
+        trained.append(row)
+        print(folder, json.dumps(row), flush=True)
+    best = arguments.runs[int(np.argmax([row["return"] for row in trained]))]
+    for dialect in ("alpha", "beta"):
+        address = f"{Walk.scene_address}&dialect={dialect}"
+        found[dialect] = evaluate(
+            OnnxNetwork(best / "walk.onnx"), address, servers=arguments.servers, episodes=episodes
+        )
+        print(best, dialect, json.dumps(found[dialect]), flush=True)
+    if arguments.ship:
+        for suffix in (".onnx", ".toml"):
+            shutil.copyfile((best / "walk.onnx").with_suffix(suffix), SHIPPED.with_suffix(suffix))
+        records = [json.loads((folder / "walk.json").read_text()) for folder in arguments.runs]
+        settings = {"options": records[0]["options"], "curves": [each["curve"] for each in records]}
+        record_ = {**settings, "evaluation": {**found, "seeds": trained}}
+        SHIPPED.with_suffix(".json").write_text(json.dumps(record_) + "\n", encoding="utf-8")
+        draw(records, found, SHIPPED, PICTURE)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
