@@ -1,7 +1,7 @@
 """Trains the bundled quadruped to trot with a velocity that it is told, by PPO on a batch.
 
     pip install -e '.[gym,onnx]' torch onnx
-    python examples/train_walk.py                      # walk/walk.{onnx,toml,json}: two million steps
+    python examples/train_walk.py                      # walk/walk.{onnx,toml,json}, a million steps
     python examples/train_walk.py --minutes 2 --seed 1 -o other
     urlab run-policy walk/walk.onnx --robot quadruped --command 0.5 0 0.3
     urlab evaluate walk/walk.onnx --task urlab/Walk-v0 --randomise
@@ -237,18 +237,20 @@ class Options(argparse.Namespace):
     threads: int
     seed: int
     episodes: int
+    report: float
     output: Path
 
 
 def parse(argv: Sequence[str] | None) -> Options:
     """Return what the command line says."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--steps", type=int, default=2_000_000, help="of all copies (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="of all copies (default: %(default)s)")
     parser.add_argument("--minutes", type=float, default=30.0, help="at most (default: %(default)g)")
     parser.add_argument("--copies", type=int, default=128, help="of the robot (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=2, help="of physics and of learning (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=100, help="of the evaluation (default: %(default)s)")
+    parser.add_argument("--report", type=float, default=0.25, metavar="MINUTES", help="how often it says and saves")
     parser.add_argument("-o", "--output", type=Path, default=Path("walk"), metavar="DIR")
     return parser.parse_args(argv, Options())
 
@@ -284,7 +286,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         steps += STEPS * options.copies
         minutes = (time.perf_counter() - started) / 60.0
         done = max(steps / options.steps, minutes / options.minutes)
-        if minutes - said > 0.25 or done >= 1.0:
+        if minutes - said >= options.report or done >= 1.0:
             said = minutes
             row = {"steps": steps, "minutes": round(minutes, 2), **task.summary(), "rate": trainer.rate}
             row["reward"] = round(trainer.reward, 3)

@@ -83,6 +83,19 @@ def sb3_batch() -> str:
     return f"{model.num_timesteps} steps, {len(model.ep_info_buffer)} episodes of 100 actions"
 
 
+def walk() -> str:
+    """The example's PPO walks better after fifteen updates than after one."""
+    example = Path(__file__).parents[1] / "examples/train_walk.py"
+    with tempfile.TemporaryDirectory() as folder:
+        options = ["--steps", "48000", "--threads", "1", "--report", "0", "--episodes", "4", "-o", folder]
+        subprocess.run([sys.executable, example, *options], check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - ours
+        curve = json.loads((Path(folder) / "walk.json").read_text())["curve"]
+    first, *_, last = (row["reward"] for row in curve)
+    if last < first + 0.05:
+        raise AssertionError(f"a reward of {first} became {last}")
+    return f"a reward per action of {first} became {last}"
+
+
 def warp() -> str:
     """MuJoCo Warp steps a batch: the same spaces, resets with the same bits, steps as near as float32 allows."""
     worst = 0.0
@@ -331,6 +344,7 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "sb3-ppo": ("stable-baselines3", sb3_ppo),
     "sb3-batch": ("stable-baselines3", sb3_batch),
     "gym-async": ("gymnasium", gym_async),
+    "walk": ("torch", walk),
     "warp": ("mujoco-warp", warp),
     "mjx": ("mujoco-mjx", mjx),
     "minari": ("minari", minari),

@@ -1,8 +1,8 @@
 """Evaluates networks of `examples/train_walk.py`, on a batch and over the wire, and draws how they learned and walk.
 
     pip install -e '.[gym,onnx,mcap,demo]'
-    python tools/walk_figures.py runs/*         # folders of trainings; prints the figures
-    python tools/walk_figures.py runs/* --ship  # also the network in examples/policies, and docs/images/walk.png
+    python tools/walk_figures.py RUN...   # folders of trainings: examples/policies/walk.{onnx,toml,json}
+    python tools/walk_figures.py          # docs/images/walk.png, of these
 
 Everything walks in the same episodes of `urlab/Walk-v0`, none of them seen in training, with friction, masses, damping,
 strength and starts that vary. The trot that `urlab demo` shows takes strides that suit the command, and keeps its own
@@ -48,6 +48,7 @@ THEIR_GAINS = Walk.scene_address.replace("kp=60,kv=2", f"kp={Trot.KP:g},kv={Trot
 ROUTE = {0.0: (0.0, 0.0, 0.0), 2.0: (0.4, 0.0, 0.0), 5.0: (0.8, 0.0, 0.0), 8.0: (0.4, 0.0, 0.5), 11.0: (-0.3, 0.0, 0.0)}
 """Commands by the second from which they hold: vx, vy (m/s), yaw rate (rad/s)."""
 SECONDS = 14.0
+FRAMES_HZ = 8.0
 
 Floats = NDArray[np.float64]
 Act = Callable[[Any], Floats]
@@ -89,15 +90,16 @@ def trot(observation: Any) -> Floats:
     return Trot.angles(phase / Trot.STRIDES_PER_S, strides, lift) / np.tile([0.3, 0.6, 0.8], 4)
 
 
-def evaluate(act: Act, address: str = Walk.scene_address, *, servers: int = 0, episodes: int = 100) -> dict[str, Any]:
-    """Return how well something walks, on a batch, or on as many servers as are given."""
+def evaluate(
+    act: Act, address: str | list[str] = Walk.scene_address, *, servers: int = 0, episodes: int = 100, **options: Any
+) -> dict[str, Any]:
+    """Return how well something walks, on a batch, or on servers: several that are started, or those of a list."""
     task = Noted()
-    options: dict[str, Any] = {"task": task, "randomise": MODEST, "autoreset_mode": AutoresetMode.DISABLED}
-    env = (
-        URLabVectorEnv(address, servers, **options)
-        if servers
-        else URLabBatchEnv(address, min(episodes, 100), **options)
-    )
+    common: dict[str, Any] = {"task": task, "randomise": MODEST, "autoreset_mode": AutoresetMode.DISABLED, **options}
+    if isinstance(address, str) and not servers:
+        env: Any = URLabBatchEnv(address, min(episodes, 100), n_threads=1, **common)
+    else:
+        env = URLabVectorEnv(address, servers or None, **common)
     try:
         found = evaluate_in(env, act, episodes=episodes)
     finally:
@@ -130,32 +132,31 @@ async def walk(network: Path, recording: Path) -> tuple[Floats, Floats]:
             policy.command = [values for start, values in ROUTE.items() if so_far.sim_time >= start][-1]
 
         policy.command = ROUTE[0.0]
-        async with record(client, recording, cameras=["quadruped/side"], camera_hz=1.0, overwrite=True):
+        async with record(client, recording, cameras=["quadruped/side"], camera_hz=FRAMES_HZ, overwrite=True):
             await run(client, policy, seconds=SECONDS, on_action=steer)
     return np.array(times), np.array(moved)
 
 
-def draw(runs: Sequence[dict[str, Any]], baselines: dict[str, dict[str, Any]], network: Path, file: Path) -> None:
+async def draw(figures: dict[str, Any]) -> None:
     """Draw frames of a walk, how all trainings learned, and how the network follows its commands."""
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "walk.mcap"
-        times, moved = asyncio.run(walk(network, recording))
+        times, moved = await walk(SHIPPED, recording)
         frames = [frame.pixels for frame in read_run(recording).frames("quadruped/side")]
     figure = plt.figure(figsize=(11, 4.8), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[1, 1.8])
-    shown = (3, 4, 6, 7, 9, 12)
+    shown = (3.0, 4.25, 6.0, 7.125, 9.25, 12.0)
     for second, axes in zip(shown, above.subplots(1, len(shown)), strict=True):
-        axes.imshow(frames[second])
-        axes.set_title(f"{second} s", fontsize=9)
+        axes.imshow(frames[round(second * FRAMES_HZ)])
+        axes.set_title(f"{second:.1f} s", fontsize=9)
         axes.axis("off")
     learning, following = below.subplots(1, 2)
-    for each in runs:
-        curve = each["curve"]
+    for curve in figures["curves"]:
         learning.plot([row["steps"] / 1e6 for row in curve], [row["reward"] for row in curve], color="C0", lw=0.8)
-    for name, style in (("zero", ":"), ("trot", "--")):
-        mean = baselines[name]["return"] / (Walk.max_episode_steps or 1)
-        learning.axhline(mean, color="grey", ls=style, label="zero output" if name == "zero" else "hand-written trot")
-    learning.plot([], [], color="C0", lw=0.8, label=f"PPO, exploring, {len(runs)} seeds")
+    learning.plot([], [], color="C0", lw=0.8, label=f"PPO while it explores, {len(figures['curves'])} seeds")
+    for name, label, style in (("trot", "hand-written trot", "--"), ("zero", "zero output", ":")):
+        mean = figures["evaluation"][name]["return"] / (Walk.max_episode_steps or 1)
+        learning.axhline(mean, color="grey", ls=style, label=label)
     learning.set(xlabel="environment steps (millions)", ylabel="reward per action", title="learning")
     learning.legend(frameon=False, fontsize=8)
     share = 1.0 / 25  # a stride has 25 actions
@@ -167,40 +168,43 @@ def draw(runs: Sequence[dict[str, Any]], baselines: dict[str, dict[str, Any]], n
             following.plot([begin, end], [command[index]] * 2, color=f"C{column}", ls="--", lw=1)
     following.set(xlabel="s", title="following commands (dashed)")
     following.legend(frameon=False, fontsize=8)
-    figure.savefig(file, dpi=110)
+    figure.savefig(PICTURE, dpi=110)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate, print and draw; return the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", nargs="+", type=Path, metavar="DIR", help="folders that train_walk.py wrote")
-    parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--servers", type=int, default=4, help="for the episodes over the wire (default: %(default)s)")
-    parser.add_argument("--ship", action="store_true", help="copy the best to examples/policies, and draw the picture")
-    arguments = parser.parse_args(argv)
-    episodes = arguments.episodes
+def assess(runs: Sequence[Path], servers: int, episodes: int) -> None:
+    """Evaluate trainings and what they are to beat; copy the best network, and write the figures beside it."""
     found = {"zero": evaluate(still, episodes=episodes), "trot": evaluate(trot, THEIR_GAINS, episodes=episodes)}
     print(json.dumps(found), flush=True)
     trained: list[dict[str, Any]] = []
-    for folder in arguments.runs:
-        row = evaluate(OnnxNetwork(folder / "walk.onnx"), episodes=episodes)
-        trained.append(row)
-        print(folder, json.dumps(row), flush=True)
-    best = arguments.runs[int(np.argmax([row["return"] for row in trained]))]
+    for folder in runs:
+        trained.append(evaluate(OnnxNetwork(folder / "walk.onnx"), episodes=episodes))
+        print(folder, json.dumps(trained[-1]), flush=True)
+    best = runs[int(np.argmax([row["return"] for row in trained]))]
+    for suffix in (".onnx", ".toml"):
+        shutil.copyfile((best / "walk.onnx").with_suffix(suffix), SHIPPED.with_suffix(suffix))
     for dialect in ("alpha", "beta"):
         address = f"{Walk.scene_address}&dialect={dialect}"
-        found[dialect] = evaluate(
-            OnnxNetwork(best / "walk.onnx"), address, servers=arguments.servers, episodes=episodes
-        )
+        found[dialect] = evaluate(OnnxNetwork(SHIPPED), address, servers=servers, episodes=episodes)
         print(best, dialect, json.dumps(found[dialect]), flush=True)
-    if arguments.ship:
-        for suffix in (".onnx", ".toml"):
-            shutil.copyfile((best / "walk.onnx").with_suffix(suffix), SHIPPED.with_suffix(suffix))
-        records = [json.loads((folder / "walk.json").read_text()) for folder in arguments.runs]
-        settings = {"options": records[0]["options"], "curves": [each["curve"] for each in records]}
-        record_ = {**settings, "evaluation": {**found, "seeds": trained}}
-        SHIPPED.with_suffix(".json").write_text(json.dumps(record_) + "\n", encoding="utf-8")
-        draw(records, found, SHIPPED, PICTURE)
+    records = [json.loads((folder / "walk.json").read_text()) for folder in runs]
+    curves = [
+        [{name: row[name] for name in ("steps", "minutes", "reward")} for row in each["curve"]] for each in records
+    ]
+    figures = {"options": records[0]["options"], "evaluation": found, "seeds": trained, "curves": curves}
+    SHIPPED.with_suffix(".json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Evaluate or draw; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", nargs="*", type=Path, metavar="DIR", help="folders that train_walk.py wrote")
+    parser.add_argument("--episodes", type=int, default=100, help="of each (default: %(default)s)")
+    parser.add_argument("--servers", type=int, default=4, help="for the episodes over the wire (default: %(default)s)")
+    arguments = parser.parse_args(argv)
+    if arguments.runs:
+        assess(arguments.runs, arguments.servers, arguments.episodes)
+    else:
+        asyncio.run(draw(json.loads(SHIPPED.with_suffix(".json").read_text())))
     return 0
 
 

@@ -180,22 +180,25 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(arms: 
     assert len(task.ends) == 4
 
 
-def test_ended_is_told_the_length_of_its_own_episode(arms: list[str], made: list[Any]) -> None:
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_ended_is_told_once_the_length_of_its_own_episode(
+    arms: list[str], made: list[Any], mode: AutoresetMode
+) -> None:
     class Falls(Reach):
-        """An episode of environment i ends after i + 2 actions."""
+        """An episode of environment i ends after i + 2 actions, and what has fallen stays so until a reset."""
 
         def __init__(self) -> None:
             self.acted, self.ends = np.zeros(3, dtype=int), []
 
         def terminated(self, states: Any) -> Any:
             self.acted += 1
-            return self.acted == np.arange(3) + 2
+            return self.acted >= np.arange(3) + 2 if mode is AutoresetMode.DISABLED else self.acted == np.arange(3) + 2
 
         def ended(self, episode: EpisodeEnd) -> None:
             self.ends.append(episode.steps)
 
     task = Falls()
-    env = URLabBatchEnv(arms[0], 3, task=task)
+    env = URLabBatchEnv(arms[0], 3, task=task, autoreset_mode=mode)
     made.append(env)
     env.reset(seed=0)
     for _ in range(4):

@@ -25,12 +25,6 @@ from urlab_client.values.names import did_you_mean
 
 Bools = NDArray[np.bool_]
 
-FALLEN_M: Final = 0.15
-"""Height of the trunk below which the quadruped has fallen, metres."""
-
-UPRIGHT: Final = 0.5
-"""Cosine of the tilt below which the quadruped has fallen."""
-
 
 class FixedReach(Task):
     """The arm holds its hand at the fixed target `TARGET_M`. The reward is the negative distance in metres."""
@@ -46,7 +40,19 @@ class FixedReach(Task):
         return -np.linalg.norm(states.site_position("arm/grip") - self.TARGET_M, axis=1)
 
 
-class Run(Task):
+class _Quadruped(Task):
+    """An episode of at most ten seconds, which terminates when the quadruped falls: low, or tilted by 60 degrees."""
+
+    FALLEN_M: Final = 0.15
+    max_episode_steps: ClassVar[int | None] = 500
+
+    def terminated(self, states: States) -> Bools:
+        """See `Task.terminated`."""
+        robot = _robot(states)
+        return (robot.qpos[:, 2] < self.FALLEN_M) | (robot.gravity[:, 2] > -0.5)
+
+
+class Run(_Quadruped):
     """The torque-controlled quadruped runs along +x as fast as it can. The episode terminates when it falls.
 
     The reward is the speed of the trunk in m/s, plus 0.5 while standing, minus a penalty on the torques.
@@ -54,17 +60,12 @@ class Run(Task):
 
     scene_address: ClassVar[str] = "sim://quadruped"
     observations: ClassVar[str | Sequence[str]] = "standard"
-    max_episode_steps: ClassVar[int | None] = 500
     reset_noise: ClassVar[float | ResetNoise] = 0.05
 
     def reward(self, states: States, actions: Any) -> Floats:
         """See `Task.reward`."""
         torques = self.scene.mapping.set_points(actions)["quadruped"]
         return states.velocities("quadruped")[:, 0] + 0.5 - 2e-4 * np.sum(torques**2, axis=1)
-
-    def terminated(self, states: States) -> Bools:
-        """See `Task.terminated`."""
-        return _fallen(states)
 
 
 class Reach(Task):
@@ -161,16 +162,15 @@ class PushPictures(Push):
     articulations: ClassVar[Sequence[str] | None] = ("arm",)
 
 
-class Walk(Task):
-    """The quadruped trots with a velocity (forward, left and yaw rate), drawn for each episode; one in ten stands still.
+class Walk(_Quadruped):
+    """The quadruped trots with a commanded velocity (forward, left and yaw rate), drawn for each episode.
 
-    Actions from -1 to 1 move the joint targets of its PD controller around the standing pose. Observations, shape (50,),
-    hold, in the base frame: linear velocity (times 2), angular velocity (0.5) and the direction of gravity (5); joint
-    positions (3), joint velocities (0.1) and the last action; sine and cosine of the stride's phase, in which diagonal
-    pairs of feet take turns; the command (3), m/s and rad/s. The reward, between 0 and 2, measures how closely the robot follows the command (up to 1.5)
-    and how closely its feet follow the stride (up to 0.5), minus penalties for a base that sways and for abrupt actions.
-    The episode terminates when the robot falls. Success means that the velocity, averaged over about a stride, differs
-    from the command by less than `CLOSE`.
+    Actions from -1 to 1 move the joint targets of its PD controller around the standing pose. Its 50 observations, in
+    the base frame: linear velocity (times 2), angular velocity (0.5), direction of gravity (5), joint positions (3),
+    joint velocities (0.1), last action, sine and cosine of the stride's phase, and the command (3), m/s and rad/s.
+    The reward, between 0 and 2, measures how closely the robot follows the command (up to 1.5) and its feet the stride
+    (up to 0.5), minus penalties for swaying and abrupt actions. Success means that the velocity, averaged over about a
+    stride, differs from the command by less than `CLOSE`. One episode in ten is about standing still.
     """
 
     LOW: Final = np.array([-0.3, -0.15, -0.5])
@@ -186,7 +186,6 @@ class Walk(Task):
     articulations: ClassVar[Sequence[str] | None] = ()  # what a policy needs to know is in `observe`
     actions: ClassVar[Actions | Mapping[str, Actions] | None] = Actions(scale=(0.3, 0.6, 0.8) * 4)  # rad
     memory: ClassVar[Mapping[str, tuple[int, ...]]] = {"velocity": (3,)}
-    max_episode_steps: ClassVar[int | None] = 500
 
     def reset(self, rng: np.random.Generator, start: Start) -> None:
         """See `Task.reset`."""
@@ -221,10 +220,6 @@ class Walk(Task):
         change = 0.02 * _squares(states.last_action - states.previous_action)
         return np.where(self.terminated(states), 0.0, np.maximum(followed + strode - sway - change, 0.0))
 
-    def terminated(self, states: States) -> Bools:
-        """See `Task.terminated`."""
-        return _fallen(states)
-
     def success(self, states: States) -> Bools:
         """See `Task.success`."""
         return np.sqrt(_squares(states.memory["velocity"] - states.goal["command"])) < self.CLOSE
@@ -248,11 +243,6 @@ def _velocity(robot: RobotState) -> Floats:
 
 def _squares(values: Floats) -> Floats:
     return np.sum(values**2, axis=1)
-
-
-def _fallen(states: States) -> Bools:
-    robot = _robot(states)
-    return (robot.qpos[:, 2] < FALLEN_M) | (-robot.gravity[:, 2] < UPRIGHT)
 
 
 TASKS: Final[dict[str, type[Task]]] = {

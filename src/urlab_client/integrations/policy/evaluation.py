@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -166,6 +166,8 @@ def evaluate_in(
     """
     if env.autoreset_mode.name != "DISABLED" or env.max_episode_steps is None:
         raise ValueError("an evaluation needs a batch with autoreset_mode=AutoresetMode.DISABLED and max_episode_steps")
+    from urlab_client.integrations.gym.vectorized import of_one
+
     seeds = episode_seeds(seed, episodes)
     space: Any = env.single_action_space
     driven: str | None = None
@@ -186,7 +188,7 @@ def evaluate_in(
         actions = np.zeros((env.num_envs, *space.shape), dtype=space.dtype)
         while going.any():
             for i in np.flatnonzero(going):
-                actions[i] = _fitting(network(_of(observations, int(i))), space)
+                actions[i] = _fitting(network(of_one(observations, int(i))), space)
             given = actions if driven is None else {driven: actions}
             observations, rewards, terminated, truncated, infos = env.step(given)
             _raise_any(infos, going)
@@ -238,14 +240,6 @@ async def evaluate_on(
         if on_episode is not None:
             on_episode(outcomes[-1])
     return Evaluation.of(outcomes, confidence)
-
-
-def _of(observations: Any, index: int) -> Any:
-    """Return the observation of one environment."""
-    if isinstance(observations, dict):
-        entries = cast("dict[str, Any]", observations)
-        return {name: _of(entry, index) for name, entry in entries.items()}
-    return observations[index]
 
 
 def _raise_any(infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
