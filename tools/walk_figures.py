@@ -159,8 +159,8 @@ async def draw(figures: dict[str, Any]) -> None:
         learning.axhline(mean, color="grey", ls=style, label=label)
     learning.set(xlabel="environment steps (millions)", ylabel="reward per action", title="learning")
     learning.legend(frameon=False, fontsize=8)
-    share = 1.0 / 25  # a stride has 25 actions
-    smooth = np.stack([np.convolve(column, np.full(25, share), mode="same") for column in moved.T], axis=1)
+    padded = np.pad(moved, ((12, 12), (0, 0)), mode="edge")
+    smooth = np.stack([np.convolve(column, np.full(25, 0.04), mode="valid") for column in padded.T], axis=1)  # a stride
     starts = [*ROUTE, SECONDS]
     for column, (index, name) in enumerate(((0, "forward (m/s)"), (2, "turning (rad/s)"))):
         following.plot(times, smooth[:, column], color=f"C{column}", label=name)

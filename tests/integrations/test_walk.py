@@ -53,7 +53,7 @@ def serving(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 def test_it_follows_commands_better_than_zero_output_and_the_trot(serving: Any, figures: ModuleType) -> None:
-    given: dict[str, Any] = {"episodes": 2, "max_episode_steps": 200}
+    given: dict[str, Any] = {"episodes": 2, "max_episode_steps": 150}
     own = serving(PD)
     walked = figures.evaluate(OnnxNetwork(NETWORK), own, **given)
     stood = figures.evaluate(figures.still, own, **given)
