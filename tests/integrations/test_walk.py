@@ -88,11 +88,12 @@ def test_its_declaration_shows_it_what_the_task_observes() -> None:
     robot, rng = env.articulations["quadruped"], np.random.default_rng(0)
     mapping = network.bind(robot)
     observation, info = env.reset(seed=3)
-    command, action = observation[-3:] / 3.0, np.zeros(12)
+    command = observation[-3:] / 3.0
+    action = np.zeros(12)
     for _ in range(5):
         seen = mapping.observe(RobotState.of(robot), command, action, info["sim_time"])
         np.testing.assert_allclose(seen, observation, atol=1e-6)
-        action = rng.uniform(-1.0, 1.0, 12).astype(np.float32)
+        action = rng.uniform(-1.0, 1.0, 12)
         targets = mapping.targets(mapping.clipped(action))
         np.testing.assert_allclose(env.mapping.set_points(action)["quadruped"][mapping.ctrl], targets)
         observation, *_, info = env.step(action)
