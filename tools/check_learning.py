@@ -174,6 +174,19 @@ def single_file() -> str:
     return f"exported; mean return of 10 episodes {json.loads(done.stdout)['mean_return']['value']:.1f}"
 
 
+def walk() -> str:
+    """The example's PPO walks better after fifteen updates than after one."""
+    example = Path(__file__).parents[1] / "examples/train_walk.py"
+    with tempfile.TemporaryDirectory() as folder:
+        options = ["--steps", "48000", "--threads", "1", "--report", "0", "--episodes", "4", "-o", folder]
+        subprocess.run([sys.executable, example, *options], check=True, stdout=subprocess.DEVNULL)  # noqa: S603 - ours
+        curve = json.loads((Path(folder) / "walk.json").read_text())["curve"]
+    first, *_, last = (row["reward"] for row in curve)
+    if last < first + 0.05:
+        raise AssertionError(f"a reward of {first} became {last}")
+    return f"a reward per action of {first} became {last}"
+
+
 def warp() -> str:
     """MuJoCo Warp steps a batch: the same spaces, resets with the same bits, steps as near as float32 allows."""
     worst = 0.0
@@ -432,6 +445,7 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "rsl-rl": ("rsl-rl-lib", rsl_rl),
     "single-file": ("torch", single_file),
     "gym-async": ("gymnasium", gym_async),
+    "walk": ("torch", walk),
     "warp": ("mujoco-warp", warp),
     "mjx": ("mujoco-mjx", mjx),
     "minari": ("minari", minari),

@@ -32,6 +32,7 @@ PICTURES = {
     "recorded_run.png": ("examples/record_run.py", "run.png"),
     "trot.webp": ("tools/home_animation.py", ""),
     "viewport.png": ("examples/viewport_picture.py", "viewport.png"),
+    "walk.png": ("tools/walk_figures.py", ""),
 }
 """Picture: the script that makes it, and the name under which an example leaves it."""
 

@@ -38,6 +38,8 @@ NOT_RUN = {
     "tests/examples/test_clone_behaviour.py runs its short form",
     r"(python examples/push_by_sight.py|urlab evaluate \S*push.onnx)": "takes minutes, and PyTorch: "
     "tests/integrations/test_evaluate.py evaluates a network that sees pictures",
+    r"(python examples/train_walk.py|urlab (evaluate|run-policy) walk/|python tools/walk_figures.py)": "takes minutes: "
+    "tools/check_learning.py trains for a moment, and tests/integrations/test_walk.py walks",
     r"urlab teleop ": "takes keys from a terminal",
     r".* --python lerobot-env/": "needs LeRobot, which has an environment of its own",
     r"(KEY=\$\()?curl ": "test_docs_console.py makes these requests",

@@ -17,8 +17,8 @@ SERVING = {"fastapi_backend"}
 # What a test of its own runs, with fewer episodes.
 SHORTENED = {"clone_behaviour"}
 
-# What no extra of the project installs: tools/check_learning.py runs three, the fourth takes some minutes.
-FOREIGN = {"learn_by_sight", "ppo", "push_by_sight", "rllib_reach"}
+# What no extra of the project installs: tools/check_learning.py runs four, the fifth takes some minutes.
+FOREIGN = {"learn_by_sight", "ppo", "push_by_sight", "rllib_reach", "train_walk"}
 
 MARKED = {
     "ray_rollouts": pytest.mark.ray,

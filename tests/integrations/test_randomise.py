@@ -54,7 +54,9 @@ PLUGIN: Any = {**BETA, "actor_names": "plugin"}
 
 
 class FreeWalk(Walk):
-    """Starts where it is put, so that what varies of the start stays."""
+    """Starts where it is put, so that what varies of the start stays; the robot's own fields are observed, too."""
+
+    articulations: ClassVar[Any] = None
 
     def reset(self, rng: np.random.Generator, start: Any) -> None:
         start.goal["command"] = rng.uniform(self.LOW, self.HIGH)

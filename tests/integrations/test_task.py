@@ -120,17 +120,26 @@ def test_all_three_environments_agree_bit_for_bit(
 
 
 def test_goals_starts_and_commands_vary_with_the_seed_alone(walkers: list[str], made: list[Any]) -> None:
-    env = URLabBatchEnv(walkers[0], 3, task=Walk())
+    class Faced(Walk):
+        """Notes where the robots look."""
+
+        faced: ClassVar[list[Any]] = []
+
+        def success(self, states: States) -> Any:
+            self.faced.append(states.positions("quadruped")[:, 3:7])
+            return super().success(states)
+
+    env = URLabBatchEnv(walkers[0], 3, task=Faced())
     made.append(env)
     first, _ = env.reset(seed=1)
     again, _ = env.reset(seed=1)
     other, _ = env.reset(seed=2)
     assert np.array_equal(first, again)
     assert np.array_equal(first[1:], other[:2]), "environment i has the seed s + i"
-    commands = first[:, -3:]
+    commands = first[:, -3:] / 3.0
     assert ((commands >= Walk.LOW) & (commands <= Walk.HIGH)).all()
     assert len(np.unique(commands)) == 9
-    quaternions = first[:, 3:7]
+    quaternions = Faced.faced[0]
     assert len(np.unique(quaternions[:, 0])) == 3, "it looks another way each time"
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0)
 
@@ -172,22 +181,25 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(arms: 
     assert len(task.ends) == 4
 
 
-def test_ended_is_told_the_length_of_its_own_episode(arms: list[str], made: list[Any]) -> None:
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_ended_is_told_once_the_length_of_its_own_episode(
+    arms: list[str], made: list[Any], mode: AutoresetMode
+) -> None:
     class Falls(Reach):
-        """An episode of environment i ends after i + 2 actions."""
+        """An episode of environment i ends after i + 2 actions, and what has fallen stays so until a reset."""
 
         def __init__(self) -> None:
             self.acted, self.ends = np.zeros(3, dtype=int), []
 
         def terminated(self, states: Any) -> Any:
             self.acted += 1
-            return self.acted == np.arange(3) + 2
+            return self.acted >= np.arange(3) + 2 if mode is AutoresetMode.DISABLED else self.acted == np.arange(3) + 2
 
         def ended(self, episode: EpisodeEnd) -> None:
             self.ends.append(episode.steps)
 
     task = Falls()
-    env = URLabBatchEnv(arms[0], 3, task=task)
+    env = URLabBatchEnv(arms[0], 3, task=task, autoreset_mode=mode)
     made.append(env)
     env.reset(seed=0)
     for _ in range(4):

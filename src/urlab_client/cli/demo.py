@@ -216,25 +216,27 @@ class Trot:
         self._qvel = np.array([joint.qvel_local_offset for joint in joints])
         self._ctrl = np.array([robot.actuators[joint.name].ctrl_local.start for joint in joints])
         self._strides = self.STRIDE_M * (1 + turn * self.SIDES)
-        self._height = 2 * self.LINK_M * math.cos(self.BEND)
 
     def act(self, time: float) -> None:
         """Write the set-points for the next step, `time` seconds into the simulation."""
-        error = self._angles(time) - self._robot.qpos_array[self._qpos]
+        share = min(1.0, time / self.RAMP_S)
+        error = self.angles(time, share * self._strides, share) - self._robot.qpos_array[self._qpos]
         self._robot.ctrl_array[self._ctrl] = self.KP * error - self.KD * self._robot.qvel_array[self._qvel]
 
-    def _angles(self, time: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-        phase = (time * self.STRIDES_PER_S + self.PHASES) % 1
-        grounded = phase < self.ON_GROUND
+    @classmethod
+    def angles(cls, time: float, strides: Floats, lift: float = 1.0) -> Floats:
+        """Return the joint angles, shape (12,), from each leg's stride in metres and the share of the full lift."""
+        phase = (time * cls.STRIDES_PER_S + cls.PHASES) % 1
+        grounded = phase < cls.ON_GROUND
         # Progress through the part of the stride the leg is in; the arc starts and ends at rest.
-        part = np.where(grounded, phase / self.ON_GROUND, (phase - self.ON_GROUND) / (1 - self.ON_GROUND))
+        part = np.where(grounded, phase / cls.ON_GROUND, (phase - cls.ON_GROUND) / (1 - cls.ON_GROUND))
         arc = part - np.sin(2 * math.pi * part) / (2 * math.pi)
-        share = min(1.0, time / self.RAMP_S)
-        x = share * self._strides * np.where(grounded, 0.5 - part, arc - 0.5)
-        z = np.where(grounded, 0.0, share * self.LIFT_M * np.sin(math.pi * part) ** 2) - self._height
+        x = strides * np.where(grounded, 0.5 - part, arc - 0.5)
+        height = 2 * cls.LINK_M * math.cos(cls.BEND)
+        z = np.where(grounded, 0.0, lift * cls.LIFT_M * np.sin(math.pi * part) ** 2) - height
         slope = np.arctan2(-x, -z)
-        bend = np.arccos(np.hypot(x, z) / (2 * self.LINK_M))
-        thigh, calf = slope + bend - self.BEND, 2 * (self.BEND - bend)
+        bend = np.arccos(np.hypot(x, z) / (2 * cls.LINK_M))
+        thigh, calf = slope + bend - cls.BEND, 2 * (cls.BEND - bend)
         return np.column_stack([np.zeros_like(thigh), thigh, calf]).ravel()
 
 

@@ -67,13 +67,8 @@ class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any
         parts = np.split(np.asarray(action), np.cumsum([*self._widths.values()])[:-1])
         by_key: Any = dict(zip(self._widths, parts, strict=True))
         observation, reward, terminated, truncated, info = self.env.step(by_key)
-        return (
-            self._renamed(observation),
-            reward,
-            terminated,
-            truncated,
-            {**info, "is_success": info.get("success", False)},
-        )
+        info = {**info, "is_success": info.get("success", False)}
+        return self._renamed(observation), reward, terminated, truncated, info
 
     def _renamed(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         fields = [
@@ -82,7 +77,7 @@ class ForLeRobot(gymnasium.Wrapper[dict[str, Any], NDArray[np.float32], Any, Any
             if key not in ("cameras", "task")
             for value in by_field.values()
         ]
-        renamed: dict[str, Any] = {"agent_pos": np.concatenate(fields).astype(np.float32)}
+        renamed: dict[str, Any] = {"agent_pos": np.concatenate([np.zeros(0), *fields]).astype(np.float32)}
         if "task" in observation:
             renamed["environment_state"] = np.asarray(observation["task"], dtype=np.float32)
         if "cameras" in observation:

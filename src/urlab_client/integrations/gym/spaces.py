@@ -296,7 +296,8 @@ class SpaceMapping:
         """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
         if self.mode == "dict":
             return {key: {field: np.array(read(key, field)) for field in self.fields} for key in self.observed}
-        return np.concatenate([read(key, field) for key in self.observed for field in self.fields], axis=-1)
+        parts = [read(key, field) for key in self.observed for field in self.fields]
+        return np.concatenate(parts, axis=-1) if parts else np.zeros(0)
 
     def field(self, observation: Observation, key: str, field: Field) -> Floats:
         """Return the view of one field in an observation of either mode, shape (…, n).

@@ -218,17 +218,19 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self.elapsed >= limit
         if errors:
             truncated[list(errors)] = True
-        self._ended = terminated | truncated
+        ended = terminated | truncated
         self._totals += rewards
         self._note(
             acting if not errors else np.setdiff1d(acting, [*errors]),
             lambda i: self._transition(i, flat, rewards, terminated, truncated),
         )
-        if self._ended.any():
-            if self.task is not None:
-                self._tell_ends(self.task, terminated, errors, infos)
-            if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                infos = self._same_step_reset(errors, infos)
+        news = ended & ~self._ended  # those that failed are marked already
+        if self.task is not None and news.any():
+            self._tell_ends(self.task, news, terminated, infos)
+        # Without autoreset, an environment may be stepped after the end of its episode.
+        self._ended = ended | self._ended if self.autoreset_mode is AutoresetMode.DISABLED else ended
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
 
     def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
@@ -344,13 +346,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Call a function for rewards or terminations of all environments; the last of `trees` are the infos."""
         return function(*trees)
 
-    def _tell_ends(self, task: Task, terminated: Bools, errors: Mapping[int, Exception], infos: dict[str, Any]) -> None:
+    def _tell_ends(self, task: Task, ended: Bools, terminated: Bools, infos: dict[str, Any]) -> None:
         states = self._states(self._all)
         success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
-        for i in np.flatnonzero(self._ended).tolist():
-            if i not in errors:
-                steps, total = int(self.elapsed[i]), float(self._totals[i])
-                task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
+        for i in np.flatnonzero(ended).tolist():
+            steps, total = int(self.elapsed[i]), float(self._totals[i])
+            task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
 
     def _same_step_reset(self, errors: Mapping[int, Exception], infos: dict[str, Any]) -> dict[str, Any]:
         ended = self._ended.copy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -169,6 +169,8 @@ def evaluate_in(
     """
     if env.autoreset_mode.name != "DISABLED" or env.max_episode_steps is None:
         raise ValueError("an evaluation needs a batch with autoreset_mode=AutoresetMode.DISABLED and max_episode_steps")
+    from urlab_client.integrations.gym.vectorized import of_one
+
     seeds = episode_seeds(seed, episodes)
     space: Any = env.single_action_space
     driven: str | None = None
@@ -192,7 +194,7 @@ def evaluate_in(
             seen = [*seen[1:], observations]
             latest = joined(seen)
             for i in np.flatnonzero(going):
-                actions[i] = _fitting(network(_of(latest, int(i))), space)
+                actions[i] = _fitting(network(of_one(latest, int(i))), space)
             given = actions if driven is None else {driven: actions}
             observations, rewards, terminated, truncated, infos = env.step(given)
             _raise_any(infos, going)
@@ -249,14 +251,6 @@ async def evaluate_on(
 def joined(observations: Sequence[Any]) -> Any:
     """Return observations, oldest first, as the input of a network: one as it is, several concatenated."""
     return observations[0] if len(observations) == 1 else np.concatenate(observations, axis=-1)
-
-
-def _of(observations: Any, index: int) -> Any:
-    """Return the observation of one environment."""
-    if isinstance(observations, dict):
-        entries = cast("dict[str, Any]", observations)
-        return {name: _of(entry, index) for name, entry in entries.items()}
-    return observations[index]
 
 
 def _raise_any(infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
