@@ -370,7 +370,7 @@ class _Rehearsal:
         for _ in range(DRAWN):
             memory = {name: np.zeros(shape) for name, shape in task.memory.items()}
             model = task.scene.model
-            task.reset(rng, Start(task.scene, np.array(model.qpos0), np.zeros(model.nv), memory=memory))
+            task.reset(rng, Start(task.scene, np.array(model.qpos0), np.zeros(int(model.nv)), memory=memory))
         drawn = np.round(self._goals, 4)
         low, high = drawn.min(axis=0), drawn.max(axis=0)
         limits: dict[str, Floats] = {"default": np.round((low + high) / 2, 4), "low": low, "high": high}
