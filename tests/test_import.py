@@ -149,3 +149,19 @@ def test_the_version_is_that_of_the_distribution() -> None:
     assert urlab_client.__version__ == version("urlab-client")
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = urlab_client.nonsense  # type: ignore[attr-defined]
+
+
+def test_why_a_name_cannot_be_loaded_is_said(tmp_path: Path) -> None:
+    # As PyOpenGL does where MUJOCO_GL names a library that is missing. Python hides it: "cannot import name".
+    (tmp_path / "mujoco.py").write_text("None.eglQueryString", encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", "from urlab_client.server import SimulatedServer"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("ImportError: cannot load urlab_client.server.simulated: ")
+    assert done.stderr.endswith("'NoneType' object has no attribute 'eglQueryString'\n")
