@@ -101,13 +101,14 @@ class Stage:
         dtype = "float32" if mode is CameraMode.DEPTH else "bgra8"
         return CameraFrame(width=width, height=height, dtype=dtype, data=pixels.tobytes())
 
-    def pixels(self, data: mujoco.MjData, camera: SceneCamera, mode: CameraMode) -> NDArray[Any]:
-        """Draw what a camera sees; return it from the top, as the wire has it.
+    def pixels(self, data: mujoco.MjData, camera: SceneCamera, mode: CameraMode, order: str = "BGRA") -> NDArray[Any]:
+        """Draw what a camera sees; return it from the top, as the wire has it unless `order` says otherwise.
 
         Args:
             data: The state, after `prepare`.
             camera: The camera.
             mode: What the pixels mean.
+            order: Of mode `real`: `BGRA` or `RGBA`.
 
         Returns:
             Blue, green, red and alpha, shape (height, width, 4), uint8; of depth centimetres, shape (height, width),
@@ -133,7 +134,7 @@ class Stage:
             mujoco.mjr_readPixels(None, depth, area, self._renderer)
             return _centimetres(depth, self._scene.camera[0])[::-1]
         if mode is CameraMode.REAL:
-            return self._read_colors(area, "BGRA")
+            return self._read_colors(area, order)
         colors = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(colors, None, area, self._renderer)
         return self._segments(colors[::-1], mode)

@@ -71,6 +71,8 @@ class PictureScene:
 
     def _picture(self, stage: Stage, data: mujoco.MjData, name: str) -> Pixels:
         camera, mode = self.cameras[name], self.mode(name)
+        if mode is CameraMode.REAL:  # no wire between the two, so no pass over the pixels to swap colours
+            return stage.pixels(data, camera, mode, "RGBA")
         pixels = np.ascontiguousarray(stage.pixels(data, camera, mode))
         return decode_camera(pixels.data.cast("B"), mode, *camera.resolution, where=name).pixels
 
