@@ -86,23 +86,11 @@ _HOMES = ("enums", "errors", "types", "events", "sync")
 
 def __getattr__(name: str) -> Any:
     if name in {"aio", "protocol", *_HOMES}:
-        return load_module(name)
+        return import_module(f"urlab_client.{name}")
     if name.startswith("_") and name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = _load(name)
     return value
-
-
-def load_module(name: str) -> Any:
-    """Return a module of this package.
-
-    Raises:
-        ImportError: Also for an `AttributeError` in it, as MuJoCo's without OpenGL: `from … import` would hide that.
-    """
-    try:
-        return import_module(f"urlab_client.{name}")
-    except AttributeError as error:
-        raise ImportError(f"cannot load urlab_client.{name}: {error}") from error
 
 
 def _load(name: str) -> Any:
@@ -111,7 +99,7 @@ def _load(name: str) -> Any:
         return import_module("importlib.metadata").version("urlab-client")
     try:
         for home in _HOMES:
-            module = load_module(home)
+            module = import_module(f"urlab_client.{home}")
             if name in module.__all__:
                 return getattr(module, name)
     except ImportError as error:

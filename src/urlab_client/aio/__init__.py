@@ -1,8 +1,7 @@
 """The async core: `URLabClient` and the classes of the objects that it returns."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from urlab_client import load_module
 
 if TYPE_CHECKING:
     from urlab_client.aio.articulation import URLabArticulation, URLabEntity
@@ -21,7 +20,7 @@ _HOMES = ("defaults", "launch", "model.elements", "controllers", "client")
 def __getattr__(name: str) -> Any:
     """Load what is asked for: a process that only compiles models starts sooner without the rest."""
     for home in _HOMES if name in __all__ else ():
-        module = load_module(f"aio.{home}")
+        module = import_module(f"{__name__}.{home}")
         if hasattr(module, name):
             value = globals()[name] = getattr(module, name)
             return value

@@ -4,9 +4,8 @@ For tests, demonstrations and offline work; `urlab serve` runs the same server f
 loaded on first access, with MuJoCo.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from urlab_client import load_module
 
 if TYPE_CHECKING:
     from urlab_client.server.assets.bundled_robots import bundled_models
@@ -32,14 +31,18 @@ _NAMES = {
     "simulation.controller_config": ("ControllerConfig",),
     "simulation.opengl": ("RenderingUnavailable",),
 }
-_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+_HOMES = {name: f"urlab_client.{module}" for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for: a process that only compiles models starts sooner without the rest."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(load_module(_HOMES[name]), name)
+    try:
+        module = import_module(_HOMES[name])
+    except AttributeError as error:  # as MuJoCo's without OpenGL; `from … import` would say only that there is no name
+        raise ImportError(f"cannot load {_HOMES[name]}: {error}") from error
+    value = globals()[name] = getattr(module, name)
     return value
 
 
