@@ -149,6 +149,15 @@ def test_a_dataset_has_rewards_successes_and_ends(
     rewards = [each["reward"] for each in told]
     assert [frame["next.reward"][0] for frame in half[0]] == [np.float32(sum(rewards[:2])), np.float32(rewards[2])]
     assert [frame["next.done"][0] for frame in half[1]] == [True]
+    assert write_lerobot(whole, tmp_path / "double", python=lerobot, task="reach", fps=100) == 16
+    doubled = [float(frame["next.reward"][0]) for frame in frames("double")[0]]
+    assert doubled == [
+        0,
+        np.float32(told[0]["reward"]),
+        0,
+        np.float32(told[1]["reward"]),
+        np.float32(told[2]["reward"]),
+    ]
     assert run(*command) == 2
     assert "--overwrite replaces it" in capsys.readouterr().err
     (tmp_path / "all" / "precious").touch()
@@ -189,7 +198,11 @@ def test_servers_in_lockstep_are_recorded_each_into_a_file(tmp_path: Path) -> No
         rewards = [servers.step(np.full((2, 7), 0.1, dtype=np.float32))[1].tolist() for _ in range(5)]
     with pytest.raises(FileExistsError), servers.recording(tmp_path / "runs"):
         pass
-    servers.close()
+    with servers.recording(tmp_path / "closed", pose_hz=0) as closed:
+        servers.reset(seed=5)
+        servers.step(np.full((2, 7), 0.1, dtype=np.float32))
+        servers.close()
+    assert [(run.summary().complete, len(transitions_of(run))) for run in map(read_run, closed)] == [(True, 1)] * 2
     for number, file in enumerate(files):
         pairs = transitions_of(read_run(file))
         told = [each[number] for i, each in enumerate(rewards) if i != 3]  # the fourth step begins an episode

@@ -57,7 +57,7 @@ def varied(model: mujoco.MjModel, **vary: Any) -> tuple[Any, dict[str, Any], Any
     ratio = {name: values / before[name] for name, values in after.items() if not np.array_equal(values, before[name])}
     moved = {name: after[name] - before[name] for name in ratio}
     qpos = np.array(model.qpos0)
-    variation.start(draws, qpos)
+    variation.start(draws, qpos, np.zeros(model.nv))
     return ratio, moved, (draws.to_dict()["varied"][0]["drawn"], qpos)
 
 
