@@ -12,7 +12,7 @@ import pytest
 
 import urlab_client
 from tests.integrations.test_record_export import lerobot, run  # noqa: F401  # a fixture
-from urlab_client.integrations.gym import Reach, States, URLabEnv, URLabVectorEnv
+from urlab_client.integrations.gym import Reach, Start, States, URLabEnv, URLabVectorEnv
 from urlab_client.integrations.record import read_run, record, transitions_of
 from urlab_client.integrations.record.export import write_lerobot
 from urlab_client.randomise import Delay, Randomisation
@@ -230,3 +230,21 @@ def expected_target(seed: int) -> Any:
     seen, _ = env.reset(seed=seed)
     env.close()
     return seen[-6:-3]
+
+
+class Oddly(Brief):
+    """A goal of a truth value and of an integer, whose names functions use for their own arguments."""
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        super().reset(rng, start)
+        start.goal |= {"source": np.array(True), "self": np.array([1, 2])}
+
+
+def test_goals_may_have_any_name_and_kind_of_number(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    env = URLabEnv(client, task=Oddly())
+    with record(client, tmp_path / "run.mcap", pose_hz=0):
+        drive(env, ELBOW[:1])
+    env.close()
+    pairs = transitions_of(read_run(tmp_path / "run.mcap"))
+    assert pairs.columns["goal/source"].values.tolist() == [[1.0]] * 3
+    assert pairs.columns["goal/self"].values.tolist() == [[1.0, 2.0]] * 3
