@@ -248,3 +248,35 @@ def test_goals_may_have_any_name_and_kind_of_number(client: urlab_client.URLabCl
     pairs = transitions_of(read_run(tmp_path / "run.mcap"))
     assert pairs.columns["goal/source"].values.tolist() == [[1.0]] * 3
     assert pairs.columns["goal/self"].values.tolist() == [[1.0, 2.0]] * 3
+
+
+def test_a_pinned_mode_only_costs_the_pictures_of_starts(opengl: None, tmp_path: Path) -> None:
+    with (
+        SimulatedServer("arm", play=True, step_mode="direct") as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        env = URLabEnv(client, task=Brief())
+        with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50, pose_hz=0):
+            told = drive(env, ELBOW)
+        env.close()
+    whole = read_run(tmp_path / "run.mcap")
+    assert len(transitions_of(whole)) == len(told)
+    assert len(whole.picture_times("arm/wrist")) == len(told)
+
+
+def test_a_recording_may_begin_and_end_within_episodes(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    env = URLabEnv(client, task=Brief())
+    action = np.full(7, 0.1, dtype=np.float32)
+    env.reset(seed=1)
+    env.step(action)
+    with record(client, tmp_path / "run.mcap", pose_hz=0):
+        rewards = [env.step(action)[1] for _ in range(2)][1:]  # the first one led to the first state that is recorded
+        env.reset()
+        rewards.append(env.step(action)[1])
+        env.reset()
+        rewards.append(env.step(action)[1])
+    env.close()
+    pairs = transitions_of(read_run(tmp_path / "run.mcap"))
+    assert pairs.columns["task/reward"].values[:, 0].tolist() == rewards
+    assert pairs.episode.tolist() == [0, 1, 2]
