@@ -85,7 +85,7 @@ def shapes_of(model: mujoco.MjModel, bodies: list[str]) -> list[Shape]:
     """
     names = model_names(model, "geom")
     found: list[Shape] = []
-    for geom, rgba in enumerate(shown_colours(model, model.geom_rgba, np.arange(model.ngeom))):
+    for geom, rgba in enumerate(shown_colours(model, model.geom_rgba, np.arange(int(model.ngeom)))):
         if int(model.geom_group[geom]) >= _VISIBLE_GROUPS or rgba[3] == 0:
             continue
         outline = _outline(model, geom)
