@@ -43,6 +43,7 @@ def spans(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -
     return first + np.arange(lengths.sum(), dtype=np.intp)
 
 
+_NO_COLOUR = (0.5, 0.5, 0.5, 1.0)  # of geoms, as MuJoCo compiles them
 _NAME_ADDRESSES = {
     "body": "name_bodyadr",
     "joint": "name_jntadr",
@@ -62,6 +63,14 @@ def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
     pool = model.names
     addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
     return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
+
+
+def shown_colours(model: mujoco.MjModel, rgba: NDArray[Any], geoms: NDArray[np.intp]) -> NDArray[Any]:
+    """Return a copy of the colours that are drawn: those of the material, unless a geom has one of its own."""
+    shown, material = rgba[geoms], model.geom_matid[geoms]
+    covered = np.flatnonzero((material >= 0) & (shown == _NO_COLOUR).all(axis=1))
+    shown[covered] = model.mat_rgba[material[covered]]
+    return shown
 
 
 # Since 3.11 an actuator may have several controls and forces; before, `nu` counted both actuators and controls.

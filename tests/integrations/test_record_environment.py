@@ -12,7 +12,7 @@ import pytest
 
 import urlab_client
 from tests.integrations.test_record_export import lerobot, run  # noqa: F401  # a fixture
-from urlab_client.integrations.gym import Reach, States, URLabEnv, URLabVectorEnv
+from urlab_client.integrations.gym import Reach, Start, States, URLabEnv, URLabVectorEnv
 from urlab_client.integrations.record import read_run, record, transitions_of
 from urlab_client.integrations.record.export import write_lerobot
 from urlab_client.randomise import Delay, Randomisation
@@ -149,6 +149,15 @@ def test_a_dataset_has_rewards_successes_and_ends(
     rewards = [each["reward"] for each in told]
     assert [frame["next.reward"][0] for frame in half[0]] == [np.float32(sum(rewards[:2])), np.float32(rewards[2])]
     assert [frame["next.done"][0] for frame in half[1]] == [True]
+    assert write_lerobot(whole, tmp_path / "double", python=lerobot, task="reach", fps=100) == 16
+    doubled = [float(frame["next.reward"][0]) for frame in frames("double")[0]]
+    assert doubled == [
+        0,
+        np.float32(told[0]["reward"]),
+        0,
+        np.float32(told[1]["reward"]),
+        np.float32(told[2]["reward"]),
+    ]
     assert run(*command) == 2
     assert "--overwrite replaces it" in capsys.readouterr().err
     (tmp_path / "all" / "precious").touch()
@@ -189,7 +198,11 @@ def test_servers_in_lockstep_are_recorded_each_into_a_file(tmp_path: Path) -> No
         rewards = [servers.step(np.full((2, 7), 0.1, dtype=np.float32))[1].tolist() for _ in range(5)]
     with pytest.raises(FileExistsError), servers.recording(tmp_path / "runs"):
         pass
-    servers.close()
+    with servers.recording(tmp_path / "closed", pose_hz=0) as closed:
+        servers.reset(seed=5)
+        servers.step(np.full((2, 7), 0.1, dtype=np.float32))
+        servers.close()
+    assert [(run.summary().complete, len(transitions_of(run))) for run in map(read_run, closed)] == [(True, 1)] * 2
     for number, file in enumerate(files):
         pairs = transitions_of(read_run(file))
         told = [each[number] for i, each in enumerate(rewards) if i != 3]  # the fourth step begins an episode
@@ -217,3 +230,53 @@ def expected_target(seed: int) -> Any:
     seen, _ = env.reset(seed=seed)
     env.close()
     return seen[-6:-3]
+
+
+class Oddly(Brief):
+    """A goal of a truth value and of an integer, whose names functions use for their own arguments."""
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        super().reset(rng, start)
+        start.goal |= {"source": np.array(True), "self": np.array([1, 2])}
+
+
+def test_goals_may_have_any_name_and_kind_of_number(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    env = URLabEnv(client, task=Oddly())
+    with record(client, tmp_path / "run.mcap", pose_hz=0):
+        drive(env, ELBOW[:1])
+    env.close()
+    pairs = transitions_of(read_run(tmp_path / "run.mcap"))
+    assert pairs.columns["goal/source"].values.tolist() == [[1.0]] * 3
+    assert pairs.columns["goal/self"].values.tolist() == [[1.0, 2.0]] * 3
+
+
+def test_a_pinned_mode_only_costs_the_pictures_of_starts(opengl: None, tmp_path: Path) -> None:
+    with (
+        SimulatedServer("arm", play=True, step_mode="direct") as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        env = URLabEnv(client, task=Brief())
+        with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50, pose_hz=0):
+            told = drive(env, ELBOW)
+        env.close()
+    whole = read_run(tmp_path / "run.mcap")
+    assert len(transitions_of(whole)) == len(told)
+    assert len(whole.picture_times("arm/wrist")) == len(told)
+
+
+def test_a_recording_may_begin_and_end_within_episodes(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    env = URLabEnv(client, task=Brief())
+    action = np.full(7, 0.1, dtype=np.float32)
+    env.reset(seed=1)
+    env.step(action)
+    with record(client, tmp_path / "run.mcap", pose_hz=0):
+        rewards = [env.step(action)[1] for _ in range(2)][1:]  # the first one led to the first state that is recorded
+        env.reset()
+        rewards.append(env.step(action)[1])
+        env.reset()
+        rewards.append(env.step(action)[1])
+    env.close()
+    pairs = transitions_of(read_run(tmp_path / "run.mcap"))
+    assert pairs.columns["task/reward"].values[:, 0].tolist() == rewards
+    assert pairs.episode.tolist() == [0, 1, 2]

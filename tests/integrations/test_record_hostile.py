@@ -31,7 +31,7 @@ from urlab_client.cli import main
 from urlab_client.console.messages import state_message
 from urlab_client.console.pictures import _jpeg_of
 from urlab_client.console.recordings import _described
-from urlab_client.console.replay import _opened, _present, _Robot, _snapshot
+from urlab_client.console.replay import _opened, _present, _Robot
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
@@ -119,7 +119,7 @@ def replayed(path: Path) -> None:
     for time in np.linspace(start, end, 5).tolist():
         found = run.state_at(time)
         if found is not None:
-            json.dumps(state_message(0, _snapshot(found, _present(found, robots), found.time - start), {}), default=str)
+            json.dumps(state_message(0, found.snapshot(found.time - start, _present(found, robots)), {}), default=str)
         for name in cameras:
             _jpeg_of(run.encoded_picture_at(name.removeprefix("-/"), time))
 

@@ -190,7 +190,7 @@ def test_a_declaration_of_actions_that_does_not_fit_is_refused(levers: list[str]
     ):
         with pytest.raises(ValueError, match=problem):
             URLabBatchEnv(levers[0], 1, actions=wrong)  # type: ignore[arg-type]
-    with pytest.raises(UnknownKeyframe, match="'lowered' does not name"):
+    with pytest.raises(UnknownKeyframe, match="no keyframe 'lowered'"):
         URLabBatchEnv(levers[0], 1, actions=Actions(offset="lowered"))
     with pytest.raises(ValueError, match="clip must be"):
         Actions(clip=(1.0, 1.0))

@@ -56,9 +56,9 @@ def varied(model: mujoco.MjModel, **vary: Any) -> tuple[Any, dict[str, Any], Any
     assert all(np.array_equal(field(name), values) for name, values in before.items())
     ratio = {name: values / before[name] for name, values in after.items() if not np.array_equal(values, before[name])}
     moved = {name: after[name] - before[name] for name in ratio}
-    qpos = np.array(model.qpos0)
-    variation.start(draws, qpos)
-    return ratio, moved, (draws.to_dict()["varied"][0]["drawn"], qpos)
+    qpos, qvel = np.array(model.qpos0), np.zeros(model.nv)
+    variation.start(draws, qpos, qvel)
+    return ratio, moved, (draws.to_dict()["varied"][0]["drawn"], qpos, qvel)
 
 
 FIELDS = (
@@ -75,12 +75,12 @@ def test_each_quantity_changes_what_it_says_and_nothing_else(model: mujoco.MjMod
 
     def scaled(what: str, **options: Any) -> tuple[Any, dict[str, float]]:
         tested.add(what)
-        ratio, _, (drawn, _) = varied(model, what=what, scale=(1.5, 2.0), **options)
+        ratio, _, (drawn, *_) = varied(model, what=what, scale=(1.5, 2.0), **options)
         return ratio, drawn
 
     def moved(what: str, by: str = "add", **options: Any) -> tuple[dict[str, Any], dict[str, Any], Any]:
         tested.add(what)
-        _, found, (drawn, qpos) = varied(model, what=what, **{by: (0.1, 0.2)}, **options)
+        _, found, (drawn, qpos, _) = varied(model, what=what, **{by: (0.1, 0.2)}, **options)
         return found, drawn, qpos
 
     ratio, drawn = scaled("friction", on="rod")
@@ -142,6 +142,16 @@ def test_each_quantity_changes_what_it_says_and_nothing_else(model: mujoco.MjMod
     np.testing.assert_allclose(qpos[:3], np.array([0, 0, 1]) + next(iter(drawn.values())))
     _, drawn, qpos = moved("base_yaw", by="set")
     assert 2 * np.arctan2(qpos[6], qpos[3]) == pytest.approx(next(iter(drawn.values())))
+    for what, on, dofs in (
+        ("velocity", "hinge", [6]),
+        ("base_velocity", "box", [0, 1, 2]),
+        ("base_spin", "box", [3, 4, 5]),
+    ):
+        tested.add(what)
+        ratio, _, (drawn, _, qvel) = varied(model, what=what, on=on, add=(0.1, 0.2))
+        assert not ratio
+        np.testing.assert_allclose(qvel[dofs], np.ravel([*drawn.values()]))
+        assert np.flatnonzero(qvel).tolist() == dofs
     assert tested == set(QUANTITIES)
 
 

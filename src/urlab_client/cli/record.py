@@ -65,10 +65,10 @@ def run(arguments: Namespace) -> int:
     import_mujoco()
     if arguments.task is None:
         arguments.address = arguments.address or "tcp://localhost"
+        if arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
+            raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     elif arguments.keyframe is not None:
         raise CommandError("--keyframe cannot be combined with --task, which determines the start")
-    elif arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
-        raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     check_recording(arguments.output, arguments)
     if arguments.camera and (arguments.address is None or arguments.address.startswith("sim://")):
         from urlab_client.simulation.opengl import need_backend

@@ -96,7 +96,7 @@ def _in_task(arguments: Namespace, path: Path, kind: type[Task], history: int) -
     with (
         task_environment(arguments, kind, max_episode_steps=sys.maxsize) as env,
         contextlib.ExitStack() as stack,
-        progress_bar(kind.__name__, arguments.seconds) as progress,
+        progress_bar(arguments.task or kind.__name__, arguments.seconds) as progress,
     ):
         network: Any = task_network(path, env.observation_space, env.action_space, history)
         if arguments.record is not None:
@@ -116,7 +116,7 @@ def _in_task(arguments: Namespace, path: Path, kind: type[Task], history: int) -
     if arguments.json:
         print(json_line({**found, "terminated": terminated}))
     else:
-        print(f"{arguments.policy.name} in {kind.__name__}, {info['sim_time']:.1f} s of simulation")
+        print(f"{arguments.policy.name} in {arguments.task or kind.__name__}, {info['sim_time']:.1f} s of simulation")
         row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
         print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import model_names
+from urlab_client._mujoco import model_names, shown_colours
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Vary
 from urlab_client.values.names import NameMap, spellings
@@ -63,9 +63,6 @@ DERIVED_FROM: Final = frozenset(
 _FIXED, _AFFINE, _NO_BIAS = 0, 1, 0  # mjGAIN_FIXED, mjGAIN_AFFINE and mjBIAS_AFFINE, mjBIAS_NONE
 _ANY: Final = (-np.inf, np.inf)
 _POSITIVE: Final = (0.0, np.inf)
-_NO_COLOUR: Final = (0.5, 0.5, 0.5, 1.0)
-"""The colour of a geom for which its material's is drawn."""
-
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -127,7 +124,7 @@ def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, 
             gravity = fields("opt.gravity")
             gravity[:] = _changed(vary, gravity, drawn[0])
         case "colour":
-            shown = _shown_colours(model, fields("geom_rgba"), ids)
+            shown = shown_colours(model, fields("geom_rgba"), ids)
             shown[:, :3] = np.clip(_changed(vary, shown[:, :3], drawn), 0.0, 1.0)
             fields("geom_rgba")[ids] = shown
         case "camera_rotation":
@@ -152,14 +149,6 @@ def _changed(vary: Vary, values: NDArray[Any], drawn: Floats) -> NDArray[Any]:
             return values + drawn
         case "set":
             return np.broadcast_to(drawn, values.shape)
-
-
-def _shown_colours(model: mujoco.MjModel, rgba: NDArray[Any], ids: Ints) -> NDArray[Any]:
-    """Return a copy of the colours that are drawn: those of the material, unless a geom has one of its own."""
-    shown, material = rgba[ids], model.geom_matid[ids]
-    covered = np.flatnonzero((material >= 0) & (shown == _NO_COLOUR).all(axis=1))
-    shown[covered] = model.mat_rgba[material[covered]]
-    return shown
 
 
 def _write_gain(what: str, ids: Ints, factors: Floats, model: mujoco.MjModel, fields: Fields) -> None:

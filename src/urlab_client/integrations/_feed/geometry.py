@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import model_names
+from urlab_client._mujoco import model_names, shown_colours
 from urlab_client.integrations._feed.messages import (
     Color,
     CylinderPrimitive,
@@ -32,7 +32,6 @@ _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers: 0 to 2 are shown; collision geome
 _EVERYTHING = 1  # SceneEntityDeletion.ALL
 _PLANE_M = 20.0  # size of infinite planes
 _PLANE_THICKNESS_M = 0.001
-_NO_COLOUR = (0.5, 0.5, 0.5, 1.0)  # of geoms, as MuJoCo compiles them
 
 
 class Kind(StrEnum):
@@ -86,11 +85,7 @@ def shapes_of(model: mujoco.MjModel, bodies: list[str]) -> list[Shape]:
     """
     names = model_names(model, "geom")
     found: list[Shape] = []
-    for geom in range(model.ngeom):
-        rgba = model.geom_rgba[geom]
-        material = int(model.geom_matid[geom])
-        if material >= 0 and np.array_equal(rgba, _NO_COLOUR):  # the material applies if the geom has none of its own
-            rgba = model.mat_rgba[material]
+    for geom, rgba in enumerate(shown_colours(model, model.geom_rgba, np.arange(int(model.ngeom)))):
         if int(model.geom_group[geom]) >= _VISIBLE_GROUPS or rgba[3] == 0:
             continue
         outline = _outline(model, geom)

@@ -156,18 +156,16 @@ class EnvEpisode:
         if begin is not None:
             begin(rng, qpos, qvel)
         await self._delay_cameras(seed)
-        looks = bool(self._cameras) or any(observer.step_cameras(0) for observer in client.observers)
         if not np.array_equal(qvel, self.state()[1]):
             try:
                 await self._push(qpos, qvel)
             except ModeLocked as locked:
                 locked.hint = "Start velocities are set in puppet mode: unpin the mode, or start at rest."
                 raise
-        elif looks:
-            await self._place(qpos)
-            await self._look(keyframe, seed, qpos)
         else:
             await self._place(qpos)
+            if self._cameras or any(observer.step_cameras(0) for observer in client.observers):
+                await self._look(keyframe, seed, qpos)
         self._step_before = client.step_count
         return self._observe()
 

@@ -22,7 +22,7 @@ from urlab_client._platform.processors import processor_count
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_option
-from urlab_client.errors import URLabError, refused_for_good
+from urlab_client.errors import ClientClosed, URLabError, refused_for_good
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
@@ -211,6 +211,7 @@ class URLabVectorEnv(OverWire):
             for address in (with_option(a, "start-timeout", f"{start_timeout:g}", default=True) for a in addresses)
         ]
         self._portal = Portal()
+        self._recordings = contextlib.AsyncExitStack()
         try:
             super().__init__(self._portal.call(self._open_all), len(addresses), autoreset_mode)
         except BaseException:
@@ -240,7 +241,7 @@ class URLabVectorEnv(OverWire):
     def recording(self, folder: str | os.PathLike[str], **options: Any) -> Generator[list[Path]]:
         """Record environment i into `folder/i.mcap` while the block runs; yield the files.
 
-        An environment that loses its client is recorded until then.
+        An environment that loses its client is recorded until then, and all of them until `close`.
 
         Args:
             folder: The folder, which is made if necessary.
@@ -255,6 +256,7 @@ class URLabVectorEnv(OverWire):
         Path(folder).mkdir(parents=True, exist_ok=True)
         files: list[Path] = []
         stack = contextlib.AsyncExitStack()
+        self._recordings.push_async_callback(stack.aclose)
         try:
             for i, session in enumerate(self._sessions):
                 episode = self._portal.call(session.ready)
@@ -262,7 +264,8 @@ class URLabVectorEnv(OverWire):
                 self._portal.call(stack.enter_async_context, record(episode.client, files[-1], **options))
             yield files
         finally:
-            self._portal.call(stack.aclose)
+            with contextlib.suppress(ClientClosed):  # `close` has ended them
+                self._portal.call(stack.aclose)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients and the servers that they started, and let the task serve another environment."""
@@ -282,6 +285,8 @@ class URLabVectorEnv(OverWire):
         return episodes[0]
 
     async def _close_all(self) -> None:
+        with contextlib.suppress(URLabError):  # which the writer has logged
+            await self._recordings.aclose()
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
     def draws(self, index: int) -> dict[str, Any] | None:

@@ -240,7 +240,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Return the start of an environment's episode, or its action with reward, termination and truncation."""
         goal: Mapping[str, Floats] = {} if self._memory is None else self._memory.goal(i)
         told: dict[str, Any] = {} if self._success is None else {"success": bool(self._success[i])}
-        told["goal"] = {name: np.ravel(values).tolist() for name, values in goal.items()}
+        told["goal"] = {name: np.ravel(values).astype(np.float64).tolist() for name, values in goal.items()}
         if actions is None:
             return Transition(actions=0, **told)
         if self.randomise is not None and self.randomise.delays_actions:

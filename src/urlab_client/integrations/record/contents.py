@@ -238,13 +238,8 @@ class RecordedState:
     articulations: dict[str, RecordedArticulation]
     entities: dict[str, RecordedEntity]
 
-    def snapshot(self, at: float, articulations: Mapping[str, RecordedArticulation] | None = None) -> StateSnapshot:
-        """Return the state as a server publishes it.
-
-        Args:
-            at: Its simulation time, seconds.
-            articulations: Articulations instead of the state's own.
-        """
+    def snapshot(self, at: float, articulations: Mapping[str, RecordedArticulation]) -> StateSnapshot:
+        """Return the state as a server publishes it, at this simulation time, with these instead of its own robots."""
         return StateSnapshot(
             time=at,
             step=self.step,
@@ -259,7 +254,7 @@ class RecordedState:
                     act=values.act if len(values.act) else None,
                     sensors={name: reading.tolist() for name, reading in values.sensors.items()} or None,
                 )
-                for key, values in (self.articulations if articulations is None else articulations).items()
+                for key, values in articulations.items()
             },
             entities={
                 name: EntityState(

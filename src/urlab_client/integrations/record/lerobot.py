@@ -207,7 +207,7 @@ def _after(run: Run, table: Table, pairs: Pairs, frames: Pairs) -> dict[str, NDA
     told = {name: table.columns[f"{TASK}/{name}"].values[until, 0] for name in ("reward", "terminated", "truncated")}
     if np.isnan(told["reward"]).all():
         return {}
-    if np.isnan(told["reward"]).any():
+    if np.isnan(told["reward"][until > frames.rows]).any():  # a frame that is repeated earns nothing
         raise RecordingError(f"{run.path}: the rewards of some of its episodes are unknown.")
     rewards = np.append(np.nan_to_num(table.columns[f"{TASK}/reward"].values[:, 0]), 0.0)
     ends = np.column_stack([frames.rows, until]).ravel() + 1

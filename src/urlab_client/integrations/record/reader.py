@@ -142,7 +142,7 @@ class Run:
 
         Args:
             progress: Called occasionally with the number of bytes read so far.
-            fields: Fields to return, such as `qpos`; None returns all.
+            fields: Fields of states to return, such as `qpos`; None returns all.
 
         Raises:
             RecordingError: The file contains two scenes, which do not fit into one table.
@@ -158,7 +158,7 @@ class Run:
         Args:
             folder: Folder of the temporary file, which has 8 bytes for each value of each state.
             progress: Called occasionally with the number of bytes read so far.
-            fields: Fields to return, such as `qpos`; None returns all.
+            fields: Fields of states to return, such as `qpos`; None returns all.
 
         Raises:
             OSError: The temporary file cannot be written.

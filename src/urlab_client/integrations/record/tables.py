@@ -156,7 +156,7 @@ class TableBuilder:
         for into, values in known:
             self._put(into, values)
 
-    def add_to_last(self, source: Source, **fields: Sequence[float]) -> None:
+    def add_to_last(self, source: Source, /, **fields: Sequence[float]) -> None:
         """Add to the last sample what may be missing from it."""
         for into, values in self._known(source, fields, new=False):
             self._put(into, values)

@@ -305,7 +305,6 @@ def show_recording(
     backend: ViewBackend,
     *,
     max_hz: float = 30.0,
-    contacts: bool = True,
     cameras: Sequence[str] | None = None,
     seconds: float | None = None,
     paced: bool = True,
@@ -344,7 +343,7 @@ def show_recording(
             state = run.state_at(moment + _ROUNDING_S)
             if state is not None and times.get("") != state.time:
                 times[""] = state.time
-                backend.show(_moment(state, scene, simulation, clock, contacts=contacts))
+                backend.show(_moment(state, scene, simulation, clock))
                 counts["states"] += 1
             for camera in scene.cameras.values():
                 picture = run.encoded_picture_at(camera.name, moment + _ROUNDING_S)
@@ -371,9 +370,7 @@ def _moments(start: float, end: float, period: float, *, paced: bool, stays: boo
         time.sleep(min(period, _PAUSE_S))
 
 
-def _moment(
-    state: RecordedState, scene: FollowedScene, simulation: Simulation, clock: SampleClock, *, contacts: bool
-) -> Moment:
+def _moment(state: RecordedState, scene: FollowedScene, simulation: Simulation, clock: SampleClock) -> Moment:
     """Return a recorded state as one to show, without robots that have other joints than the model's."""
     robots = {
         key: values
@@ -381,11 +378,11 @@ def _moment(
         if key in scene.layouts and len(values.qpos) == len(scene.layouts[key].qpos_adr)
     }
     reply = state.snapshot(state.sim_time, robots)
-    simulation.take(reply.per_articulation, reply.entities or {}, forces=contacts)
+    simulation.take(reply.per_articulation, reply.entities or {}, forces=True)
     set_points = {key: values.set_points.tolist() for key, values in robots.items()}
     ns = clock.advance(round(state.time * _NS), restarts=False)
     shown = State(scene, reply, set_points, ns, False, state.wall_ns, False)
-    return Moment(ns, state.wall_ns, state.step, scene, simulation, state.episode, contacts, shown)
+    return Moment(ns, state.wall_ns, state.step, scene, simulation, state.episode, True, shown)
 
 
 class AsyncView(Viewing, AsyncBlock):
