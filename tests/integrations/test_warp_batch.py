@@ -76,7 +76,7 @@ def address() -> Iterator[str]:
 
 def test_episodes_start_with_the_same_bits_and_go_on_alike(address: str) -> None:
     disturbed = Randomisation(
-        vary=(Vary(what="position", on="*/*", add=(-0.1, 0.1)),), noise=(Noise(field="qpos", std=0.01),)
+        vary=(Vary(what="position", on="*/*", add=(-0.1, 0.1)),), noise=(Noise(field="task", std=0.01),)
     )
     engines: list[Any] = ["warp", "mujoco"]
     warp, plain = (
