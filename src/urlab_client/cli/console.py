@@ -123,7 +123,7 @@ async def _serve(arguments: Namespace) -> None:
                 return f"{url}/?token={access.invite()}"
 
             def started() -> None:
-                link, more = new_link(), " Enter prints another link," if sys.stdin.isatty() else ""
+                link, more = new_link(), " Enter prints another link," if sys.stdin and sys.stdin.isatty() else ""
                 print(
                     f"{arguments.address} is shown at {link} (good for one browser);{more} Ctrl-C ends it.", flush=True
                 )

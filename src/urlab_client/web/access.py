@@ -187,7 +187,8 @@ def _keep(values: dict[str, None], value: str) -> None:
 
 def _among(value: str, values: Collection[str]) -> str | None:
     given = value.encode()
-    return next((known for known in values if hmac.compare_digest(known.encode(), given)), None)
+    # A copy, as another thread may add an invitation meanwhile.
+    return next((known for known in tuple(values) if hmac.compare_digest(known.encode(), given)), None)
 
 
 def _name(host: str) -> str:
