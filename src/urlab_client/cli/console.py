@@ -22,15 +22,7 @@ from datetime import UTC, datetime
 from urlab_client import aio
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
-from urlab_client.cli._arguments import (
-    PAGE,
-    WATCHER,
-    address_usage,
-    check_page,
-    host_names,
-    make_client,
-    page_url,
-)
+from urlab_client.cli._arguments import PAGE, WATCHER, address_usage, check_page, host_names, make_client, page_url
 from urlab_client.cli._common import CommandError, import_mujoco
 
 _PORT = 8355
