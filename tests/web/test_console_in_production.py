@@ -23,11 +23,13 @@ import httpx2
 import pytest
 from children import child
 from ports import free_port
+from starlette.responses import Response
+from starlette.testclient import TestClient
 from waiting import DEADLINE_S, attempts
 from websockets.asyncio.client import connect
 
 from urlab_client.cli import _parser
-from urlab_client.web.access import Access
+from urlab_client.web.access import Access, Guarded
 
 PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "production.md").read_text(encoding="utf-8")
 NGINX = shutil.which("nginx", path=f"{os.environ['PATH']}{os.pathsep}/usr/sbin")
@@ -196,6 +198,13 @@ def test_without_any_input_there_is_no_such_offer() -> None:
         assert one.wait(DEADLINE_S) == 0
     assert "token=" in said
     assert "Enter" not in said
+
+
+def test_a_used_link_is_refused_with_the_advice_of_its_application() -> None:
+    guarded = Guarded(Response("inside"), Access(), advice="Ask Ann for a link.")
+    answer = TestClient(guarded, base_url="http://localhost").get("/?token=used")
+    assert answer.status_code == 401
+    assert answer.json()["error"]["message"].endswith("restarted. Ask Ann for a link.")
 
 
 def test_an_invitation_may_be_added_while_a_token_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:

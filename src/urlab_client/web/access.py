@@ -163,7 +163,9 @@ class Guarded:
             return None
         key = self._access.admit(token[0])
         if key is None and self._access.key_of(Headers(scope=scope)) is None:
-            return _denied(scope, (401, "bad_token", f"This link has been used, or the console restarted. {_ADVICE}"))
+            return _denied(
+                scope, (401, "bad_token", f"This link has been used, or the console restarted. {self._advice}")
+            )
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(
