@@ -39,9 +39,7 @@ if TYPE_CHECKING:
         URLabTimeoutError,
         URLabVersionMismatch,
     )
-    from urlab_client.events import (
-        ClientEvent,
-    )
+    from urlab_client.events import ClientEvent
     from urlab_client.sync import (
         DEFAULT,
         Actuator,

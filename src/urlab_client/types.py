@@ -15,12 +15,7 @@ from urlab_client.aio.client_types import (
     ServerInfo,
     Verdict,
 )
-from urlab_client.protocol.messages.cameras import (
-    CameraDelay,
-    CameraDelayInForce,
-    CameraStreaming,
-    CameraTransports,
-)
+from urlab_client.protocol.messages.cameras import CameraDelay, CameraDelayInForce, CameraStreaming, CameraTransports
 from urlab_client.protocol.messages.streams import (
     CameraSample,
     RowSample,

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from urlab_client.values.names import NameMap, UnknownName, element_ids, owner_of, robot_prefixes, split_prefix
+from urlab_client.values.names import (
+    NameMap,
+    UnknownName,
+    element_ids,
+    own_aliases,
+    owner_of,
+    robot_prefixes,
+    split_prefix,
+)
 
 
 def two_robots_and_an_arm() -> NameMap[int]:
@@ -231,3 +239,10 @@ def test_elements_are_found_by_readable_names_whatever_compiled_names_begin_with
         bodies["arm/2_hand"]
     shared = element_ids(["left_hand", "hand"], robot_prefixes([("left", "", "left")]), "site")
     assert (shared["left/hand"], shared["hand"]) == (0, 1)
+
+
+def test_what_two_elements_of_a_robot_may_be_called_is_ambiguous_but_a_compiled_name_is_not() -> None:
+    robots = robot_prefixes([("arm", "arm_left", "arm_C_0"), ("other", "arm_C_0_left", "other")])
+    assert own_aliases(["left_hand", "hand"], "arm_C_0", robots)["arm_left_hand"] == ["left_hand", "hand"]
+    named = robot_prefixes([("arm", "arm_left", "arm")])
+    assert own_aliases(["left_hand", "hand"], "arm", named)["arm_left_hand"] == ["left_hand"]

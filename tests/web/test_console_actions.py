@@ -126,6 +126,37 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
     assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
 
 
+ARM = """<mujoco><worldbody><body name="upper"><joint name="turn" axis="0 1 0"/><geom size="0.1" fromto="0 0 0 1 0 0"/>
+<body name="lower"><joint name="slide" type="slide"/><geom size="0.1"/></body></body></worldbody>
+<actuator><motor name="motor" joint="turn"/><position name="grip" joint="slide" kp="10"/></actuator></mujoco>"""
+
+
+async def test_holding_a_pose_leaves_to_others_what_they_command(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(ARM, encoding="utf-8")
+    async with (
+        SimulatedServer(tmp_path / "arm.xml", play=True, dialect="beta") as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        await client.discover()
+        controls, viewer = ConsoleSession(client, recordings=tmp_path).controls, Viewer("key", "me")
+        (key, robot), *_ = client.articulations.items()
+        other_name = next(iter(client.articulations.aliases))
+        await controls.hold(viewer, other_name, True)
+        robot.set_ctrl({"grip": 0.25})
+        await controls.step(viewer, 50)
+        assert list(controls.holding) == [key]
+        await controls.hold(viewer, key, False)
+        assert robot.ctrl_array.tolist() == [0.0, 0.25], "only the motor is let go"
+        await controls.hold(viewer, key, True)
+        controls.set_points(viewer, {other_name: {"grip": 0.5}})
+        assert not controls.holding
+        await controls.hold(viewer, key, True)
+        await controls.step(viewer, 50)
+        robot.set_ctrl({"motor": 2.0})  # as an agent does, or the program around the console
+        await controls.step(viewer, 50)
+        assert (list(controls.holding), robot.ctrl_array.tolist()) == ([], [2.0, 0.5])
+
+
 async def test_each_of_several_robots_has_its_own_home(tmp_path: Path) -> None:
     async with (
         SimulatedServer("quadruped", "arm", play=True) as server,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import configparser
 import contextlib
+import hmac
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import shutil
 import signal
 import ssl
 import subprocess
+import sys
 from collections.abc import AsyncGenerator, Generator
 from pathlib import Path
 from typing import Any
@@ -21,10 +23,13 @@ import httpx2
 import pytest
 from children import child
 from ports import free_port
+from starlette.responses import Response
+from starlette.testclient import TestClient
 from waiting import DEADLINE_S, attempts
 from websockets.asyncio.client import connect
 
 from urlab_client.cli import _parser
+from urlab_client.web.access import Access, Guarded
 
 PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "production.md").read_text(encoding="utf-8")
 NGINX = shutil.which("nginx", path=f"{os.environ['PATH']}{os.pathsep}/usr/sbin")
@@ -182,6 +187,37 @@ def test_enter_in_the_terminal_prints_another_link_for_one_browser() -> None:
         assert httpx2.get(links[1][0]).status_code == 401
         terminal.press_ctrl_c()
         assert terminal.end()[0] == 0
+
+
+def test_without_any_input_there_is_no_such_offer() -> None:
+    arguments = [sys.executable, "-m", "urlab_client", "console", "sim://ball", "--port", "0"]
+    with subprocess.Popen(["sh", "-c", 'exec "$@" <&-', "sh", *arguments], stdout=subprocess.PIPE, text=True) as one:
+        assert one.stdout is not None
+        said = one.stdout.readline()
+        one.send_signal(signal.SIGTERM)
+        assert one.wait(DEADLINE_S) == 0
+    assert "token=" in said
+    assert "Enter" not in said
+
+
+def test_a_used_link_is_refused_with_the_advice_of_its_application() -> None:
+    guarded = Guarded(Response("inside"), Access(), advice="Ask Ann for a link.")
+    answer = TestClient(guarded, base_url="http://localhost").get("/?token=used")
+    assert answer.status_code == 401
+    assert answer.json()["error"]["message"].endswith("restarted. Ask Ann for a link.")
+
+
+def test_an_invitation_may_be_added_while_a_token_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    access = Access()
+    token, compared = access.invite(), hmac.compare_digest
+
+    def compare(known: bytes, given: bytes) -> bool:
+        access.invite()
+        return compared(known, given)
+
+    monkeypatch.setattr(hmac, "compare_digest", compare)
+    assert access.admit("another") is None
+    assert access.admit(token) is not None
 
 
 def test_service_and_container_run_commands_that_exist() -> None:

@@ -22,12 +22,7 @@ from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.runtime import ClaimControl
 from urlab_client.protocol.messages.session import ControllerInfo
-from urlab_client.values.descriptions import (
-    ArticulationDescription,
-    ControllerDescription,
-    EntityDescription,
-    Pose,
-)
+from urlab_client.values.descriptions import ArticulationDescription, ControllerDescription, EntityDescription, Pose
 from urlab_client.values.names import Local, NameMap
 from urlab_client.values.rotation import rotate
 

@@ -8,6 +8,7 @@ knows.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import TypeVar
@@ -80,15 +81,8 @@ async def _examine(config: ClientConfig, session: Session, state: SimState, stat
     yield finding
     if not playing:
         return
-    for finding in _physics(session, state):
-        yield finding
-    for finding in _modes(config, state):
-        yield finding
-    for finding in _articulations(state):
-        yield finding
-    for finding in _control(config, session, state):
-        yield finding
-    for finding in _cameras(session, state):
+    robots = _articulations(state), _control(config, session, state), _cameras(session, state)
+    for finding in itertools.chain(_physics(session, state), _modes(config, state), *robots):
         yield finding
 
 

@@ -22,15 +22,7 @@ from datetime import UTC, datetime
 from urlab_client import aio
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
-from urlab_client.cli._arguments import (
-    PAGE,
-    WATCHER,
-    address_usage,
-    check_page,
-    host_names,
-    make_client,
-    page_url,
-)
+from urlab_client.cli._arguments import PAGE, WATCHER, address_usage, check_page, host_names, make_client, page_url
 from urlab_client.cli._common import CommandError, import_mujoco
 
 _PORT = 8355
@@ -123,7 +115,7 @@ async def _serve(arguments: Namespace) -> None:
                 return f"{url}/?token={access.invite()}"
 
             def started() -> None:
-                link, more = new_link(), " Enter prints another link," if sys.stdin.isatty() else ""
+                link, more = new_link(), " Enter prints another link," if sys.stdin and sys.stdin.isatty() else ""
                 print(
                     f"{arguments.address} is shown at {link} (good for one browser);{more} Ctrl-C ends it.", flush=True
                 )

@@ -47,7 +47,6 @@ def run(arguments: Namespace) -> int:
 
 
 async def _diagnose(arguments: Namespace) -> Diagnosis:
-
     client = make_client(
         aio.URLabClient,
         arguments.address,

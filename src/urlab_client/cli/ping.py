@@ -20,13 +20,7 @@ from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
 from urlab_client.cli._arguments import SESSIONLESS, address_usage, make_client
 from urlab_client.cli._common import aligned, counted, import_mujoco, json_line
-from urlab_client.errors import (
-    ModeLocked,
-    URLabConnectionError,
-    URLabRPCError,
-    URLabTimeoutError,
-    URLabVersionMismatch,
-)
+from urlab_client.errors import ModeLocked, URLabConnectionError, URLabRPCError, URLabTimeoutError, URLabVersionMismatch
 from urlab_client.protocol.instances import RegisteredInstance, decode, registry_directory
 from urlab_client.protocol.messages.runtime import SetMode
 

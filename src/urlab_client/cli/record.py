@@ -61,12 +61,12 @@ urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15  another mac
 def run(arguments: Namespace) -> int:
     """Record; return 1 if states were dropped or a camera sent no picture, else 0."""
     import_mujoco()
+    if arguments.keyframe is not None and arguments.task is not None:
+        raise CommandError("--keyframe cannot be combined with --task, which determines the start")
+    if arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
+        raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     if arguments.task is None:
         arguments.address = arguments.address or "tcp://localhost"
-        if arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
-            raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    elif arguments.keyframe is not None:
-        raise CommandError("--keyframe cannot be combined with --task, which determines the start")
     check_recording(arguments.output, arguments)
     if arguments.camera and (arguments.address is None or arguments.address.startswith("sim://")):
         from urlab_client.simulation.opengl import need_backend

@@ -24,14 +24,7 @@ import numpy as np
 from urlab_client import aio
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import CLIENT, POLICY, RECORD, TASK, address_usage, make_client, policy_task
-from urlab_client.cli._common import (
-    aligned,
-    check_recording,
-    import_mujoco,
-    json_line,
-    progress_bar,
-    refusing,
-)
+from urlab_client.cli._common import aligned, check_recording, import_mujoco, json_line, progress_bar, refusing
 from urlab_client.cli._watching import recorded, recording_options, task_environment
 from urlab_client.enums import StepMode
 

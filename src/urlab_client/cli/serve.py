@@ -13,7 +13,6 @@ import logging
 import os
 import queue
 import signal
-import sys
 import threading
 from argparse import Namespace
 from collections.abc import Generator
@@ -46,8 +45,8 @@ _PASSED_ON = (
 )
 """Options that the server has by the same name."""
 
-# Ctrl-C does not interrupt a lock wait on Windows, so the wait is sliced there.
-_WAIT_S = 0.1 if sys.platform == "win32" else None
+# A signal that arrives just before the main thread waits does not interrupt the wait, and on Windows none does.
+_WAIT_S = 0.1
 _SILENT_S = 10.0  # for a request for metrics
 _START_GRACE_S = 0.5  # how long a stop waits for a start in progress; the whole stop may take a second
 

@@ -19,7 +19,7 @@ from urlab_client.cli._arguments import CLIENT, address_usage
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
 from urlab_client.conformance.sessions import Passed, Ports, Relay, Replay, SessionWriter, read_session
 from urlab_client.conformance.wire import oddities, plain, reply_oddities
-from urlab_client.keys import KeyPair, read_pair
+from urlab_client.keys import read_pair
 from urlab_client.protocol.registry import OPS
 
 USAGE = f"""
@@ -47,16 +47,13 @@ def run(arguments: Namespace) -> int:
     if not number.isdigit():
         raise CommandError(f"--listen: {arguments.listen!r} is not a port, nor HOST:PORT")
     with refusing(ValueError, option="--listen"):
-        ports = Ports((host or "127.0.0.1").strip("[]"), _key(arguments))
+        key = None if arguments.listen_key is None else read_pair(arguments.listen_key)
+        ports = Ports((host or "127.0.0.1").strip("[]"), key)
     own = {"port": int(number), "state_port": arguments.listen_state or (int(number) + 1 if int(number) else 0)}
     with sigterm_interrupts():
         if arguments.replay is not None:
             return _replay(arguments.replay, ports, own)
         return _relay(arguments, ports, own)
-
-
-def _key(arguments: Namespace) -> KeyPair | None:
-    return None if arguments.listen_key is None else read_pair(arguments.listen_key)
 
 
 def _replay(path: Path, ports: Ports, own: dict[str, int]) -> int:

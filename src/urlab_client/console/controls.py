@@ -95,7 +95,7 @@ class Controls:
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
-        self.holding: dict[str, Callable[[], None]] = {}
+        self.holding: dict[str, _PoseHold] = {}
         self._client = client
         self._lease = lease
         self._view = view
@@ -157,31 +157,32 @@ class Controls:
 
         In live mode the newest are sent immediately.
         """
-        found = {key: (self._client.articulations[key], given) for key, given in values.items()}
-        for art, given in found.values():
+        robots = self._client.articulations
+        found = [(robots.key(name), robots[name], given) for name, given in values.items()]
+        for _, art, given in found:
             for name in given:
                 art.actuators[name]  # raises
         self._lease.use(viewer)
-        for key, (art, given) in found.items():
+        for key, art, given in found:
             self.holding.pop(key, None)
             self._seed(key, art)
             art.set_ctrl(given)
             self._pending.add(key)
         self._commanded.set()
 
-    async def hold(self, viewer: Viewer, key: str, holding: bool) -> None:
+    async def hold(self, viewer: Viewer, name: str, holding: bool) -> None:
         """Make a robot with torque motors hold its home pose, or let it go.
 
         A law that balances a robot must not be late, so this needs direct mode, and chooses it.
         """
-        art = self._client.articulations[key]
+        key = self._client.articulations.key(name)
         if holding:
-            renew = _pose_hold(self._client.model, art)
+            hold = _PoseHold(self._client.model, self._client.articulations[key])
             if self._client.step_mode is not StepMode.DIRECT:
                 await self.do(viewer, SetMode(mode=StepMode.DIRECT))
-            self.holding[key] = renew
-        elif self.holding.pop(key, None):
-            art.ctrl_array[:] = 0.0
+            self.holding[key] = hold
+        elif (held := self.holding.pop(key, None)) is not None:
+            held.let_go()
 
     def _seed(self, key: str, art: URLabArticulation) -> None:
         """Hold the current pose before a first set-point, which sends all set-points of the articulation."""
@@ -230,8 +231,7 @@ class Controls:
             self._seed(key, art)
         while True:
             self._before_step()
-            for renew in self.holding.values():
-                renew()
+            self.holding = {key: hold for key, hold in self.holding.items() if hold.renew()}
             taken = min(n_steps, self._per_period) if self.holding else n_steps
             began = time.monotonic()
             watched = dict.fromkeys(self._cameras.watched(), "latest") if began >= self._pictures_due else {}
@@ -279,25 +279,38 @@ class Controls:
             await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
 
 
-def _pose_hold(model: mujoco.MjModel | None, art: URLabArticulation) -> Callable[[], None]:
-    """Return what writes set-points by which torque motors hold the home pose, if it is called in each period."""
-    motors = [one for one in art.actuators.values() if one.joint is not None and one.describe().takes == "force"]
-    if model is None or not motors:
-        raise ValueError(f"{art.prefix} cannot hold a pose: that needs torque motors on its joints, and a local model")
-    joints = [art.joints[one.joint or ""] for one in motors]
-    ctrl, qpos = [one.ctrl_local.start for one in motors], [one.qpos_local_offset for one in joints]
-    qvel = [one.qvel_local_offset for one in joints]
-    driving, driven = [one.id for one in motors], [one.id for one in joints]
-    home = home_of(model, art)[model.jnt_qposadr[driven]]
-    strength = model.actuator_gainprm[driving, 0] * model.actuator_gear[driving, 0]
-    inertia = model.dof_M0[model.jnt_dofadr[driven]]
+class _PoseHold:
+    """Torques with which the motors of a robot hold its home pose, until somebody else writes set-points of them."""
 
-    def renew() -> None:
-        error, velocity = home - art.qpos_array[qpos], art.qvel_array[qvel]
+    def __init__(self, model: mujoco.MjModel | None, art: URLabArticulation) -> None:
+        motors = [one for one in art.actuators.values() if one.joint is not None and one.describe().takes == "force"]
+        if model is None or not motors:
+            need = "that needs torque motors on its joints, and a local model"
+            raise ValueError(f"{art.prefix} cannot hold a pose: {need}")
+        joints = [art.joints[one.joint or ""] for one in motors]
+        driving, driven = [one.id for one in motors], [one.id for one in joints]
+        self._art = art
+        self._ctrl, self._qpos = [one.ctrl_local.start for one in motors], [one.qpos_local_offset for one in joints]
+        self._qvel = [one.qvel_local_offset for one in joints]
+        self._home = home_of(model, art)[model.jnt_qposadr[driven]]
+        strength = model.actuator_gainprm[driving, 0] * model.actuator_gear[driving, 0]
+        self._per_acceleration = model.dof_M0[model.jnt_dofadr[driven]] / strength
+        self._written = art.ctrl_array[self._ctrl]
+
+    def renew(self) -> bool:
+        """Write the set-points of the next period, unless somebody else has; return whether they are written."""
+        ctrl = self._art.ctrl_array
+        if (ctrl[self._ctrl] != self._written).any():
+            return False
+        error, velocity = self._home - self._art.qpos_array[self._qpos], self._art.qvel_array[self._qvel]
         acceleration = _FREQUENCY**2 * error - 2 * _DAMPING * _FREQUENCY * velocity
-        art.ctrl_array[ctrl] = inertia * acceleration / strength  # physics clamps it
+        ctrl[self._ctrl] = self._per_acceleration * acceleration  # physics clamps it
+        self._written = ctrl[self._ctrl]
+        return True
 
-    return renew
+    def let_go(self) -> None:
+        """End the torques."""
+        self._art.ctrl_array[self._ctrl] = 0.0
 
 
 async def _perform(client: URLabClient, request: Request[Any]) -> object:

@@ -342,8 +342,9 @@ def own_aliases(names: Sequence[str], prefix: str, prefixes: NameMap[str]) -> di
         prefix: What its compiled names begin with.
         prefixes: As from `robot_prefixes`.
     """
-    written = spellings([f"{prefix}_{name}" for name in names], prefixes)
-    return {alias: [name] for name, others in zip(names, written, strict=True) for alias in others}
+    compiled = [f"{prefix}_{name}" for name in names]
+    written = _meanings(zip(names, spellings(compiled, prefixes), strict=True))
+    return written | {other: [name] for other, name in zip(compiled, names, strict=True)}
 
 
 def element_ids(names: Sequence[str], prefixes: NameMap[str], kind: str) -> NameMap[int]:
@@ -351,12 +352,17 @@ def element_ids(names: Sequence[str], prefixes: NameMap[str], kind: str) -> Name
 
     Aliases are their other `spellings`, and what a robot itself calls its element: `NAME`.
     """
-    ids: dict[str, int] = {}
-    aliases: dict[str, list[str]] = {}
-    owned = split_prefix(names, [*prefixes.values()])
-    for i, ((name, *others), (_, local)) in enumerate(zip(spellings(names, prefixes), owned, strict=True)):
-        if name:
-            ids[name] = i
-            for other in (*others, local):
-                aliases.setdefault(other, []).append(name)
-    return NameMap(ids, aliases, kind)
+    written, owned = spellings(names, prefixes), split_prefix(names, [*prefixes.values()])
+    aliases = _meanings(
+        (name, (*others, local)) for (name, *others), (_, local) in zip(written, owned, strict=True) if name
+    )
+    return NameMap({name: i for i, name in enumerate(names) if name}, aliases, kind)
+
+
+def _meanings(written: Iterable[tuple[str, Iterable[str]]]) -> dict[str, list[str]]:
+    """Return the names that each spelling may mean, given the spellings of each name."""
+    found: dict[str, list[str]] = {}
+    for name, others in written:
+        for other in others:
+            found.setdefault(other, []).append(name)
+    return found

@@ -163,7 +163,9 @@ class Guarded:
             return None
         key = self._access.admit(token[0])
         if key is None and self._access.key_of(Headers(scope=scope)) is None:
-            return _denied(scope, (401, "bad_token", f"This link has been used, or the console restarted. {_ADVICE}"))
+            return _denied(
+                scope, (401, "bad_token", f"This link has been used, or the console restarted. {self._advice}")
+            )
         response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
         if key is not None:
             response.set_cookie(
@@ -187,7 +189,8 @@ def _keep(values: dict[str, None], value: str) -> None:
 
 def _among(value: str, values: Collection[str]) -> str | None:
     given = value.encode()
-    return next((known for known in values if hmac.compare_digest(known.encode(), given)), None)
+    # A copy, as another thread may add an invitation meanwhile.
+    return next((known for known in tuple(values) if hmac.compare_digest(known.encode(), given)), None)
 
 
 def _name(host: str) -> str:

@@ -69,14 +69,8 @@ class ArticulationLayout:
 def articulation_layouts(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> dict[str, ArticulationLayout]:
     """Return the layout of each articulation; an element belongs to the longest prefix of its name."""
     keys = list(prefixes.values())
-    bodies = _by_owner(model, "body", keys)
-    joints = _by_owner(model, "joint", keys)
-    actuators = _by_owner(model, "actuator", keys)
-    sensors = _by_owner(model, "sensor", keys)
-    return {
-        key: _layout(model, bodies[prefix], joints[prefix], actuators[prefix], sensors[prefix])
-        for key, prefix in prefixes.items()
-    }
+    elements = [_by_owner(model, kind, keys) for kind in ("body", "joint", "actuator", "sensor")]
+    return {key: _layout(model, *(owned[prefix] for owned in elements)) for key, prefix in prefixes.items()}
 
 
 def compiled_ids(model: mujoco.MjModel, kind: str, prefixes: NameMap[str]) -> NameMap[int]:

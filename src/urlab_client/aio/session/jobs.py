@@ -10,14 +10,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
-from urlab_client.errors import (
-    OutcomeUnknown,
-    ProtocolError,
-    UnknownJob,
-    URLabError,
-    URLabRPCError,
-    URLabTimeoutError,
-)
+from urlab_client.errors import OutcomeUnknown, ProtocolError, UnknownJob, URLabError, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.base import Op, Reply
 from urlab_client.protocol.codec import decode_job
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus, OpStatusOk

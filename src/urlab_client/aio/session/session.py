@@ -35,14 +35,7 @@ from urlab_client.errors import (
     URLabTimeoutError,
 )
 from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
-from urlab_client.protocol.codec import (
-    check_finite,
-    check_request,
-    decode_answer,
-    decode_reply,
-    encode_request,
-    op_of,
-)
+from urlab_client.protocol.codec import check_finite, check_request, decode_answer, decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 

@@ -20,13 +20,7 @@ from urlab_client.aio.state.step_pictures import first_picture_s
 from urlab_client.aio.streams.pictures import PictureListener
 from urlab_client.aio.streams.sources import Camera
 from urlab_client.enums import StepMode
-from urlab_client.errors import (
-    ModeLocked,
-    NoActiveManager,
-    PictureTimeout,
-    URLabError,
-    URLabTimeoutError,
-)
+from urlab_client.errors import ModeLocked, NoActiveManager, PictureTimeout, URLabError, URLabTimeoutError
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.messages.session import Meta, Step
 from urlab_client.protocol.messages.sim import PieStatus

@@ -17,14 +17,7 @@ from urlab_client.aio.state.scene_objects import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.enums import StepMode
-from urlab_client.errors import (
-    NoActiveManager,
-    NotReady,
-    ProtocolError,
-    UnknownOp,
-    URLabError,
-    URLabVersionMismatch,
-)
+from urlab_client.errors import NoActiveManager, NotReady, ProtocolError, UnknownOp, URLabError, URLabVersionMismatch
 from urlab_client.events import PlayStarted
 from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta

@@ -25,13 +25,7 @@ from urlab_client.aio.streams.live_state import LiveState
 from urlab_client.aio.streams.pictures import LatestPicture, StepStreams
 from urlab_client.aio.streams.publishers import Publishers
 from urlab_client.enums import CameraMode, CameraTiming, StepMode
-from urlab_client.errors import (
-    NoActiveManager,
-    NoSession,
-    ProtocolError,
-    SessionTakenOver,
-    URLabRPCError,
-)
+from urlab_client.errors import NoActiveManager, NoSession, ProtocolError, SessionTakenOver, URLabRPCError
 from urlab_client.events import PlayEnded, SessionLost, SessionOpened
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import (

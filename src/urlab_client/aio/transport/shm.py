@@ -23,13 +23,7 @@ from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, a
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
 from urlab_client.aio.transport.zmq import ZmqTransport
-from urlab_client.errors import (
-    ClientClosed,
-    ProtocolError,
-    URLabConnectionError,
-    URLabError,
-    URLabTimeoutError,
-)
+from urlab_client.errors import ClientClosed, ProtocolError, URLabConnectionError, URLabError, URLabTimeoutError
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.protocol.shm import RegionNotReady, Ring

@@ -27,13 +27,7 @@ from urlab_client.aio.transport.connection import (
     shared_context,
 )
 from urlab_client.aio.transport.waiting import BusyPoll, Watch
-from urlab_client.errors import (
-    AuthenticationFailed,
-    ClientClosed,
-    ServerUnreachable,
-    URLabError,
-    URLabTimeoutError,
-)
+from urlab_client.errors import AuthenticationFailed, ClientClosed, ServerUnreachable, URLabError, URLabTimeoutError
 from urlab_client.events import ClientEvent, ServerAnswers, ServerConnected, ServerLost, ServerReconnected, ServerSilent
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES

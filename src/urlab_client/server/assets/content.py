@@ -29,13 +29,7 @@ import mujoco
 
 from urlab_client._platform.files import write_whole
 from urlab_client.protocol.instances import import_directory
-from urlab_client.server.assets.blueprint import (
-    IMPORTS,
-    Blueprint,
-    BlueprintRecord,
-    load_blueprint,
-    sanitized,
-)
+from urlab_client.server.assets.blueprint import IMPORTS, Blueprint, BlueprintRecord, load_blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
 from urlab_client.server.assets.importer import build_confined, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.limits import Limits

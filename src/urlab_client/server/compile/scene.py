@@ -24,13 +24,7 @@ from urlab_client._mujoco import copy_options, flat_model, saved_model
 from urlab_client.server.assets.actors import Actor, scene_problem
 from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.importer import mujoco_messages, one_line
-from urlab_client.server.compile.composition import (
-    aims_at_world,
-    attachable,
-    compose,
-    empty_scene,
-    populate,
-)
+from urlab_client.server.compile.composition import aims_at_world, attachable, compose, empty_scene, populate
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.limits import Limits, options_problem

@@ -50,8 +50,11 @@ const CALLS = {
   "import model": (given) => `imported ${given}`,
 };
 
-const shortly = (value) => (typeof value === "number" ? `${+value.toPrecision(4)}` : typeof value === "string" ? value
-  : JSON.stringify(value, (_, one) => (typeof one === "number" ? +one.toPrecision(4) : one)));
+function shortly(value) {
+  if (typeof value === "number") return `${+value.toPrecision(4)}`;
+  if (Array.isArray(value)) return value.map(shortly).join(" ");
+  return value && typeof value === "object" ? Object.entries(value).map(([name, one]) => `${name} ${shortly(one)}`).join(", ") : `${value}`;
+}
 
 /** The arguments of an op, or a sentence as it is. */
 function argumentsOf(entry) {

@@ -32,10 +32,11 @@ $("help").append(h("h2", {}, "Keys"),
   h("p", { class: "hint" }, "Panels move by the grip at their top edge: drag it, or focus it and use the arrow keys."),
   h("form", { method: "dialog", class: "row" }, h("button", {}, "Close"), h("button", { id: "reset-layout", onclick: resetLayout }, "Reset the layout")));
 
+// The target is the document itself when nothing has the focus.
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || document.querySelector("dialog[open]")) return;
-  const field = event.target.closest("input:not([type=range], [type=checkbox]), select, textarea");
-  const button = event.key === " " && event.target.closest("button, summary, [type=checkbox]");
+  const field = event.target.closest?.("input:not([type=range], [type=checkbox]), select, textarea");
+  const button = event.key === " " && event.target.closest?.("button, summary, [type=checkbox]");
   if ((field || button) && event.key !== "Escape") return;
   const found = KEYS.find(([key]) => key === event.key);
   if (!found) return;
