@@ -17,7 +17,9 @@ from starlette.testclient import TestClient
 from urlab_client.aio import URLabClient
 from urlab_client.console.description import describe
 from urlab_client.console.lease import Viewer
+from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
+from urlab_client.console.shared_view import SharedView
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -168,6 +170,58 @@ def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp
     push = {"body": trunk["id"], "local": [0, 0, 0], "target": [0, 0, 1]}
     assert "Go back to live to push" in refusal(http.post("/api/push", json=push))
     assert http.delete("/api/replay").status_code == 200
+
+
+def test_what_the_server_has_saved_is_replayed_too(http: TestClient, server: SimulatedServer) -> None:
+    """It has the positions of all compiled joints together, and no velocities."""
+    assert http.post("/api/ops/recording_start", json={}).status_code == 200
+    for _ in range(5):
+        assert http.post("/api/step", json={"n_steps": 20}).status_code == 200
+    fallen = http.get("/api/state").json()["articulations"]["quadruped"]["qpos"]
+    assert http.post("/api/ops/recording_stop", json={}).status_code == 200
+    saved = Path(http.post("/api/ops/recording_save", json={"path": "fall.json"}).json()["absolute_path"])
+    assert http.put("/api/recordings/fall.json", content=saved.read_bytes()).status_code == 200
+    http.post("/api/ops/reset", json={})
+    began = http.get("/api/state").json()["articulations"]["quadruped"]["qpos"]
+    assert abs(began[2] - fallen[2]) > 0.01
+    replay = http.post("/api/replay", json={"name": "fall.json", "playing": False, "time": 1e6})
+    assert replay.status_code == 200, replay.text
+    shown = http.get("/api/state").json()["articulations"]["quadruped"]["qpos"]
+    assert shown == pytest.approx(fallen, abs=2e-5)
+    assert http.delete("/api/replay").status_code == 200
+
+
+async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path) -> None:
+    crate = tmp_path / "crate.xml"
+    crate.write_text(
+        '<mujoco model="crate"><worldbody><body name="crate" pos="2 0 1"><freejoint/><geom size=".1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    async with (
+        SimulatedServer("arm", crate, play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct", live_pictures=False) as client,
+    ):
+        await client.discover()
+        view = SharedView(client)
+        viewer = MujocoViewer(client, view)
+        shown = await viewer.shown()
+        assert shown is not None
+        assert viewer.latest() is None, "no state has come yet"
+        client.articulations["arm"].set_ctrl({"elbow": 1.0})
+        async with client.state_stream("all") as states:
+            await client.step(50)
+            view.snapshot = await states.receive()
+            while view.snapshot.time < client.sim_time:
+                view.snapshot = await states.receive()
+        assert viewer.latest() is shown
+        assert client.data is not None
+        assert np.allclose(shown.data.qpos, client.data.qpos)
+        speeds = [joint.qvel_offset for joint in client.articulations["arm"].joints.values()]
+        assert np.abs(client.data.qvel[speeds]).max() > 0.01
+        assert np.allclose(shown.data.qvel[speeds], client.data.qvel[speeds])
+        body = client.entities["crate"].body_id
+        assert shown.data.xpos[body] == pytest.approx(client.entities["crate"].root_pos_w)
+        assert shown.data.xpos[body][2] < 0.99, "it falls"
 
 
 def test_curves_and_arrays_of_a_recording_are_files(http: TestClient, tmp_path: Path) -> None:
