@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +62,22 @@ def commands(change: Any) -> Any:
     return in_request("step", lambda request: [change(one) for one in request.get("per_articulation", {}).values()])
 
 
-def unguarded(request: Fields, reply: Fields) -> object:
-    """Say that a step was taken where the server refused it."""
+def unguarded(request: Fields, reply: Fields, *, only: str = "") -> object:
+    """Say that a step was taken where the server refused it, for all commands or those with one field."""
     if request.get("op") != "step" or reply.get("code") != "not_control_owner":
+        return None
+    if only and not any(only in command for command in request["per_articulation"].values()):
         return None
     clock = {"sec": 0.0, "nsec": 0.0}
     taken: Fields = {"op": "step_ok", "time": 0.0, "step": 0.0, "sim_time": clock, "wall_time": clock}
     return msgspec.msgpack.encode({**taken, "frame_id": 1.0, "arts": {}, "scene": {}})
+
+
+def touched(reply: Fields) -> None:
+    """Add a contact with a body that is not there."""
+    names = {"body1": "nobody", "body2": "", "geom1": "", "geom2": ""}
+    contact = {**names, "pos": [0.0] * 3, "normal": [0.0, 0.0, 1.0], "dist": 0.0, "force": [0.0] * 3}
+    reply["contacts"] = [{**one, "body1": "nobody"} for one in reply["contacts"]] or [contact]
 
 
 def whole_number(reply: Fields) -> bytes:
@@ -255,6 +265,11 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"reply": in_reply("error:session_expired", put("code", "busy"))},
     ),
     "a code that nobody knows": ("beta", "Session 9.6", {"reply": in_reply("error:bad_mode", put("code", "no_mood"))}),
+    "contacts of bodies that the model lacks": (
+        ANY,
+        "Simulation 7.3",
+        {"reply": in_reply("get_contacts_ok", touched)},
+    ),
     # Modes and options
     "the mode before": (ANY, "Session 9.6", {"reply": in_reply("set_mode_ok", put("previous_mode", "puppet"))}),
     "a speed without limits": (ANY, "Session 9.8", {"reply": in_reply("set_sim_speed_ok", put("percent", 1000.0))}),
@@ -270,6 +285,8 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
     ),
     # Claims and leases
     "a claim that is not enforced": ("beta", "Beta 9", {"reply": unguarded}),
+    "a claim that set-points by name get around": ("beta", "Beta 9", {"reply": partial(unguarded, only="ctrl_map")}),
+    "a claim that wrenches get around": ("beta", "Beta 9", {"reply": partial(unguarded, only="xfrc_applied")}),
     "an owner that is not told": ("beta", "Beta 9", {"reply": in_reply("error:not_control_owner", drop("owner"))}),
     "a claim under the public name": (
         "beta",
@@ -450,3 +467,10 @@ async def test_the_relay_falsifies_nothing_by_itself(
 ) -> None:
     for statement in ("Session 10.2", "Beta 43", "Transports 3.2", "Session 9.1"):
         assert await differing(targets[generation], statement) == set()
+
+
+async def test_frame_ids_grow_by_one_in_the_beta_only(targets: dict[str, tuple[SimulatedServer, Path]]) -> None:
+    wide = in_reply("step_ok", each("frame_id", lambda number: 2 * number))
+    for generation, differs in (("alpha", False), ("beta", True)):
+        found = await differing(targets[generation], "Beta 32", reply=wide)
+        assert ("Beta 32" in found) == differs, generation
