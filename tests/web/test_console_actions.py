@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -192,13 +193,18 @@ def test_what_the_server_has_saved_is_replayed_too(http: TestClient, server: Sim
 
 
 async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path) -> None:
-    crate = tmp_path / "crate.xml"
-    crate.write_text(
-        '<mujoco model="crate"><worldbody><body name="crate" pos="2 0 1"><freejoint/><geom size=".1"/></body>'
-        "</worldbody></mujoco>"
-    )
+    """A crate that falls is not in the local model's initial pose, and a door moves only as the server says."""
+
+    def prop(name: str, settings: dict[str, bool]) -> dict[str, Any]:
+        mesh = {"shape": "box", "size": [0.1, 0.1, 0.1]}
+        place = {"location": [3, len(name), 1], "quick_convert": settings}
+        return {"name": name, "kind": "static_mesh", "mesh": mesh, **place}
+
+    level = tmp_path / "level.json"
+    actors = [prop("crate", {}), prop("door", {"driven_by_unreal": True})]
+    level.write_text(json.dumps({"format": "urlab-level", "version": 1, "blueprints": {}, "actors": actors}))
     async with (
-        SimulatedServer("arm", crate, play=True) as server,
+        SimulatedServer("arm", level, play=True) as server,
         URLabClient(**server.client_options(), step_mode="direct", live_pictures=False) as client,
     ):
         await client.discover()
@@ -207,6 +213,7 @@ async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path
         shown = await viewer.shown()
         assert shown is not None
         assert viewer.latest() is None, "no state has come yet"
+        shown.data.mocap_pos[:] = 9.0
         client.articulations["arm"].set_ctrl({"elbow": 1.0})
         async with client.state_stream("all") as states:
             await client.step(50)
@@ -219,9 +226,10 @@ async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path
         speeds = [joint.qvel_offset for joint in client.articulations["arm"].joints.values()]
         assert np.abs(client.data.qvel[speeds]).max() > 0.01
         assert np.allclose(shown.data.qvel[speeds], client.data.qvel[speeds])
-        body = client.entities["crate"].body_id
-        assert shown.data.xpos[body] == pytest.approx(client.entities["crate"].root_pos_w)
-        assert shown.data.xpos[body][2] < 0.99, "it falls"
+        crate, door = (client.entities[name] for name in ("crate_MjBody", "door_MjBody"))
+        assert shown.data.xpos[crate.body_id] == pytest.approx(crate.root_pos_w)
+        assert shown.data.xpos[crate.body_id][2] < 0.99, "it falls"
+        assert shown.data.xpos[door.body_id].tolist() == [3.0, 4.0, 1.0]
 
 
 def test_curves_and_arrays_of_a_recording_are_files(http: TestClient, tmp_path: Path) -> None:
