@@ -80,6 +80,41 @@ def test_ops_that_the_client_must_know_of_go_through_it(http: TestClient) -> Non
     assert [one["key"] for one in http.get("/api/world").json()["articulations"]] == ["quadruped"]
 
 
+def test_options_and_the_switch_of_cameras_go_through_the_client_too(http: TestClient, server: SimulatedServer) -> None:
+    options = http.post("/api/ops/set_sim_options", json={"options": {"timestep": 0.004}})
+    assert (options.status_code, options.json()["options"]["timestep"]) == (200, 0.004)
+    before = http.get("/api/state").json()["time"]
+    assert http.post("/api/step", json={"n_steps": 5}).json()["time"] == pytest.approx(before + 0.02)
+    camera = http.get("/api/world").json()["articulations"][0]["cameras"][0]["name"]
+    switched = http.post("/api/ops/set_camera_streaming", json={"cameras": {camera: True}})
+    assert (switched.status_code, switched.json()["cameras"][camera]["streaming"]) == (200, True)
+    assert http.post("/api/ops/set_sim_options", json={"options": {"timestep": 0.002}}).status_code == 200
+
+
+async def test_a_client_that_only_watches_takes_the_handshake_from_the_console(
+    http: TestClient, server: SimulatedServer
+) -> None:
+    answer = http.get("/api/handshake")
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "application/octet-stream")
+    async with URLabClient(**server.client_options(), read_only=True) as watching:
+        await watching.discover(handshake=answer.content)
+        assert list(watching.articulations) == ["quadruped"]
+        assert watching.model is not None
+
+
+def test_an_invitation_lets_one_more_in_once(http: TestClient) -> None:
+    invitation = http.post("/api/invitations").json()
+    assert invitation["path"] == f"/?token={invitation['token']}"
+    token = {"token": invitation["token"]}
+    key = http.post("/api/session", json=token).json()["key"]
+    assert http.get("/api/status", headers={"authorization": f"Bearer {key}"}).status_code == 200
+    assert "unknown or has been used" in refusal(http.post("/api/session", json=token), 401)
+    stranger = {"authorization": "", "accept": "text/html"}
+    shut = http.get("/api/status", headers=stranger)
+    assert (shut.status_code, shut.headers["content-type"].partition(";")[0]) == (401, "text/html")
+    assert "Access denied" in shut.text
+
+
 def test_rays_and_pushes_take_finite_numbers_and_bodies_of_robots(http: TestClient) -> None:
     bodies = http.get("/api/bodies").json()["bodies"]
     trunk = next(one for one in bodies if one["robot"] == "quadruped")
@@ -245,6 +280,13 @@ def test_an_outcome_needs_a_recording(http: TestClient) -> None:
     said = refusal(http.post("/api/recording/outcome", json={"outcome": "success"}))
     assert "no recording runs" in said
     assert "no recording runs" in refusal(http.delete("/api/recording"))
+
+
+def test_without_play_there_is_nothing_to_record(http: TestClient) -> None:
+    http.post("/api/ops/stop_pie", json={})
+    refused = http.post("/api/recording", json={}).json()["error"]
+    assert (refused["message"], refused["hint"]) == ("There is nothing to record.", "Begin play first.")
+    assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
 
 
 def test_the_pace_of_the_simulation_is_shown(http: TestClient) -> None:
