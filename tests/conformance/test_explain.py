@@ -138,7 +138,7 @@ async def test_the_generation_is_named(connect: Any, serve: Any, dialect: str) -
         client = connect(server)
         await client.discover()
         (versions,) = (finding for finding in (await client.explain()).findings if finding.subject == "versions")
-        assert f"({dialect}) with MuJoCo" in versions.text
+        assert f", generation {dialect}, with MuJoCo" in versions.text
 
 
 async def test_who_controls_a_robot(connect: Any, serve: Any, dialect: str) -> None:
