@@ -84,6 +84,13 @@ def test_how_long_a_start_may_take_is_a_number_of_seconds(text: str) -> None:
         URLabClient(f"sim://arm?start-timeout={text}")
 
 
+async def test_a_server_that_is_not_ready_in_time_is_ended_and_the_option_named() -> None:
+    async with URLabClient("sim://arm?start-timeout=0.001") as client:
+        with pytest.raises(ServerUnreachable, match=r"not ready within 0\.001 s; add \?start-timeout=SECONDS"):
+            await client.discover()
+    assert children() == set()
+
+
 async def test_options_of_a_model_that_have_no_effect_are_told(tmp_path: Path) -> None:
     """Simulation behaviour 1.4: the plugin ignores a model's options, and so does what stands for it, unless told."""
     model = tmp_path / "slow.xml"

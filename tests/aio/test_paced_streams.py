@@ -123,6 +123,12 @@ def test_nonsense_is_refused(rate: float) -> None:
         Stream(Numbers(), policy="latest", max_rate=rate)
 
 
+@pytest.mark.parametrize("rate", ["60", [60]])
+def test_what_is_no_number_is_refused(rate: Any) -> None:
+    with pytest.raises(TypeError, match="max_rate takes a number above 0"):
+        Stream(Numbers(), policy="latest", max_rate=rate)
+
+
 def test_all_items_and_a_rate_contradict_each_other() -> None:
     with pytest.raises(ValueError, match="'latest'"):
         Stream(Numbers(), policy="all", max_rate=60)

@@ -23,6 +23,16 @@ async def test_nobody_there(connect: Any) -> None:
     assert f"127.0.0.1:{port}: Connection refused; is the server running" in problems(diagnosis)
 
 
+async def test_a_state_stream_that_cannot_be_reached_is_a_note(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server, socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+        diagnosis = await connect(server, step_mode="live", state_port=port).explain()
+    (note,) = [finding for finding in diagnosis.findings if finding.subject == "state stream"]
+    assert note.verdict is Verdict.NOTE
+    assert note.text.startswith(f"127.0.0.1:{port}: Connection refused; is the server running")
+
+
 async def test_no_session(connect: Any, serve: Any) -> None:
     with serve("arm", play=True) as server:
         assert "Call discover() first" in problems(await connect(server).explain())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +63,22 @@ def commands(change: Any) -> Any:
     return in_request("step", lambda request: [change(one) for one in request.get("per_articulation", {}).values()])
 
 
-def unguarded(request: Fields, reply: Fields) -> object:
-    """Say that a step was taken where the server refused it."""
+def unguarded(request: Fields, reply: Fields, *, only: str = "") -> object:
+    """Say that a step was taken where the server refused it, for all commands or those with one field."""
     if request.get("op") != "step" or reply.get("code") != "not_control_owner":
+        return None
+    if only and not any(only in command for command in request["per_articulation"].values()):
         return None
     clock = {"sec": 0.0, "nsec": 0.0}
     taken: Fields = {"op": "step_ok", "time": 0.0, "step": 0.0, "sim_time": clock, "wall_time": clock}
     return msgspec.msgpack.encode({**taken, "frame_id": 1.0, "arts": {}, "scene": {}})
+
+
+def touched(reply: Fields) -> None:
+    """Add a contact with a body that is not there."""
+    names = {"body1": "nobody", "body2": "", "geom1": "", "geom2": ""}
+    contact = {**names, "pos": [0.0] * 3, "normal": [0.0, 0.0, 1.0], "dist": 0.0, "force": [0.0] * 3}
+    reply["contacts"] = [{**one, "body1": "nobody"} for one in reply["contacts"]] or [contact]
 
 
 def whole_number(reply: Fields) -> bytes:
@@ -255,6 +266,11 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"reply": in_reply("error:session_expired", put("code", "busy"))},
     ),
     "a code that nobody knows": ("beta", "Session 9.6", {"reply": in_reply("error:bad_mode", put("code", "no_mood"))}),
+    "contacts of bodies that the model lacks": (
+        ANY,
+        "Simulation 7.3",
+        {"reply": in_reply("get_contacts_ok", touched)},
+    ),
     # Modes and options
     "the mode before": (ANY, "Session 9.6", {"reply": in_reply("set_mode_ok", put("previous_mode", "puppet"))}),
     "a speed without limits": (ANY, "Session 9.8", {"reply": in_reply("set_sim_speed_ok", put("percent", 1000.0))}),
@@ -270,6 +286,8 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
     ),
     # Claims and leases
     "a claim that is not enforced": ("beta", "Beta 9", {"reply": unguarded}),
+    "a claim that set-points by name get around": ("beta", "Beta 9", {"reply": partial(unguarded, only="ctrl_map")}),
+    "a claim that wrenches get around": ("beta", "Beta 9", {"reply": partial(unguarded, only="xfrc_applied")}),
     "an owner that is not told": ("beta", "Beta 9", {"reply": in_reply("error:not_control_owner", drop("owner"))}),
     "a claim under the public name": (
         "beta",
@@ -420,15 +438,20 @@ def targets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tupl
         yield made
 
 
-async def differing(target: tuple[SimulatedServer, Path], statement: str, **how: Any) -> set[str]:
-    """Return the statements that differ when something is falsified."""
+async def verdicts(target: tuple[SimulatedServer, Path], statement: str, **how: Any) -> dict[str, Verdict]:
+    """Return the verdicts on all statements when something is falsified and one of them is checked."""
     served, folder = target
     with Falsifier(served, **how) as relay:
         async with bench(served, folder, port=relay.port, state_port=relay.state_port) as made:
             named = (statement, *(WITH_REPLIES if statement in {"Fields 1", "Session 3.1"} else ()))
             choice = Choice(frozenset(Group), statements=named, measure=False)
             report = await run(made, choice)
-    return {row.id for row in report.statements if row.verdict is Verdict.DIFFERS}
+    return {row.id: row.verdict for row in report.statements}
+
+
+async def differing(target: tuple[SimulatedServer, Path], statement: str, **how: Any) -> set[str]:
+    """Return the statements that differ when something is falsified."""
+    return {name for name, verdict in (await verdicts(target, statement, **how)).items() if verdict is Verdict.DIFFERS}
 
 
 @pytest.mark.parametrize("what", FALSIFIED)
@@ -450,3 +473,19 @@ async def test_the_relay_falsifies_nothing_by_itself(
 ) -> None:
     for statement in ("Session 10.2", "Beta 43", "Transports 3.2", "Session 9.1"):
         assert await differing(targets[generation], statement) == set()
+
+
+@pytest.mark.parametrize(("width", "verdict"), [(1, Verdict.HOLDS), (3, Verdict.HOLDS), (0, Verdict.DIFFERS)])
+async def test_before_the_beta_frame_ids_need_only_grow(
+    targets: dict[str, tuple[SimulatedServer, Path]], width: int, verdict: Verdict
+) -> None:
+    """The generation between the alpha and the beta has both the ids and the switch of cameras."""
+    ids = itertools.count(1, width) if width else itertools.repeat(1)
+
+    def june(_request: Fields, reply: Fields) -> None:
+        if reply.get("op") == "meta_ok":
+            reply["ops"].append({**reply["ops"][0], "name": "set_camera_streaming"})
+        elif reply.get("op") == "step_ok":
+            reply["frame_id"] = float(next(ids))
+
+    assert (await verdicts(targets["alpha"], "Generation 2 19", reply=june))["Generation 2 19"] is verdict

@@ -100,6 +100,15 @@ def test_another_robot_or_another_size_is_refused(
     assert urlab(["run-policy", str(NETWORK), "--declaration", str(declaration)]) == 2
     assert f"quadruped.onnx has 38 inputs, but {declaration} declares 35" in capsys.readouterr().err
 
+    declaration.write_text(
+        'robot = "quadruped"\nstep_modes = ["direct"]\ntimestep = 0.002\ndecimation = 10\nhistory = 19\n'
+        '[[observation]]\nterm = "clock"\nhz = 2.0\n'
+        '[action]\nvia = "actuators"\njoints = ["FL_thigh", "FR_thigh"]\n'
+    )
+    assert urlab(["run-policy", str(NETWORK), serving("quadruped"), "--declaration", str(declaration)]) == 2
+    said = capsys.readouterr().err
+    assert f"quadruped.onnx has 12 outputs, but {declaration} declares 2 (action.joints)" in said
+
 
 def test_a_run_is_recorded_and_told_as_a_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from urlab_client.integrations.record import read_run

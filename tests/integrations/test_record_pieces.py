@@ -30,6 +30,22 @@ def changing(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[floa
         yield {"arm": Robot([i / 7], readings), **late}, {"box": [float(i), 0.0, 0.0]} if i > 41 else {}
 
 
+def test_the_state_of_a_moment_has_what_was_in_the_scene_then(tmp_path: Path) -> None:
+    write_recording(tmp_path / "run.mcap", changing(60))
+    run = read_run(tmp_path / "run.mcap")
+    early, late = run.state_at(0.2), run.state_at(0.5)
+    assert early is not None
+    assert late is not None
+    assert (early.articulations.keys(), early.entities) == ({"arm"}, {})
+    assert late.articulations["late"].qpos.tolist() == [50 / 3, 1.0]
+    assert late.articulations["arm"].sensors["touch"].tolist() == [0.5, 50.0]
+    assert late.entities["box"].position.tolist() == [50.0, 0.0, 0.0]
+    without = run.state_at(0.49)
+    assert without is not None
+    assert without.articulations.keys() == {"arm"}, "it has left for this sample"
+    assert without.entities["box"].position.tolist() == [49.0, 0.0, 0.0]
+
+
 def steady(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
     return (({"arm": Robot([float(i)] * 20)}, {}) for i in range(count))
 

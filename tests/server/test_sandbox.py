@@ -8,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from waiting import eventually
 from wire import Wire
 
 from urlab_client import URLabTimeoutError
@@ -142,12 +144,18 @@ def compile_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ca
     process._children.close()
 
 
-def test_a_process_that_never_answers_is_waited_for_once(
-    compile_with: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[process._Child]:
+    """The processes that are started for models."""
     started: list[process._Child] = []
     start = process._Child.__init__
     monkeypatch.setattr(process._Child, "__init__", lambda self: (started.append(self), start(self))[1])
+    return started
+
+
+def test_a_process_that_never_answers_is_waited_for_once(
+    compile_with: Callable[..., str], started: list[process._Child]
+) -> None:
     assert compile_with(HANGING, 0.1).endswith("x.xml: compilation took more than the limit model_wall_s, 1 s")
     assert len(started) == 1
 
@@ -162,7 +170,12 @@ def test_a_process_that_never_answers_is_waited_for_once(
     ids=["holds the pipe", "left its group", "at work"],
 )
 def test_what_a_killed_process_has_forked_delays_no_answer_and_is_ended(
-    program: str, wall_s: float, reason: str, tmp_path: Path, compile_with: Callable[..., str]
+    program: str,
+    wall_s: float,
+    reason: str,
+    tmp_path: Path,
+    compile_with: Callable[..., str],
+    started: list[process._Child],
 ) -> None:
     os.mkfifo(tmp_path / "alive")
     alive = os.open(tmp_path / "alive", os.O_RDONLY | os.O_NONBLOCK)
@@ -172,6 +185,17 @@ def test_what_a_killed_process_has_forked_delays_no_answer_and_is_ended(
         if program is LEFT_ITS_GROUP:  # no model can; it is the answer that matters
             os.kill(int(os.read(alive, 64)), signal.SIGKILL)
         assert pipe.read() == b""  # none of them has it open any longer
+    pipes = [pipe for child in started for pipe in (child.process.stdin, child.process.stdout) if pipe is not None]
+    eventually(lambda: all(pipe.closed for pipe in pipes))
+
+
+def test_an_import_writes_nowhere_but_in_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the kernel does not see to that."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    (tmp_path / "m.obj").write_text(TRIANGLE)
+    (tmp_path / "figure.xml").write_text(FIGURE.format(file="m.obj"))
+    importer.write_snapshot(tmp_path / "figure.xml", tmp_path / "snapshot")
+    assert {one.suffix for one in (tmp_path / "snapshot").iterdir()} == {".xml", ".obj"}
 
 
 def test_models_do_not_wait_for_each_other(tmp_path: Path, compile_with: Callable[..., str]) -> None:

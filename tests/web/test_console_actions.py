@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from starlette.testclient import TestClient
 from urlab_client.aio import URLabClient
 from urlab_client.console.description import describe
 from urlab_client.console.lease import Viewer
+from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
+from urlab_client.console.shared_view import SharedView
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app
 
@@ -75,6 +78,41 @@ def test_ops_that_the_client_must_know_of_go_through_it(http: TestClient) -> Non
     assert http.get("/api/world").json()["articulations"] == []
     assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
     assert [one["key"] for one in http.get("/api/world").json()["articulations"]] == ["quadruped"]
+
+
+def test_options_and_the_switch_of_cameras_go_through_the_client_too(http: TestClient, server: SimulatedServer) -> None:
+    options = http.post("/api/ops/set_sim_options", json={"options": {"timestep": 0.004}})
+    assert (options.status_code, options.json()["options"]["timestep"]) == (200, 0.004)
+    before = http.post("/api/step", json={"n_steps": 1}).json()["time"]
+    assert http.post("/api/step", json={"n_steps": 5}).json()["time"] == pytest.approx(before + 0.02)
+    camera = http.get("/api/world").json()["articulations"][0]["cameras"][0]["name"]
+    switched = http.post("/api/ops/set_camera_streaming", json={"cameras": {camera: True}})
+    assert (switched.status_code, switched.json()["cameras"][camera]["streaming"]) == (200, True)
+    assert http.post("/api/ops/set_sim_options", json={"options": {"timestep": 0.002}}).status_code == 200
+
+
+async def test_a_client_that_only_watches_takes_the_handshake_from_the_console(
+    http: TestClient, server: SimulatedServer
+) -> None:
+    answer = http.get("/api/handshake")
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "application/octet-stream")
+    async with URLabClient(**server.client_options(), read_only=True) as watching:
+        await watching.discover(handshake=answer.content)
+        assert list(watching.articulations) == ["quadruped"]
+        assert watching.model is not None
+
+
+def test_an_invitation_lets_one_more_in_once(http: TestClient) -> None:
+    invitation = http.post("/api/invitations").json()
+    assert invitation["path"] == f"/?token={invitation['token']}"
+    token = {"token": invitation["token"]}
+    key = http.post("/api/session", json=token).json()["key"]
+    assert http.get("/api/status", headers={"authorization": f"Bearer {key}"}).status_code == 200
+    assert "unknown or has been used" in refusal(http.post("/api/session", json=token), 401)
+    stranger = {"authorization": "", "accept": "text/html"}
+    shut = http.get("/api/status", headers=stranger)
+    assert (shut.status_code, shut.headers["content-type"].partition(";")[0]) == (401, "text/html")
+    assert "Access denied" in shut.text
 
 
 def test_rays_and_pushes_take_finite_numbers_and_bodies_of_robots(http: TestClient) -> None:
@@ -201,6 +239,64 @@ def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp
     assert http.delete("/api/replay").status_code == 200
 
 
+def test_what_the_server_has_saved_is_replayed_too(http: TestClient, server: SimulatedServer) -> None:
+    """It has the positions of all compiled joints together, and no velocities."""
+    assert http.post("/api/ops/recording_start", json={}).status_code == 200
+    for _ in range(5):
+        assert http.post("/api/step", json={"n_steps": 20}).status_code == 200
+    assert http.post("/api/ops/recording_stop", json={}).status_code == 200
+    saved = Path(http.post("/api/ops/recording_save", json={"path": "fall.json"}).json()["absolute_path"])
+    assert http.put("/api/recordings/fall.json", content=saved.read_bytes()).status_code == 200
+    last = json.loads(saved.read_bytes())["Frames"][-1]["jointStates"]
+    fallen = [value for joint in last.values() for value in joint["qPos"]]
+    http.post("/api/ops/reset", json={})
+    replay = http.post("/api/replay", json={"name": "fall.json", "playing": False, "time": 1e6})
+    assert replay.status_code == 200, replay.text
+    shown = http.get("/api/state").json()["articulations"]["quadruped"]["qpos"]
+    assert shown == pytest.approx(fallen, abs=2e-5)
+    assert http.delete("/api/replay").status_code == 200
+
+
+async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path) -> None:
+    """A crate that falls is not in the local model's initial pose, and a door moves only as the server says."""
+
+    def prop(name: str, settings: dict[str, bool]) -> dict[str, Any]:
+        mesh = {"shape": "box", "size": [0.1, 0.1, 0.1]}
+        place = {"location": [3, len(name), 1], "quick_convert": settings}
+        return {"name": name, "kind": "static_mesh", "mesh": mesh, **place}
+
+    level = tmp_path / "level.json"
+    actors = [prop("crate", {}), prop("door", {"driven_by_unreal": True})]
+    level.write_text(json.dumps({"format": "urlab-level", "version": 1, "blueprints": {}, "actors": actors}))
+    async with (
+        SimulatedServer("arm", level, play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct", live_pictures=False) as client,
+    ):
+        await client.discover()
+        view = SharedView(client)
+        viewer = MujocoViewer(client, view)
+        shown = await viewer.shown()
+        assert shown is not None
+        assert viewer.latest() is None, "no state has come yet"
+        shown.data.mocap_pos[:] = 9.0
+        client.articulations["arm"].set_ctrl({"elbow": 1.0})
+        async with client.state_stream("all") as states:
+            await client.step(50)
+            view.snapshot = await states.receive()
+            while view.snapshot.time < client.sim_time:
+                view.snapshot = await states.receive()
+        assert viewer.latest() is shown
+        assert client.data is not None
+        assert np.allclose(shown.data.qpos, client.data.qpos)
+        speeds = [joint.qvel_offset for joint in client.articulations["arm"].joints.values()]
+        assert np.abs(client.data.qvel[speeds]).max() > 0.01
+        assert np.allclose(shown.data.qvel[speeds], client.data.qvel[speeds])
+        crate, door = (client.entities[name] for name in ("crate_MjBody", "door_MjBody"))
+        assert shown.data.xpos[crate.body_id] == pytest.approx(crate.root_pos_w)
+        assert shown.data.xpos[crate.body_id][2] < 0.99, "it falls"
+        assert shown.data.xpos[door.body_id].tolist() == [3.0, 4.0, 1.0]
+
+
 def test_curves_and_arrays_of_a_recording_are_files(http: TestClient, tmp_path: Path) -> None:
     size = len(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"])
     recording(tmp_path / "recordings", "own.mcap", {"quadruped": size})
@@ -214,6 +310,13 @@ def test_an_outcome_needs_a_recording(http: TestClient) -> None:
     said = refusal(http.post("/api/recording/outcome", json={"outcome": "success"}))
     assert "no recording runs" in said
     assert "no recording runs" in refusal(http.delete("/api/recording"))
+
+
+def test_without_play_there_is_nothing_to_record(http: TestClient) -> None:
+    http.post("/api/ops/stop_pie", json={})
+    refused = http.post("/api/recording", json={}).json()["error"]
+    assert (refused["message"], refused["hint"]) == ("There is nothing to record.", "Begin play first.")
+    assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
 
 
 def test_the_pace_of_the_simulation_is_shown(http: TestClient) -> None:
