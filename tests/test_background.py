@@ -78,6 +78,7 @@ KILLED = {
     },
     "tests/sync/test_portal.py": {"urlab-io"},
     "tests/web/test_console_failures.py": {"urlab-web-camera", "urlab-web-"},
+    "tests/web/test_console_in_production.py": {"urlab-console-links"},
     "tests/integrations/test_failing_threads.py": {
         "urlab-environment",
         "urlab-feed",

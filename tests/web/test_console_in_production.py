@@ -236,3 +236,28 @@ def test_service_and_container_run_commands_that_exist() -> None:
     assert told is not None
     arguments = _parser("console").parse_args([*options, *told[1].split()])
     assert (program, arguments.host, arguments.address) == ("urlab", "0.0.0.0", "tcp://10.0.0.7")
+
+
+def test_a_terminal_is_told_when_it_gets_no_more_links() -> None:
+    from terminal import Terminal
+
+    program = """
+        import logging, threading
+        os.dup2(os.open("/dev/tty", os.O_RDWR), 0)
+        from urlab_client.cli import main
+        from urlab_client.web import Access
+        invite = Access.invite
+        def invite_first(access):
+            if threading.current_thread().name == "urlab-console-links":
+                raise MemoryError("none left")
+            return invite(access)
+        Access.invite = invite_first
+        logging.getLogger("urlab_client.web").addHandler(logging.StreamHandler(sys.stdout))
+        sys.exit(main(["console", "sim://ball", "--port", "0"]))
+    """
+    with Terminal(program) as terminal:
+        terminal.line()
+        terminal.type("\n")
+        assert terminal.line() == "no more links: MemoryError('none left')"
+        terminal.press_ctrl_c()
+        assert terminal.end()[0] == 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import logging
 import os
@@ -122,7 +123,7 @@ async def _serve(arguments: Namespace) -> None:
                 if arguments.open:
                     webbrowser.open(link)
                 if more:
-                    failed = logging.getLogger("urlab_client.web").exception
+                    failed = functools.partial(logging.getLogger("urlab_client.web").exception, "no more links: %r")
                     daemon("urlab-console-links", _print_links, new_link, failed=failed).start()
 
             site = app(
