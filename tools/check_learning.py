@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import io
 import json
 import os
@@ -110,7 +111,9 @@ def export() -> str:
         modes: Any = import_module("gymnasium.vector").AutoresetMode
         batch = gymnasium.make_vec(task, num_envs=4, backend="batch", autoreset_mode=modes.SAME_STEP)
         envs = wrap(batch)
-        model = getattr(library, name)("MlpPolicy", envs, seed=1, device="cpu", **options)
+        model = getattr(library, name)(
+            "MlpPolicy", envs, seed=1, device="cpu", **copy.deepcopy(options)
+        )  # it adds some
         model.learn(steps)
         with tempfile.TemporaryDirectory() as folder:
             spec = policy.export_policy(model, task, Path(folder) / "policy.onnx")
