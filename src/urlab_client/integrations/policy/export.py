@@ -69,7 +69,13 @@ _ACTIVATIONS: Final[dict[str, tuple[str, dict[str, str]]]] = {
 }
 """Operators of PyTorch's activations, and PyTorch's names of their attributes."""
 
-_NOTHING: Final = ("Dropout", "FlattenExtractor", "Identity", "_IdentityDeterministicOutput")
+_NOTHING: Final = (
+    "Dropout",
+    "FlattenExtractor",
+    "Identity",
+    "_FirstSliceDeterministicOutput",
+    "_IdentityDeterministicOutput",
+)
 """Modules that do not change a flat observation. What else they may do, the check of the network notices."""
 
 
@@ -138,16 +144,11 @@ def export_policy(
         spec = _declared(served, robot, goals, terms, history)
         policy = Policy(spec, network, source=path.with_suffix(".toml").name)
         seen = _rehearsed(served, goals, policy, act, tolerance)
-        # What was not seen in these episodes, too.
-        seen += [
-            *np.random.default_rng(0).normal(
-                np.mean(seen, axis=0), 3 * np.std(seen, axis=0) + 0.1, (DRAWN, len(seen[0]))
-            )
-        ]
-        exact = np.array(seen, dtype=np.float32)  # what a network is given
-        _require_equal(
-            "The network", "action", [network(each) for each in exact], act(exact.astype(np.float64)), tolerance
-        )
+        mean, spread = np.mean(seen, axis=0), 3 * np.std(seen, axis=0) + 0.1
+        unseen = np.random.default_rng(0).normal(mean, spread, (DRAWN, len(mean)))
+        exact = np.concatenate([seen, unseen]).astype(np.float32)  # what a network is given
+        found, expected = [network(each) for each in exact], act(exact.astype(np.float64))
+        _require_equal("The network", "action", found, expected, tolerance)
         path.write_bytes(written.read_bytes())
     path.with_suffix(".toml").write_text(f"# Inputs and outputs of {path.name}.\n\n{spec.to_toml()}", encoding="utf-8")
     return spec
@@ -303,11 +304,12 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], 
         kept, statistics = vars(wrapper), vars(wrapper).get("obs_rms")
         if statistics is not None and kept.get("norm_obs", True):  # VecNormalize, NormalizeObservation
             limit = float(kept.get("clip_obs", np.inf))
-            deviation = np.sqrt(statistics.var + wrapper.epsilon)
-            # Those of one observation hold for all that are stacked.
-            normalised.append((np.resize(statistics.mean, n_inputs), np.resize(deviation, n_inputs), limit))
-            before += [("Sub", normalised[-1][:1], {}), ("Div", normalised[-1][1:2], {}), *_clipped(-limit, limit)]
-        elif "VectorObservationWrapper" in _ancestors(wrapper):
+            # Statistics of one observation hold for all that are stacked.
+            mean, variance = (np.resize(values, n_inputs) for values in (statistics.mean, statistics.var))
+            deviation = np.sqrt(variance + wrapper.epsilon)
+            normalised.append((mean, deviation, limit))
+            before += [("Sub", [mean], {}), ("Div", [deviation], {}), *_clipped(-limit, limit)]
+        elif _is_a("VectorObservationWrapper", wrapper):
             raise PolicyExportError(f"The wrapper {type(wrapper).__name__} changes observations, and is not exported.")
     factor, offset = np.ones(len(ours.T)), np.zeros(len(ours.T))
     if not np.array_equal(ours, theirs):
@@ -341,8 +343,9 @@ def _wrappers(env: Any) -> Iterator[Any]:
         env = getattr(env, "venv", None) or getattr(env, "env", None)
 
 
-def _ancestors(thing: object) -> list[str]:
-    return [each.__name__ for each in type(thing).__mro__]
+def _is_a(name: str, thing: object) -> bool:
+    """Return whether a class of this name, of a library that is not imported, is among those of an object."""
+    return any(each.__name__ == name for each in type(thing).__mro__)
 
 
 def _stable_baselines(model: Any) -> tuple[list[Layer], _Act]:
@@ -392,7 +395,7 @@ def _layers(modules: Iterable[Any]) -> Iterator[Layer]:
             yield "LayerNormalization", [_array(module.weight), _array(module.bias)], {"epsilon": module.eps}
         elif kind == "Unflatten":  # RSL-RL's network has means, and then deviations
             yield "Slice", [np.array([0]), np.array([module.unflattened_size[-1]]), np.array([1])], {}
-        elif "Sequential" in _ancestors(module):
+        elif _is_a("Sequential", module):
             yield from _layers(module)  # children() would leave out activations that are used twice
         elif hasattr(module, "obs_normalizer"):  # RSL-RL's actor
             yield from _layers(module.children())
