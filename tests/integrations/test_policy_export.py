@@ -181,7 +181,8 @@ def test_a_policy_of_a_task_runs_in_the_task_and_on_the_robot(
 def test_without_terms_a_file_runs_in_its_task_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Actions that training rescaled become those of the task."""
     inner = URLabBatchEnv(Reach.scene_address, 1, task=Reach(), autoreset_mode=AutoresetMode.SAME_STEP)
-    rescaled = RescaleAction(inner, np.float32(-1.0), np.float32(1.0))
+    one: Any = np.float32(1.0)
+    rescaled = RescaleAction(inner, -one, one)
     model = Model(22, rescaled.single_action_space, env=rescaled)
     path = tmp_path / "reach.onnx"
     spec = export_policy(model, Reach, path)

@@ -136,7 +136,8 @@ def export_policy(
                 f"{_name(type(own))} must have flat observations, and actions of one articulation.",
                 hint="Other networks can be exported with torch.onnx.export: see task_network().",
             )
-        size, robot = served.observation_space.shape[0], served.articulations[driven[0]]
+        seen_space: Any = served.observation_space
+        size, robot = int(seen_space.shape[0]), served.articulations[driven[0]]
         layers, act, history = _trained(model, env, size, served.action_space)
         written = Path(folder) / path.name
         written.write_bytes(onnx_network(layers, size * history))
@@ -204,7 +205,7 @@ def _declared(
         step_modes=[StepMode.DIRECT, StepMode.LIVE],
         timestep=float(task.scene.model.opt.timestep),
         decimation=env.n_substeps,
-        task=_name(type(task)),
+        task=_name(task.__class__),
         keyframe=task.keyframe,
         history=history,
         observation=observation,
@@ -301,9 +302,9 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], 
     before: list[Layer] = []
     normalised: list[tuple[Floats, Floats, float]] = []
     for wrapper in reversed(wrappers):
-        kept, statistics = vars(wrapper), vars(wrapper).get("obs_rms")
-        if statistics is not None and kept.get("norm_obs", True):  # VecNormalize, NormalizeObservation
-            limit = float(kept.get("clip_obs", np.inf))
+        statistics = _own(wrapper, "obs_rms")
+        if statistics is not None and _own(wrapper, "norm_obs", True):  # VecNormalize, NormalizeObservation
+            limit = float(_own(wrapper, "clip_obs", np.inf))
             # Statistics of one observation hold for all that are stacked.
             mean, variance = (np.resize(values, n_inputs) for values in (statistics.mean, statistics.var))
             deviation = np.sqrt(variance + wrapper.epsilon)
@@ -341,6 +342,11 @@ def _wrappers(env: Any) -> Iterator[Any]:
     while env is not None:
         yield env
         env = getattr(env, "venv", None) or getattr(env, "env", None)
+
+
+def _own(thing: object, name: str, otherwise: Any = None) -> Any:
+    """Return an attribute of an object itself: wrappers also have those of what they wrap."""
+    return vars(thing).get(name, otherwise)
 
 
 def _is_a(name: str, thing: object) -> bool:
