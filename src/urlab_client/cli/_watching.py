@@ -11,7 +11,6 @@ from argparse import Namespace
 from collections.abc import AsyncGenerator, Callable, Generator
 from typing import TYPE_CHECKING, Any
 
-from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import cameras, make_client
 from urlab_client.cli._common import CommandError, in_background, refusing
 from urlab_client.enums import StepMode
@@ -121,6 +120,7 @@ async def recorded(client: URLabClient, arguments: Namespace) -> AsyncGenerator[
 @contextlib.contextmanager
 def task_environment(arguments: Namespace, kind: type[Task], **options: Any) -> Generator[URLabEnv]:
     """Yield an environment of a task, over the server that the arguments name or else a simulated one."""
+    from urlab_client.aio.launch import with_model_options
     from urlab_client.integrations.gym import URLabEnv
     from urlab_client.sync.client import URLabClient as BlockingClient
 

@@ -15,8 +15,6 @@ import contextlib
 from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from urlab_client import aio
 from urlab_client.cli._arguments import (
     CAMERA,
@@ -87,6 +85,7 @@ def run(arguments: Namespace) -> int:
 def _record_task(arguments: Namespace) -> Recorder:
     """Run episodes of a task with actions of zero, or the nearest that the action space allows."""
     import gymnasium
+    import numpy as np
 
     from urlab_client.integrations.record import record
 
