@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import io
 import json
 import os
@@ -110,7 +111,9 @@ def export() -> str:
         modes: Any = import_module("gymnasium.vector").AutoresetMode
         batch = gymnasium.make_vec(task, num_envs=4, backend="batch", autoreset_mode=modes.SAME_STEP)
         envs = wrap(batch)
-        model = getattr(library, name)("MlpPolicy", envs, seed=1, device="cpu", **options)
+        model = getattr(library, name)(
+            "MlpPolicy", envs, seed=1, device="cpu", **copy.deepcopy(options)
+        )  # it adds some
         model.learn(steps)
         with tempfile.TemporaryDirectory() as folder:
             spec = policy.export_policy(model, task, Path(folder) / "policy.onnx")
@@ -133,13 +136,13 @@ def export() -> str:
 
 
 def rsl_rl() -> str:
-    """RSL-RL's runner trains on a batch of 64, with staggered ends, and its actor becomes a file that acts like it."""
+    """RSL-RL's runner trains on a batch of 16, with staggered ends and rescaled actions, and becomes a file."""
     adapter: Any = import_module("urlab_client.integrations.gym.rsl_rl")
     policy: Any = import_module("urlab_client.integrations.policy")
     modes: Any = import_module("gymnasium.vector").AutoresetMode
-    envs = adapter.RslRlVecEnv(
-        gymnasium.make_vec("urlab/Reach-v0", num_envs=64, backend="batch", autoreset_mode=modes.SAME_STEP)
-    )
+    batch = gymnasium.make_vec("urlab/Reach-v0", num_envs=16, backend="batch", autoreset_mode=modes.SAME_STEP)
+    rescaled = gymnasium.wrappers.vector.RescaleAction(batch, np.float32(-1.0), np.float32(1.0))
+    envs = adapter.RslRlVecEnv(rescaled)
     layers: dict[str, Any] = {"class_name": "MLPModel", "hidden_dims": [64, 64], "obs_normalization": True}
     gaussian = {"class_name": "HeteroscedasticGaussianDistribution", "init_std": 0.3}
     settings: dict[str, Any] = {
@@ -158,8 +161,14 @@ def rsl_rl() -> str:
         raise AssertionError(f"the episodes' ends are not staggered: {lengths}")
     with tempfile.TemporaryDirectory() as folder:
         policy.export_policy(runner, "urlab/Reach-v0", Path(folder) / "reach.onnx")
+        network = policy.OnnxNetwork(Path(folder) / "reach.onnx")
+    seen, space = envs.get_observations(), batch.single_action_space
+    acted = runner.get_inference_policy(device="cpu")(seen).detach().numpy()
+    expected = np.clip(rescaled.actions(acted)[0], space.low, space.high)
+    if not np.allclose(network(seen["policy"][0].numpy()), expected, atol=1e-4):
+        raise AssertionError("the file gives other actions than training")
     envs.close()
-    return f"{runner.current_learning_iteration + 1} iterations of {64 * 50} steps, exported"
+    return f"{runner.current_learning_iteration + 1} iterations of {16 * 50} steps, exported"
 
 
 def single_file() -> str:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from urlab_client import URLabClient
 from urlab_client.integrations.gym import URLabBatchEnv
 from urlab_client.integrations.policy import Policy, PolicyMapping, PolicySpec, RobotState, read_spec
-from urlab_client.integrations.policy.export import Layer, onnx_network
+from urlab_client.integrations.policy.network import Layer, onnx_network
 
 Floats = NDArray[np.float64]
 Act = Callable[[Floats], Floats]

@@ -10,14 +10,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RescaleAction
 
 from urlab_client import URLabClient
 from urlab_client.cli import main as urlab
-from urlab_client.integrations.gym import Actions, Reach, States, Task, URLabBatchEnv, URLabEnv, Walk
-from urlab_client.integrations.policy import PolicyExportError, export_policy, load, run_blocking
-from urlab_client.integrations.policy.spec import CommandTerm, GoalTerm, parse_spec
+from urlab_client.integrations.gym import Actions, Push, Reach, Start, States, Task, URLabBatchEnv, URLabEnv, Walk
+from urlab_client.integrations.policy import OnnxNetwork, PolicyExportError, export_policy, load, run_blocking
+from urlab_client.integrations.policy.spec import (
+    AngularVelocity,
+    CommandTerm,
+    FieldTerm,
+    GoalTerm,
+    Gravity,
+    JointPosition,
+    JointVelocity,
+    LastAction,
+    LinearVelocity,
+    PhaseClock,
+    parse_spec,
+)
 
 
 class Tensor(np.ndarray[Any, Any]):
@@ -65,18 +78,15 @@ class Conv2d(Tanh):
 
 
 class VecNormalize:
-    norm_obs = True
-    clip_obs = 3.0
     epsilon = 1e-8
 
     def __init__(self, venv: Any, size: int) -> None:
         rng = np.random.default_rng(9)
-        self.venv = venv
+        self.venv, self.norm_obs, self.clip_obs = venv, True, 3.0
         self.obs_rms = SimpleNamespace(mean=rng.normal(size=size), var=rng.uniform(0.1, 2.0, size))
 
     def normalize_obs(self, x: Any) -> Any:
-        found = (x.reshape(len(x), -1, len(self.obs_rms.mean)) - self.obs_rms.mean) / np.sqrt(self.obs_rms.var + 1e-8)
-        return np.clip(found, -3.0, 3.0).reshape(x.shape)
+        return np.clip((x - self.obs_rms.mean) / np.sqrt(self.obs_rms.var + self.epsilon), -3.0, 3.0)
 
 
 class VecFrameStack:
@@ -107,21 +117,40 @@ class Model:
         return np.clip(self.head(self.net(inputs)), self.action_space.low, self.action_space.high), None
 
 
-@pytest.fixture(scope="module")
-def walk() -> Any:
-    env = URLabBatchEnv(Walk.scene_address, 1, task=Walk())
-    yield env
-    env.close()
+WALKING = [
+    LinearVelocity(scale=2.0),
+    AngularVelocity(scale=0.5),
+    Gravity(scale=5.0),
+    JointPosition(scale=3.0),
+    JointVelocity(scale=0.1),
+    LastAction(),
+    PhaseClock(hz=Walk.STRIDES_PER_S),
+    CommandTerm(scale=3.0),
+]
+"""What `Walk` observes."""
+
+LEGS = Box(-1.0, 1.0, (12,))
+ARM = Box(*np.array([[-2.9, -1.8, -2.9, -3.1, -2.9, -0.1, 0.0], [2.9, 1.8, 2.9, 0.0, 2.9, 3.7, 0.04]], np.float32))
+
+
+class Follow(Walk):
+    """Walking with other observations and actions: all of the robot's fields, and the command."""
+
+    n_observed = 3
+    articulations = None
+    actions = Actions(scale=0.2)
+
+    def observe(self, states: States) -> Any:
+        return states.goal["command"]
 
 
 def test_a_policy_of_a_task_runs_in_the_task_and_on_the_robot(
-    tmp_path: Path, walk: Any, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    size, space = walk.single_observation_space.shape[0], walk.single_action_space
-    trained = VecNormalize(None, size)
-    model = Model(size, space, env=trained)
+    trained = VecNormalize(None, 50)
+    model = Model(50, LEGS, env=trained)
     path = tmp_path / "walk.onnx"
-    spec = export_policy(model, "urlab/Walk-v0", path, terms=[CommandTerm()])
+    spec = export_policy(model, "urlab/Walk-v0", path, terms=WALKING)
     assert parse_spec(path.with_suffix(".toml").read_text(), "walk.toml") == spec
     assert (spec.task, spec.robot, spec.decimation, spec.action.via) == ("urlab/Walk-v0", "quadruped", 10, "controller")
     assert spec.action.scale == [0.3, 0.6, 0.8] * 4
@@ -132,11 +161,11 @@ def test_a_policy_of_a_task_runs_in_the_task_and_on_the_robot(
 
     env = URLabEnv.connect(Walk.scene_address, task=Walk())
     observation, total = env.reset(seed=0)[0], 0.0
-    for _ in range(50):
+    for _ in range(10):
         observation, reward, *_ = env.step(model.predict(trained.normalize_obs(observation[None]), True)[0][0])
         total += reward
     env.close()
-    arguments = ["run-policy", str(path.with_suffix(".toml")), "--json", "--seconds=1"]
+    arguments = ["run-policy", str(path.with_suffix(".toml")), "--json", "--seconds=0.2"]
     assert urlab(arguments) in (0, 1)
     assert json.loads(capsys.readouterr().out)["return"] == pytest.approx(total, rel=1e-3)
 
@@ -144,28 +173,16 @@ def test_a_policy_of_a_task_runs_in_the_task_and_on_the_robot(
         client.discover()
         assert run_blocking(client, load(path), seconds=0.2).actions == 10
     assert urlab([*arguments, "--command", "0.2", "0", "0"]) in (0, 1)
-    assert json.loads(capsys.readouterr().out)["policy"]["steps"] == 500
+    assert json.loads(capsys.readouterr().out)["policy"]["steps"] == 100
     assert urlab(["evaluate", str(path), "--episodes=2", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["outcomes"]) == 2
 
 
-def test_earlier_observations_are_part_of_the_input(
-    tmp_path: Path, walk: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    size, space = walk.single_observation_space.shape[0], walk.single_action_space
-    model = Model(3 * size, space, env=VecFrameStack(VecNormalize(None, size), 3))
-    spec = export_policy(model, walk, tmp_path / "walk.onnx")
-    assert spec.history == 3
-    assert isinstance(spec.observation[-1], GoalTerm)  # what the task observes is its goal
-    assert urlab(["run-policy", str(tmp_path / "walk.onnx"), "--json", "--seconds=0.2"]) == 0
-    assert json.loads(capsys.readouterr().out)["actions"] == 10
-    assert urlab(["evaluate", str(tmp_path / "walk.onnx"), "--episodes=1", "--json"]) == 0
-
-
-def test_rescaled_actions_become_those_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The observations are not the robot's alone, so the file runs only in its task, and says so."""
+def test_without_terms_a_file_runs_in_its_task_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Actions that training rescaled become those of the task."""
     inner = URLabBatchEnv(Reach.scene_address, 1, task=Reach(), autoreset_mode=AutoresetMode.SAME_STEP)
-    rescaled = RescaleAction(inner, np.float32(-1.0), np.float32(1.0))
+    one: Any = np.float32(1.0)
+    rescaled = RescaleAction(inner, -one, one)
     model = Model(22, rescaled.single_action_space, env=rescaled)
     path = tmp_path / "reach.onnx"
     spec = export_policy(model, Reach, path)
@@ -174,7 +191,6 @@ def test_rescaled_actions_become_those_of_the_task(tmp_path: Path, capsys: pytes
         ValueError, match=r"reach.toml: it declares no observation, so .* only in the task 'urlab/Reach"
     ):
         load(path)
-    inner.reset(seed=0)
     env = URLabEnv.connect(Reach.scene_address, task=Reach())
     observation, total = env.reset(seed=0)[0], 0.0
     for _ in range(10):
@@ -187,24 +203,37 @@ def test_rescaled_actions_become_those_of_the_task(tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["return"] == pytest.approx(total, rel=1e-4)
 
 
-def test_a_file_that_differs_is_not_written(tmp_path: Path, walk: Any) -> None:
-    size, space = walk.single_observation_space.shape[0], walk.single_action_space
-    model = Model(size, space)
+def test_earlier_observations_are_part_of_the_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The normalisation may be that of one observation, or of all that are stacked."""
+    one, three = VecNormalize(None, 40), VecNormalize(VecFrameStack(None, 3), 120)
+    for envs in (VecFrameStack(one, 3), three):
+        path = tmp_path / "follow.onnx"
+        spec = export_policy(Model(120, LEGS, env=envs), Follow, path, terms=[GoalTerm()])
+        assert spec.history == 3
+    assert [term.field for term in spec.observation if isinstance(term, FieldTerm)] == ["qpos", "qvel"]
+    assert spec.action.scale == 0.2
+    assert spec.task.endswith("test_policy_export:Follow")
+    network, seen = OnnxNetwork(path), np.random.default_rng(0).normal(size=120)
+    model = Model(120, LEGS)
+    np.testing.assert_allclose(network(seen), model.predict(three.normalize_obs(seen[None]), True)[0][0], atol=1e-5)
+    assert urlab(["run-policy", str(path), "--json", "--seconds=0.2"]) in (0, 1)
+    assert json.loads(capsys.readouterr().out)["actions"] == 10
+    assert urlab(["evaluate", str(path), "--episodes=1", "--json"]) == 0
+
+
+def test_a_file_that_differs_is_not_written(tmp_path: Path) -> None:
+    model = Model(50, LEGS)
     told = model.predict
 
     def biased(inputs: Any, deterministic: bool = False) -> Any:
         return told(inputs, deterministic)[0] * 0.9, None
 
     model.predict = biased  # type: ignore[method-assign]
-    with pytest.raises(
-        PolicyExportError, match=r"an observation of an episode, gives .* number \d+ of the action, not"
-    ):
+    with pytest.raises(PolicyExportError, match=r"The network gives .* number \d+ of the action, not"):
         export_policy(model, Walk, tmp_path / "walk.onnx")
     # The sensor is read at the start of the last physics step, the task's own position after it.
     terms = [GoalTerm(), GoalTerm(relative_to="grip_position")]
-    arm = URLabBatchEnv(Reach.scene_address, 1, task=Reach())
-    reach = Model(22, arm.single_action_space)
-    arm.close()
+    reach = Model(22, ARM)
     with pytest.raises(
         PolicyExportError, match=r"reach\.toml gives .* of the observation, not .* tolerance of 0\.0001"
     ):
@@ -213,63 +242,46 @@ def test_a_file_that_differs_is_not_written(tmp_path: Path, walk: Any) -> None:
     assert len(export_policy(reach, Reach, tmp_path / "reach.onnx", terms=terms, tolerance=0.05).observation) == 4
 
 
-class Tuned(Walk):
-    """Walking with other actions."""
+class VectorObservationWrapper:
+    """Gymnasium's, which changes observations."""
 
-    actions = Actions(scale=0.2)
+
+class RescaleObservation(VectorObservationWrapper):
+    env = None
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda model: model.net.append(Conv2d()), "The layer Conv2d cannot be exported"),
-        (lambda model: setattr(model.policy, "lstm_actor", object()), "no actor with continuous actions and without"),
-        (lambda model: setattr(model, "net", None) or delattr(model.policy, "action_net"), "no actor with continuous"),
-        (lambda model: setattr(model, "_env", VecFrameStack(None, 2)), "maps 40 numbers .* observations of 80"),
-        (lambda model: setattr(model, "_env", VecTransposeImage()), "wrapper VecTransposeImage changes observations"),
+        (lambda model: delattr(model.policy, "action_net"), "Model has no actor with continuous actions"),
+        (lambda model: setattr(model, "_env", VecFrameStack(None, 2)), "maps 50 numbers .* observations of 100"),
+        (lambda model: setattr(model, "_env", RescaleObservation()), "wrapper RescaleObservation changes observations"),
+        (lambda model: setattr(model, "action_space", Box(-np.inf, np.inf, (12,))), "differ .* and are not finite"),
     ],
 )
-def test_what_cannot_be_exported_is_said(change: Callable[[Any], Any], said: str, tmp_path: Path, walk: Any) -> None:
-    model = Model(40, walk.single_action_space)
+def test_what_cannot_be_exported_is_said(change: Callable[[Any], Any], said: str, tmp_path: Path) -> None:
+    model = Model(50, LEGS)
     change(model)
     with pytest.raises(PolicyExportError, match=said):
         export_policy(model, Walk, tmp_path / "walk.onnx")
 
 
-class VecTransposeImage:
-    """A wrapper for pictures."""
+class Further(Follow):
+    """A goal of four numbers."""
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        super().reset(rng, start)
+        start.goal["height"] = np.zeros(1)
 
 
-def test_an_environment_that_overrides_its_task_is_refused(tmp_path: Path, serving: Callable[..., str]) -> None:
-    env = URLabBatchEnv(Walk.scene_address, 1, task=Walk(), n_substeps=5)
-    with pytest.raises(PolicyExportError, match="overrides attributes of urlab/Walk-v0"):
-        export_policy(Model(40, env.single_action_space), env, tmp_path / "walk.onnx")
-    env.close()
-    tuned = URLabBatchEnv(Walk.scene_address, 1, task=Tuned())
-    spec = export_policy(Model(40, tuned.single_action_space), tuned, tmp_path / "walk.onnx")
-    tuned.close()
-    assert spec.action.scale == 0.2
-    assert spec.task.endswith("test_policy_export:Tuned")
-    without = URLabBatchEnv(serving("arm"), 1)
-    with pytest.raises(PolicyExportError, match="has no task"):
-        export_policy(Model(40, without.single_action_space), without, tmp_path / "x.onnx")
-    without.close()
-
-
-def test_a_task_is_left_as_it_was(tmp_path: Path, walk: Any) -> None:
-    """The object may serve an environment, and its curriculum does not advance."""
-
-    class Counting(Walk):
-        ends = 0
-
-        def ended(self, episode: Any) -> None:
-            self.ends += 1
-
-    task: Task = Counting()
-    env = URLabBatchEnv(Walk.scene_address, 1, task=task)
-    env.reset(seed=0)
-    before = {**vars(task)}
-    export_policy(Model(40, walk.single_action_space), task, tmp_path / "walk.onnx")
-    assert vars(task) == before
-    assert isinstance(env._states(np.arange(1)), States)
-    env.close()
+@pytest.mark.parametrize(
+    ("task", "model", "said"),
+    [
+        (Push, Model(31, ARM), "Terms describe arm, but arm, block, floor are observed"),
+        (Further, Model(40, LEGS), "The goal of .*:Further has 4 numbers: not a command"),
+    ],
+)
+def test_terms_that_do_not_fit_the_task_are_refused(task: type[Task], model: Model, said: str, tmp_path: Path) -> None:
+    with pytest.raises(PolicyExportError, match=said):
+        export_policy(model, task, tmp_path / "policy.onnx", terms=[CommandTerm()])

@@ -86,10 +86,11 @@ def _in_task(arguments: Namespace, path: Path, kind: type[Task], history: int) -
     """Run one episode of a task; return 1 if it was terminated without success, else 0."""
     from urlab_client.integrations.policy import joined, task_network
 
+    name = arguments.task or kind.__name__
     with (
         task_environment(arguments, kind, max_episode_steps=sys.maxsize) as env,
         contextlib.ExitStack() as stack,
-        progress_bar(arguments.task or kind.__name__, arguments.seconds) as progress,
+        progress_bar(name, arguments.seconds) as progress,
     ):
         network: Any = task_network(path, env.observation_space, env.action_space, history)
         if arguments.record is not None:
@@ -109,7 +110,7 @@ def _in_task(arguments: Namespace, path: Path, kind: type[Task], history: int) -
     if arguments.json:
         print(json_line({**found, "terminated": terminated}))
     else:
-        print(f"{arguments.policy.name} in {arguments.task or kind.__name__}, {info['sim_time']:.1f} s of simulation")
+        print(f"{arguments.policy.name} in {name}, {info['sim_time']:.1f} s of simulation")
         row = str(actions), f"{total:.3f}", "" if success is None else str(success), str(terminated)
         print(aligned([("actions", "return", "success", "terminated"), row], right=range(4)))
     return _FELL if terminated and not success else 0

@@ -18,9 +18,8 @@ Tensor = Any
 class RslRlVecEnv:
     """A `URLabBatchEnv` or `URLabVectorEnv`, also in Gymnasium's wrappers, for `OnPolicyRunner(RslRlVecEnv(env), …)`.
 
-    Observations are a `TensorDict` with the group `policy`, float32. They are converted once, from float64; the other
-    tensors on the CPU share their memory with the environment's arrays. `extras` contains `time_outs`, and under `log`
-    the share of successes among the episodes that ended, if the task defines success.
+    Observations are a `TensorDict` with the group `policy`, float32 like the rewards. `extras` contains `time_outs`,
+    and under `log` the share of successes among the episodes that ended, if the task defines success.
 
     Attributes:
         env: The environment.

@@ -1,9 +1,9 @@
-"""A network in an ONNX file: its inputs, its outputs, and running it."""
+"""A network in an ONNX file: its inputs, its outputs, writing and running it."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -19,6 +19,9 @@ _BYTES: Final = "tensor(uint8)"
 
 Network: TypeAlias = Callable[[Floats], Floats]
 """Maps an observation, shape (n_inputs,), to outputs, shape (n_outputs,)."""
+
+Layer: TypeAlias = tuple[str, Sequence[Any], Mapping[str, Any]]
+"""An ONNX operator, the constants that it takes after the value, and its attributes."""
 
 PicturesNetwork: TypeAlias = Callable[[Mapping[str, NDArray[Any]]], Floats]
 """Maps named inputs, which may include pictures, to outputs, shape (n_outputs,)."""
@@ -169,6 +172,45 @@ def task_network(path: Path, observation_space: Any, action_space: Any, history:
         if getattr(network, name) not in (None, size):
             raise PolicyFileError(f"{path} has {getattr(network, name)} {name}, but the task has {size}.")
     return network
+
+
+def onnx_network(layers: Sequence[Layer], inputs: int) -> bytes:
+    """Return an ONNX file of a network that maps observations, shape (batch, inputs), to actions.
+
+    Args:
+        layers: What happens to an observation, in order. Besides ONNX's operators there is `Swish`.
+        inputs: Length of an observation.
+
+    Raises:
+        MissingExtra: The extra `train` is not installed.
+    """
+    need("onnx", extra="train")
+    onnx: Any = importlib.import_module("onnx")
+    make, float32 = onnx.helper, onnx.TensorProto.FLOAT
+    nodes: list[Any] = []
+    constants: list[Any] = []
+    value = "observation"
+    for index, (operator, arrays, attributes) in enumerate(layers):
+        result = "action" if index == len(layers) - 1 else f"value{index}"
+        names = [f"{operator}{index}_{number}" for number in range(len(arrays))]
+        for name, array in zip(names, map(np.asarray, arrays), strict=True):
+            exact = array if array.dtype.kind == "i" else array.astype(np.float32)
+            constants.append(onnx.numpy_helper.from_array(exact, name))
+        if operator == "Swish":
+            nodes.append(make.make_node("Sigmoid", [value], [f"gate{index}"]))
+            names = [f"gate{index}"]
+        kind = "Mul" if operator == "Swish" else operator
+        nodes.append(make.make_node(kind, [value, *names], [result], **attributes))
+        value = result
+    ends = [
+        [make.make_tensor_value_info(name, float32, ["batch", width])]
+        for name, width in (("observation", inputs), ("action", None))
+    ]
+    graph = make.make_graph(nodes, "policy", *ends, constants)
+    opsets = [make.make_opsetid("", 20)]
+    made = make.make_model(graph, producer_name="urlab_client", opset_imports=opsets, ir_version=9)
+    onnx.checker.check_model(made, full_check=True)
+    return made.SerializeToString()
 
 
 def _session(path: Path) -> Any:
