@@ -276,6 +276,8 @@ def policy_task(arguments: Namespace, *about_robots: str) -> tuple[Path, type[Ta
     if arguments.task is not None and given:
         raise CommandError(f"--{given[0].replace('_', '-')} cannot be combined with --task, which determines it")
     name = arguments.task or (spec.task if spec is not None and not given else "")
+    if ":" in name and arguments.task is None:  # a policy that somebody sends must not run code of this folder
+        raise CommandError(f"{declaration} belongs to the task {name}; say --task {name} to run that module's code")
     return network, task_named(name) if name else None, 1 if spec is None else spec.history
 
 
