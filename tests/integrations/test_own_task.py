@@ -118,8 +118,8 @@ def test_commands_take_a_class_of_the_current_folder(
     assert main(["run-policy", str(still), *task, "--robot", "arm"]) == 2
     assert "--robot cannot be combined with --task" in capsys.readouterr().err
     assert task_named(f"{module}:Near").__name__ == "Near"
-    declared = f'robot = "arm"\ntask = "{module}:Near"\ntimestep = 0.002\ndecimation = 1\nobservation = []\n'
-    still.with_suffix(".toml").write_text(declared + '[action]\nvia = "controller"\n')
+    walk = (Path(__file__).parents[2] / "examples/policies/walk.toml").read_text()
+    still.with_suffix(".toml").write_text(f'task = "{module}:Near"\n{walk}')
     for command in ("evaluate", "run-policy"):
         assert main([command, str(still)]) == 2, "a file that somebody sends runs no module"
         assert f"say --task {module}:Near to run that module's code" in capsys.readouterr().err
