@@ -215,9 +215,9 @@ def test_earlier_observations_are_part_of_the_input(tmp_path: Path, capsys: pyte
     network, seen = OnnxNetwork(path), np.random.default_rng(0).normal(size=120)
     model = Model(120, LEGS)
     np.testing.assert_allclose(network(seen), model.predict(three.normalize_obs(seen[None]), True)[0][0], atol=1e-5)
-    assert urlab(["run-policy", str(path), "--json", "--seconds=0.2"]) in (0, 1)
+    assert urlab(["run-policy", str(path), "--task", spec.task, "--json", "--seconds=0.2"]) in (0, 1)
     assert json.loads(capsys.readouterr().out)["actions"] == 10
-    assert urlab(["evaluate", str(path), "--episodes=2", "--json"]) == 0
+    assert urlab(["evaluate", str(path), "--task", spec.task, "--episodes=2", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["outcomes"]) == 2
 
 
