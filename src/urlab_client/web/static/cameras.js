@@ -108,7 +108,7 @@ class CameraView {
     }
     const age = Date.now() + clock.offset - this.head.received;
     const rate = this.frames.filter((at) => at > performance.now() - 1000).length;
-    text(this.note, age <= 1500 && rate ? `${rate} fps · ${duration(age)}` : paused() ? "paused" : `${duration(age)} old`);
+    text(this.note, age <= 1500 && (rate || !paused()) ? `${rate} fps · ${duration(age)}` : paused() ? "paused" : `${duration(age)} old`);
     this.note.classList.toggle("old", age > 1500 && now.status?.moving);
   }
 
