@@ -62,6 +62,7 @@ def test_a_slider_moves_its_joint(page: Page) -> None:
 @pytest.mark.opengl
 def test_cameras_and_curves_are_drawn(page: Page) -> None:
     page.until("document.querySelectorAll('#cameras .camera').length === 4")
+    page.driver.execute_script("document.querySelector('#cameras').scrollIntoView()")  # only what is seen is streamed
     page.until("[...document.querySelectorAll('#cameras .camera')].every(one => /fps/.test(one.innerText))")
     pixels = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
     drawn = f"(canvas => {pixels}.some((value, i) => i % 4 === 1 && value > 90))"  # in colours, not in black

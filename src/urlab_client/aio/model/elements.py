@@ -375,7 +375,7 @@ H = TypeVar("H", Actuator, Joint, Sensor, Body)
 
 
 def _named(record: MirroredArticulation, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
-    by_name = {item.name: item for item in items}
+    by_name: dict[str, H] = {item.name: item for item in items}
     aliases = own_aliases([*by_name], record.info.compiled_prefix, record.mirror.prefixes)
     for live, authored in original.items():
         if live in by_name:
