@@ -76,6 +76,22 @@ def tab_to(page: Page, name: str) -> None:
     raise AssertionError(f"Tab does not lead to {name!r}")
 
 
+@pytest.mark.opengl
+def test_a_simulation_that_stands_still_shows_pictures_also_instead_of_the_3d_view(still: Page) -> None:
+    still.until("document.querySelector('#age').textContent === 'paused'")
+    pixels = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
+    drawn = f"(canvas => canvas && {pixels}.some((value, i) => i % 4 === 1 && value > 90))"
+    still.driver.execute_script("document.querySelector('.instead .camera').scrollIntoView({block: 'center'})")
+    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
+    chosen = still.look("document.querySelector('.instead .camera').dataset.camera")
+    options = still.look("[...document.querySelector('#camera-instead').options].map(({value}) => value)")
+    other = next(one for one in options if one != chosen)
+    still.choose("#camera-instead", other)
+    still.until(f"document.querySelector('.instead .camera').dataset.camera === '{other}'")
+    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
+    assert not still.look("document.querySelector('.instead .num').classList.contains('old')")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("small", [False, True], ids=["desk", "phone"])
 def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
@@ -205,22 +221,6 @@ def test_the_first_play_leaves_a_robot_with_torque_motors_standing(still: Page) 
     still.click("[data-robot=quadruped] .still button")
     still.until(f"{hold} === 'false'")
     still.asked("api/state", lambda state: height(state) < 0.2)
-
-
-@pytest.mark.opengl
-def test_a_simulation_that_stands_still_shows_pictures_also_instead_of_the_3d_view(still: Page) -> None:
-    still.until("document.querySelector('#age').textContent === 'paused'")
-    pixels = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
-    drawn = f"(canvas => canvas && {pixels}.some((value, i) => i % 4 === 1 && value > 90))"
-    still.driver.execute_script("document.querySelector('#view').scrollIntoView()")
-    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
-    chosen = still.look("document.querySelector('.instead .camera').dataset.camera")
-    options = still.look("[...document.querySelector('#camera-instead').options].map(({value}) => value)")
-    other = next(one for one in options if one != chosen)
-    still.choose("#camera-instead", other)
-    still.until(f"document.querySelector('.instead .camera').dataset.camera === '{other}'")
-    still.until(f"{drawn}(document.querySelector('.instead canvas'))")
-    assert not still.look("document.querySelector('.instead .num').classList.contains('old')")
 
 
 def test_an_invitation_shows_its_link_which_admits_one_browser(still: Page) -> None:
