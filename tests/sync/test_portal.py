@@ -799,10 +799,14 @@ class TestInterrupt:
                 os.kill(os.getpid(), signal.SIGINT)
                 await asyncio.Event().wait()
 
+            async def struck():
+                signal.raise_signal(signal.SIGUSR1)
+                await asyncio.Event().wait()
+
             portal = Portal()
             signal.signal(signal.SIGUSR1, lambda *_: portal.call(hang))
             try:
-                portal.call(lambda: asyncio.sleep(signal.raise_signal(signal.SIGUSR1) or 3600))
+                portal.call(struck)
             except KeyboardInterrupt:
                 say("interrupted")
             portal.close()
