@@ -133,10 +133,10 @@ class Disturbances:
             if not self._n_task:
                 raise ValueError("noise on task: the environment's task adds nothing to the observation")
             return [("", "task", self._n_task)]
-        if noise.field not in mapping.fields:
-            raise ValueError(
-                f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(mapping.fields)}"
-            )
+        fields = mapping.fields if mapping.observed else ()
+        if noise.field not in fields:
+            seen = [*fields, *(["task"] if self._n_task else [])]
+            raise ValueError(f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(seen)}")
         meant = fnmatch.filter(mapping.prefixes.with_aliases(), noise.articulation)
         keys = [key for key in mapping.observed if key in map(mapping.prefixes.key, meant)]
         if not keys:
