@@ -285,7 +285,7 @@ def test_late_lost_and_noisy_samples_are_seen_and_rewards_are_judged_without(mad
             with pytest.raises(KeyError if declared.push else ValueError, match=reason):
                 URLabBatchEnv(where(server), 1, task=Reach(), observations=["qpos"], randomise=declared)
     noisy_joints = Randomisation(noise=(Noise(field="qpos", std=1.0),))
-    with pytest.raises(ValueError, match="not observed; the observed fields are task$"):  # Walk shows nothing else
+    with pytest.raises(ValueError, match=r"not observed; the observed fields are task$"):  # Walk shows nothing else
         URLabBatchEnv(Walk.scene_address, 1, task=Walk(), randomise=noisy_joints)
 
 

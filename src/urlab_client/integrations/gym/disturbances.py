@@ -136,7 +136,9 @@ class Disturbances:
         fields = mapping.fields if mapping.observed else ()
         if noise.field not in fields:
             seen = [*fields, *(["task"] if self._n_task else [])]
-            raise ValueError(f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(seen)}")
+            raise ValueError(
+                f"noise on {noise.field}, which is not observed; the observed fields are {', '.join(seen)}"
+            )
         meant = fnmatch.filter(mapping.prefixes.with_aliases(), noise.articulation)
         keys = [key for key in mapping.observed if key in map(mapping.prefixes.key, meant)]
         if not keys:
