@@ -215,7 +215,8 @@ async def test_discovering_changes_nothing_in_the_world_of_another(connect: Any,
         for looking in ("direct", "auto"):
             server.restore()
             assert await run(server, looking) == alone
-    assert set(ops) == {"hello", "meta", "set_mode", "begin_pie"}
+    # On a busy machine the client asks for the keyframes, to see whether the server still answers.
+    assert set(ops) - {"list_keyframes"} == {"hello", "meta", "set_mode", "begin_pie"}
 
 
 async def test_a_request_of_the_caller_stays_as_it_is(connect: Any, serve: Any) -> None:
