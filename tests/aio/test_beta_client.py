@@ -20,6 +20,7 @@ from urlab_client.aio import Stream, URLabClient
 from urlab_client.errors import DestroyFailed, ProtocolError, StepTimeout
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.server import SimulatedServer
+from urlab_client.types import Verdict
 from urlab_client.values.types import JobStatus
 
 
@@ -342,6 +343,33 @@ async def test_a_failed_job_raises_what_a_direct_refusal_would(client: URLabClie
     with pytest.raises(DestroyFailed) as caught:
         await client.scene.destroy_actor("nobody")
     assert (caught.value.op, caught.value.message) == ("remove_actor", "no such actor")
+
+
+async def test_a_job_that_ends_without_a_result(scripted: ScriptedServer) -> None:
+    scripted.on("meta", meta_ok("beta"))
+    scripted.on("import_xml", {"op": "op_started", "job_id": "job_7", "state": "running"})
+    async with client_of(scripted, local_model=False) as client:
+        await client.discover()
+        for state, kind, words in (
+            ("failed", URLabRPCError, "job_7 failed, and the editor gave no reason"),
+            ("done", ProtocolError, "job_7 is done, but its result is missing"),
+        ):
+            scripted.on("op_status", {"op": "op_status_ok", "job_id": "job_7", "state": state})
+            with pytest.raises(kind, match=words) as caught:
+                await client.scene.import_xml("/robots/arm.xml")
+            assert caught.value.op == "import_xml"
+
+
+async def test_a_diverged_simulation_and_a_packaged_build_are_explained(
+    client: URLabClient, beta: ScriptedBeta, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = beta.arts
+    monkeypatch.setattr(beta, "arts", lambda: {name: {**art, "qpos": [float("nan")]} for name, art in sound().items()})
+    beta.on("pie_status", error("unknown_op", "pie_status"))
+    await client.step()
+    said = {(found.verdict, found.subject): found.text for found in (await client.explain()).findings}
+    assert "the simulation has diverged. Call reset()" in said[Verdict.PROBLEM, "arm_a"]
+    assert "does not report its play state" in said[Verdict.NOTE, "play"]
 
 
 async def test_a_job_whose_end_was_told_to_nobody(client: URLabClient, beta: ScriptedBeta) -> None:

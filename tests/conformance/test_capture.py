@@ -127,3 +127,18 @@ async def test_a_pinned_mode_is_left_alone(connect: Any, serve: Any, models: Pat
         with pytest.raises(ModeLocked, match="include_cameras"):
             await client.camera("near").capture()
         assert (await client.step()).step == 2
+
+
+async def test_a_live_step_brings_pictures_where_the_server_sends_them(connect: Any, serve: Any, dialect: str) -> None:
+    with serve("arm", play=True) as server:
+        client = connect(server, step_mode="live")
+        await client.discover()
+        one = await client.step(include_cameras={"wrist": "latest"})
+        every = await client.step(include_cameras=True)
+    if dialect == "alpha":  # its steps bring pictures in direct mode only
+        assert not one.cameras
+        assert not every.cameras
+    else:
+        assert set(one.cameras) == {"wrist"}
+        assert set(every.cameras) == {"wrist", "overview"}
+        assert one.cameras["wrist"].data

@@ -138,3 +138,21 @@ def test_a_chunk_whose_reply_was_lost_is_not_sent_again(robot: Path) -> None:
         with pytest.raises(URLabTimeoutError, match="upload_model_chunk"):
             client.scene.upload_model(robot, timeout=3)
         assert client.transport_stats.sent == sent + 2, "the manifest and one chunk"
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "words"),
+    [
+        ("MAX_BLOB_BYTES", 40, "has [0-9]+ bytes; servers take 40$"),
+        ("MAX_ASSETS", 1, "has 2 files; servers take 1$"),
+        ("MAX_MODEL_BYTES", 100, "has [0-9]+ bytes; servers take 100$"),
+    ],
+)
+def test_a_model_beyond_the_limits_of_servers_is_refused_before_it_is_sent(
+    robot: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, words: str
+) -> None:
+    monkeypatch.setattr(f"urlab_client.aio.model.upload.{limit}", value)
+    with SimulatedServer(dialect="beta") as server, URLabClient(**server.client_options()) as client:
+        client.discover()
+        with pytest.raises(ValueError, match=f"upload_model: .*crab.xml {words}"):
+            client.scene.upload_model(robot)
