@@ -6,9 +6,10 @@
 
 mutmut's operators make the mutants (`pip install -e '.[mutants]'`). Lines are drawn evenly, so that a package counts by
 its size; strings, which are mostly prose, annotations and generated files are left alone. The tests that run a mutant's
-line run in a copy of the tree: quick ones first, and one case of each function before the others, until one fails or
-`--seconds` of processor time are used up. A failure counts if that test passes without the mutant; hanging counts, too.
-equivalent_mutants.toml has those that make no difference, with the reason. They are not counted.
+line run in a copy of the tree until one fails: for half of `--seconds` of processor time those whose own text shares
+words with the line, the rarest first; then quick ones, and one case of each function before the others. A failure
+counts if that test passes without the mutant; hanging counts, too. equivalent_mutants.toml has those that make no
+difference, with the reason. They are not counted.
 The record lies in `.mutants/`, with the sources of its time, by which it serves later commits.
 """
 
@@ -62,6 +63,7 @@ DECLARED = (  # tests that read what modules declare, of which no coverage tells
 TEST_S, RUN_S = 120, 900  # others use the machine, too
 MEMORY = 8 << 30  # a mutant may ask for more and more of it
 PASSED, FAILED = 0, 1  # exit codes of pytest
+WORD = re.compile(r"[A-Za-z_]\w{3,}")
 
 # Files of what pytest notes for a record, and for a mutant. It loads this module with `-p`.
 TIMES, CAUGHT_BY = "SAMPLE_MUTANTS_TIMES", "SAMPLE_MUTANTS_CAUGHT_BY"
@@ -148,7 +150,6 @@ class Record:
         self.seconds: dict[str, float] = {test: took[0] for test, *took in notes if test not in failed}
         self._data = CoverageData(str(self._folder / "data"))
         self._data.read()
-        self._data.read()
         self._paths = {path[path.rindex(PACKAGE) :]: path for path in self._data.measured_files()}
 
     def running(self, file: str, lines: Iterable[int]) -> set[str]:
@@ -222,8 +223,42 @@ def in_order(tests: Iterable[str], seconds: Mapping[str, float], ways: Mapping[s
             rank[test] = before[group(test)]
             before[group(test)] += 1
         ordered.sort(key=rank.__getitem__)
-    spent = itertools.accumulate(seconds[test] for test in ordered)
-    return ordered[: max(1, sum(total <= limit for total in spent))]
+    return within(ordered, seconds, limit) or ordered[:1]
+
+
+def within(tests: Sequence[str], seconds: Mapping[str, float], limit: float) -> list[str]:
+    """Return the first tests, as many as take no more than a limit together."""
+    spent = itertools.accumulate(seconds[test] for test in tests)
+    return list(tests[: sum(total <= limit for total in spent)])
+
+
+def speaking(root: Path, tests: Iterable[str], words: set[str], seconds: Mapping[str, float]) -> list[str]:
+    """Return the tests whose own text has any of some words, those with the rarest first; the quickest case of each."""
+    quickest = {test.partition("[")[0]: test for test in sorted(tests, key=lambda test: (-seconds[test], test))}
+    said: dict[str, set[str]] = {}
+    for name in quickest:
+        path, *_, function = name.split("::")
+        said[name] = words & _vocabularies(root / path).get(function, set())
+    common = Counter(word for found in said.values() for word in found)
+    weight = {name: sum(1 / common[word] for word in found) for name, found in said.items()}
+    return [quickest[name] for name in sorted(weight, key=lambda name: (-weight[name], name)) if weight[name]]
+
+
+@functools.cache
+def _vocabularies(file: Path) -> dict[str, set[str]]:
+    """Return the words of each function in a file with tests."""
+    text = file.read_text("utf-8") if file.suffix == ".py" and file.is_file() else ""
+    nodes = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+    lines = text.splitlines()
+    return {node.name: set(WORD.findall("\n".join(lines[node.lineno - 1 : node.end_lineno]))) for node in nodes}
+
+
+def chosen(root: Path, mutant: Mutant, tests: set[str], known: Record, limit: float) -> list[str]:
+    """Return the tests that are most likely to notice a mutant, in the order in which to run them."""
+    first = within(speaking(root, tests, mutant.words, known.seconds), known.seconds, limit / 2)
+    left = limit - sum(known.seconds[test] for test in first)
+    rest = tests.difference(first)
+    return first + (in_order(rest, known.seconds, known.ways(mutant.file), left) if rest else [])
 
 
 @dataclass
@@ -248,6 +283,12 @@ class Mutant:
         """The statements that it is in, from the outside inwards."""
         statements = (node for node in ast.walk(ast.parse(self.old)) if isinstance(node, ast.stmt))
         return [node for node in statements if node.lineno <= self.line <= (node.end_lineno or 0)]
+
+    @property
+    def words(self) -> set[str]:
+        """The words of the lines that change, and the names of the functions and classes that they are in."""
+        names = {getattr(node, "name", "") for node in self.around}
+        return names.union(WORD.findall(self.changed("-")), WORD.findall(self.changed("+")))
 
     @property
     def on_import(self) -> bool:
@@ -376,7 +417,8 @@ class Copies:
                 kept = [test for test in mutant.tests if test not in unsound]
                 mutant.tests = kept if len(kept) < len(mutant.tests) else []
             else:
-                mutant.outcome = {None: "hangs", PASSED: "survives"}.get(code, "caught")
+                passed = "survives" if mutant.covering else "no test"
+                mutant.outcome = {None: "hangs", PASSED: passed}.get(code, "caught")
         mutant.outcome = mutant.outcome or "no test"
         self._write(tree / mutant.file, mutant.old)
         self._free.put(tree)
@@ -419,9 +461,10 @@ def main(argv: Sequence[str] | None = None, *, root: Path = ROOT, table: Path = 
         if (mutant.changed("-"), mutant.changed("+")) in equivalent:
             mutant.outcome = "equivalent"
         mutant.covering = len(tests := covering(mutant, known))
-        chosen = in_order(tests, known.seconds, known.ways(mutant.file), arguments.seconds)
+        # Confined processes can write no record of what they run: any test that runs the rest of the file may notice.
+        tests = tests or known.running(mutant.file, range(1, mutant.old.count("\n") + 1))
         declared = [test for test in DECLARED if mutant.on_import and (root / test.partition("::")[0]).is_file()]
-        mutant.tests = list(arguments.tests) or declared + chosen
+        mutant.tests = list(arguments.tests) or declared + chosen(root, mutant, tests, known, arguments.seconds)
     with tempfile.TemporaryDirectory(prefix="m") as folder, ThreadPoolExecutor(arguments.jobs) as pool:
         copies = Copies(root, Path(folder), arguments.jobs)
         for mutant in pool.map(copies.judge, drawn):
@@ -429,6 +472,7 @@ def main(argv: Sequence[str] | None = None, *, root: Path = ROOT, table: Path = 
     for mutant in drawn:
         if mutant.outcome in {"survives", "no test"}:
             ran = f"{len(mutant.tests)} of the {mutant.covering} tests that run it passed"
+            ran = ran if mutant.covering else "no test is known to run it"
             print(f"\n{mutant.outcome}: {mutant.file}:{mutant.line} ({ran})", *mutant.diff, sep="\n")
     print("", *shares(drawn), sep="\n")
     print(f"{sum(os.times()[2:4]) / max(1, len(drawn)):.1f} s of the processors for each")

@@ -136,7 +136,7 @@ def test_a_sample_says_what_is_caught_and_shows_what_is_not(
         " ",
         " def unused():",
         "",
-        f"no test: {FILE}:10 (0 of the 0 tests that run it passed)",
+        f"no test: {FILE}:10 (no test is known to run it)",
         "@@ -8,5 +8,5 @@",
         " ",
         " def unused():",
@@ -195,3 +195,11 @@ def test_each_way_through_a_file_and_each_function_comes_before_another_case_and
     assert tool.in_order(seconds, seconds, same, 100) == ["f[1]", "g", "h", "f[2]"]
     assert tool.in_order(seconds, seconds, {**same, "h": frozenset({2})}, 100) == ["f[1]", "h", "g", "f[2]"]
     assert tool.in_order(["h"], seconds, {}, 10) == ["h"], "one is run in any case"
+
+
+def test_those_come_first_that_speak_of_what_changes(tree: Path) -> None:
+    tests = [f"tests/test_adding.py::{name}" for name in ("test_area", "test_capped", "test_check[1]", "test_check[2]")]
+    seconds = dict(zip(tests, (1.0, 1.0, 2.0, 1.5), strict=True))
+    of_area = mutant(23, "size**2", "size**3")
+    assert of_area.words == {"Square", "area", "return", "self", "size"}
+    assert tool.speaking(tree, tests, of_area.words, seconds) == [tests[0], tests[3]]
