@@ -184,7 +184,7 @@ class Bench:
             own = {name for name in (info.prefix, info.actor_name, info.actor_id) if name}
             known = next((self.names[name] for name in own if name in self.names), None)
             word = known or f"robot_{len({*self.names.values()} - {'host'}) + 1}"
-            self.names |= {name: word for name in own - self.names.keys()}
+            self.names |= dict.fromkeys(own - self.names.keys(), word)
 
     def need(self, what: str) -> None:
         """Raise `NotTried` unless something is there."""
