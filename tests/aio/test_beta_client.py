@@ -6,7 +6,7 @@ import asyncio
 import inspect
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import pytest
@@ -132,8 +132,12 @@ async def test_a_state_port_that_is_given_is_not_replaced_by_the_announced_one(
 
 
 @pytest.mark.parametrize("flavour", ["async", "blocking"])
-@pytest.mark.parametrize("word", ["stepped", "mirror"])
-async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str, word: str) -> None:
+@pytest.mark.parametrize(
+    ("word", "mode"), [("stepped", "direct"), ("mirror", "direct"), ("statepushed", "puppet"), ("freerun", "live")]
+)
+async def test_the_words_of_the_next_generation(
+    beta: ScriptedBeta, flavour: str, word: str, mode: Literal["direct", "puppet", "live"]
+) -> None:
     """Beta statement 78."""
 
     def hello(request: dict[str, Any]) -> dict[str, Any]:
@@ -147,7 +151,7 @@ async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str
     def set_mode(request: dict[str, Any]) -> dict[str, Any]:
         if request["mode"] not in {"freerun", "stepped", "statepushed"}:
             return error("bad_mode", request["mode"])
-        beta.mode = "direct"
+        beta.mode = mode
         return {"op": "set_mode_ok", "previous_mode": "freerun", "current_mode": word}
 
     beta.on("hello", hello)
@@ -156,11 +160,10 @@ async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str
     beta.on("set_mode", set_mode)
 
     def drive() -> str:
-        with urlab_client.URLabClient(
-            "tcp://127.0.0.1", step_port=beta.port, live_pictures=False, step_mode="direct"
-        ) as client:
+        with urlab_client.URLabClient("tcp://127.0.0.1", step_port=beta.port, live_pictures=False) as client:
             client.discover()
-            assert client.step_mode is StepMode.DIRECT
+            client.runtime.set_mode(mode)
+            assert client.step_mode is StepMode(mode)
             assert list(client.articulations) == ["arm_a", "arm_C_1"]
             client.articulations["arm_a"].set_ctrl({"m": 0.5})
             client.step()
@@ -169,14 +172,15 @@ async def test_the_words_of_the_next_generation(beta: ScriptedBeta, flavour: str
     if flavour == "blocking":
         said = await asyncio.to_thread(drive)
     else:
-        async with client_of(beta, step_mode="direct") as client:
+        async with client_of(beta) as client:
             await client.discover()
-            assert client.step_mode is StepMode.DIRECT
+            await client.runtime.set_mode(mode)
+            assert client.step_mode is StepMode(mode)
             assert list(client.articulations) == ["arm_a", "arm_C_1"]
             client.articulations["arm_a"].set_ctrl({"m": 0.5})
             await client.step()
             said = str(await client.explain())
-    assert beta.ctrl["arm_C_0"] == [0.5]
+    assert beta.ctrl["arm_C_0"] == [0.0 if mode == "puppet" else 0.5]  # in which no actuator acts
     assert "urlab/0.2, generation 3," in said
 
 

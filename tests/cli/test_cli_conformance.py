@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 
 from urlab_client.cli import main
 from urlab_client.conformance import statement_titles
+from urlab_client.conformance.reports import redaction
 from urlab_client.server import SimulatedServer
 
 
@@ -62,6 +64,36 @@ def test_names_stay_if_they_may(address: str, tmp_path: Path, capsys: pytest.Cap
             assert ('"arm"' in bundle.read("exchanges.jsonl").decode()) is there
             assert any(name.startswith("frames/") for name in bundle.namelist()) is there
     capsys.readouterr()
+
+
+@pytest.mark.opengl
+def test_a_bundle_has_no_robot_that_an_earlier_handshake_named(tmp_path: Path) -> None:
+    file = tmp_path / "r.zip"
+    options = ["--play", "--author", "--only", "robot", "--only", "missing file", "--no-measurements"]
+    assert main(["conformance", "sim://arm?dialect=beta", *options, "--bundle", str(file)]) == 0
+    with zipfile.ZipFile(file) as bundle:
+        text = "".join(bundle.read(name).decode() for name in bundle.namelist())
+    assert re.findall(r".{20}\barm(?:_C_0)?\b.{20}", text) == []
+    assert "robot_1" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        (r"no C:\Users\Joe Smith\arm.xml here", "no (path) here"),
+        (r"\\nas\joe\arm.xml", "(path)"),
+        ("ipc:///home/joe/socket", "ipc:/(path)"),
+        ("tcp://[fe80::1]:5559", "tcp://host:5559"),
+        ("tcp://10.0.0.7:5559", "tcp://host:5559"),
+        ("tcp://localhost:5559", "tcp://localhost:5559"),
+        ("/Game/Levels/lab.lab at 3 m/s", "/Game/Levels/lab.lab at 3 m/s"),
+        ("arm_C_0/elbow on pc", "robot_1/elbow on host"),
+    ],
+)
+def test_what_is_taken_out_of_a_text(text: str, left: str) -> None:
+    told = {"arm": "robot_1", "arm_C_0": "robot_1", "pc": "host"}
+    assert redaction(told, allowed=False)(text) == left
+    assert redaction(told, allowed=True)(text) == text
 
 
 def test_some_checks(address: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
+from falsifier import Falsifier, in_request
 from relay import Relay
 from targets import bench, furnish, server
 
@@ -110,3 +112,42 @@ async def test_the_level_is_open_again_after_an_interruption(tmp_path: Path, int
             assert [row["actor_id"] for row in rows if row.get("is_articulation")] == ["arm a", ""]
             gone = await made.ask("destroy_asset", asset_path="/Game/Levels/urlab_conformance.urlab_conformance")
             assert gone["was_found"] is False
+
+
+@pytest.mark.parametrize(
+    ("op", "number"),
+    [
+        ("import_xml", 1),
+        ("create_level", 1),
+        ("claim_control", 1),
+        ("upload_model_commit", 3),
+        ("remove_actor", 2),
+        ("load_level", 3),
+    ],
+)
+async def test_ctrl_c_in_the_middle_of_a_request_leaves_nothing_behind(tmp_path: Path, op: str, number: int) -> None:
+    loop, seen = asyncio.get_running_loop(), 0
+
+    def watch(_request: dict[str, Any]) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == number:
+            loop.call_soon_threadsafe(running.cancel)
+
+    with server(tmp_path, "beta", shm=False) as served:
+        async with bench(served, tmp_path) as before:
+            await furnish(before, tmp_path)
+        with Falsifier(served, request=in_request(op, watch)) as relay:
+            async with bench(served, tmp_path, port=relay.port) as made:
+                groups = frozenset({Group.PLAY if op == "claim_control" else Group.AUTHOR})
+                running = asyncio.ensure_future(run(made, Choice(groups=groups, measure=False)))
+                with pytest.raises(asyncio.CancelledError):
+                    await running
+                assert made.left == []
+        async with bench(served, tmp_path) as after:
+            assert (await after.ask("current_level"))["level_path"] == "/Game/Levels/lab"
+            assert after.hello.manager_present
+            for robot in after.robots:
+                await after.ask("claim_control", articulation=robot.key, control_owner="another client")
+            blueprints = (await after.ask("list_blueprints"))["blueprints"]
+            assert [row["blueprint_short_name"] for row in blueprints] == ["bot"]

@@ -195,6 +195,19 @@ def test_other_machines_need_a_key(capsys: pytest.CaptureFixture[str]) -> None:
     assert "needs a key (--listen-key)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["tcp://localhost", "--listen", "65535"], "is not a port below 65535"),
+        (["tcp://localhost:99999"], "'tcp://localhost:99999' is not a valid address"),
+        (["sim://arm"], "sim://arm cannot be relayed"),
+    ],
+)
+def test_what_cannot_be_relayed_is_refused(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tap", *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
 def passed(request: dict[str, Any], reply: dict[str, Any]) -> Passed:
     return Passed(request["op"], msgspec.msgpack.encode(request), msgspec.msgpack.encode(reply), 0.00125, 0)
 

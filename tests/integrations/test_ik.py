@@ -58,6 +58,20 @@ def test_what_stands_still_is_outside_of_the_problem(client: URLabClient, ik: In
     assert solution.joints["elbow"] == pytest.approx(0.3, abs=0.02)
 
 
+def test_joints_are_found_by_every_name_that_means_them(client: URLabClient, ik: InverseKinematics) -> None:
+    for elbow in ("arm/elbow", "arm_elbow"):
+        assert InverseKinematics(client, "arm", site="grip", joints=[elbow]).joints == ("elbow",)
+        assert np.array_equal(ik.pose({elbow: 0.3})[0], ik.pose({"elbow": 0.3})[0])
+        aim = ik.pose({"elbow": 0.3})[0]
+        assert ik.solve(aim, start={elbow: 0.3}, starts=1) == ik.solve(aim, start={"elbow": 0.3}, starts=1)
+        joints = ik.solve(aim).joints
+        spelled = {elbow if name == "elbow" else name: position for name, position in joints.items()}
+        assert ik.set_points(spelled) == ik.set_points(joints)
+        assert ik.collisions([spelled]) == ik.collisions([joints])
+    with pytest.raises(KeyError, match="the chain to 'grip' has no joint 'arm/left_finger'"):
+        ik.pose({"arm/left_finger": 0.0})
+
+
 def test_a_foot_below_a_free_base_moves_by_its_own_leg(client: URLabClient) -> None:
     client.reset()
     quadruped = client.articulations["quadruped"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,7 +14,7 @@ import pytest
 import urlab_client
 from tests.integrations.test_record_export import lerobot, run  # noqa: F401  # a fixture
 from urlab_client.integrations.gym import Reach, Start, States, URLabEnv, URLabVectorEnv
-from urlab_client.integrations.record import read_run, record, transitions_of
+from urlab_client.integrations.record import RecordingError, read_run, record, transitions_of
 from urlab_client.integrations.record.export import write_lerobot
 from urlab_client.randomise import Delay, Randomisation
 from urlab_client.server import SimulatedServer
@@ -282,3 +283,24 @@ def test_a_recording_may_begin_and_end_within_episodes(client: urlab_client.URLa
     pairs = transitions_of(read_run(tmp_path / "run.mcap"))
     assert pairs.columns["task/reward"].values[:, 0].tolist() == rewards
     assert pairs.episode.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["task", "goal"])
+def test_a_robot_with_the_name_of_columns_or_entries_is_refused(tmp_path: Path, name: str) -> None:
+    block = tmp_path / f"{name}.xml"
+    model = files("urlab_client.server.robots").joinpath("block.xml").read_text()
+    block.write_text(model.replace('model="block"', f'model="{name}"'))
+    with (
+        SimulatedServer("arm", block, play=True) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        env = URLabEnv(client, task=Brief(), articulations=["arm"])
+        with (
+            pytest.raises(RecordingError, match=f"'{name}' cannot be the name of a robot or entity"),
+            record(client, tmp_path / "run.mcap"),
+        ):
+            env.reset(seed=0)
+        if name == "task":
+            with pytest.raises(ValueError, match="an articulation is named 'task'"):
+                URLabEnv(client, task=Brief(), articulations=["arm", "task"], space_mode="dict")

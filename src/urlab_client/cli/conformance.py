@@ -133,12 +133,16 @@ async def _checked(
         bench.state_port = arguments.state_port or wire.transport.state_port or bench.state_port
         with progress_bar("checking", 1.0) as show:
             return bench, await run_checks(bench, choice, lambda _, done, whole: show(done / max(whole, 1)))
+    except asyncio.CancelledError:
+        sys.stderr.write("urlab conformance: interrupted; it put back what it had changed\n")
+        _print_left(bench.left)
+        raise
     finally:
         await asyncio.shield(wire.aclose())
 
 
 def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
-    redact = redaction(bench.plain_hello, allowed=arguments.with_names)
+    redact = redaction(bench.names, allowed=arguments.with_names)
     exchanges = tuple(bench.wire.exchanges)
     if arguments.html is not None:
         arguments.html.write_text(page(report, exchanges, redact), encoding="utf-8")
@@ -151,6 +155,11 @@ def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
             return
         arguments.json.write_text(text + "\n", encoding="utf-8")
     _print(arguments, report)
+
+
+def _print_left(lines: list[str]) -> None:
+    for line in lines:
+        sys.stderr.write(f"urlab conformance: not put back: {line}\n")
 
 
 def _folded(table: str) -> str:
@@ -171,7 +180,6 @@ def _print(arguments: Namespace, report: Report) -> None:
     print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
     if not arguments.all:
         print("--all also prints what was not tried, and what that needs.")
-    for line in report.left:
-        sys.stderr.write(f"urlab conformance: not put back: {line}\n")
+    _print_left(report.left)
     if report.stopped:
         sys.stderr.write(f"urlab conformance: {report.stopped}; what came after was not tried\n")

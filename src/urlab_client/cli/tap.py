@@ -14,8 +14,9 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any, Final, cast
 
+from urlab_client.aio.launch import transport_to
 from urlab_client.aio.transport.connection import client_keys
-from urlab_client.cli._arguments import CLIENT, address_usage
+from urlab_client.cli._arguments import CLIENT
 from urlab_client.cli._common import CommandError, check_ending, refusing, sigterm_interrupts
 from urlab_client.conformance.sessions import Passed, Ports, Relay, Replay, SessionWriter, read_session
 from urlab_client.conformance.wire import oddities, plain, reply_oddities
@@ -23,7 +24,7 @@ from urlab_client.keys import read_pair
 from urlab_client.protocol.registry import OPS
 
 USAGE = f"""
-{address_usage()}
+ADDRESS=tcp://localhost  HOST[:PORT] or tcp://HOST[:PORT]
 --listen [HOST:]PORT=6559  where clients connect
 --listen-state PORT  port for the state stream (default: the one after --listen)
 --listen-key KEY_FILE  secret key for clients on other machines, who must know its public half
@@ -39,13 +40,14 @@ urlab tap tcp://localhost --listen 6559 --save session.mcap  record it, to send 
 urlab tap --replay session.mcap --listen 6559  answer a client as the recorded server did
 """
 _LONGEST: Final = 100
+_LAST_PORT: Final = 65535
 
 
 def run(arguments: Namespace) -> int:
     """Relay, or replay, until Ctrl-C."""
     host, _, number = arguments.listen.rpartition(":")
-    if not number.isdigit():
-        raise CommandError(f"--listen: {arguments.listen!r} is not a port, nor HOST:PORT")
+    if not number.isdigit() or int(number) >= _LAST_PORT:  # the next one is for the state stream
+        raise CommandError(f"--listen: {arguments.listen!r} is not a port below {_LAST_PORT}, nor HOST:PORT")
     with refusing(ValueError, option="--listen"):
         key = None if arguments.listen_key is None else read_pair(arguments.listen_key)
         ports = Ports((host or "127.0.0.1").strip("[]"), key)
@@ -70,9 +72,8 @@ def _replay(path: Path, ports: Ports, own: dict[str, int]) -> int:
 def _relay(arguments: Namespace, ports: Ports, own: dict[str, int]) -> int:
     if not arguments.address.startswith("tcp://"):
         raise CommandError(f"{arguments.address} cannot be relayed: give tcp://HOST or tcp://HOST:PORT")
-    rest = arguments.address.removeprefix("tcp://")
-    endpoint = arguments.address if rest.rpartition(":")[2].isdigit() else f"{arguments.address}:{arguments.step_port}"
     with refusing(ValueError):
+        endpoint = transport_to(arguments.address, arguments.step_port, None).endpoint
         keys = client_keys(endpoint, arguments.server_key, arguments.client_key)
     with (
         _saved(arguments) as writer,

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from urlab_client.conformance.bench import ROBOT, Bench
+from urlab_client.conformance.bench import ROBOT, Bench, to_the_end
 from urlab_client.conformance.declarations import BETA, NEWER, Body, Group, NotTried, check, has, holds, same
 
 author: Callable[..., Callable[[Body], Body]] = partial(check, group=Group.AUTHOR)
@@ -288,9 +288,14 @@ async def uploads(bench: Bench) -> None:
     await bench.refused("hash_mismatch", "upload_model_chunk", **_chunk(upload, xml.upper()))
     has(await bench.ask("upload_model_chunk", **_chunk(upload, xml)), complete=True)
     has(await _manifest(bench, xml), need_xml=False, need_assets=[])
-    made = await bench.ask("upload_model_commit", upload_id=upload["upload_id"])
+    made: dict[str, Any] = {}
+
+    async def commit() -> None:
+        made.update(await bench.ask("upload_model_commit", upload_id=upload["upload_id"]))
+        bench.later("destroy_asset", asset_path=str(made["blueprint_class_path"]).removesuffix("_C"))
+
+    await to_the_end(commit())
     has(made, imported=True, nq=None)
-    bench.later("destroy_asset", asset_path=str(made["blueprint_class_path"]).removesuffix("_C"))
     bench.later(_remove_op(bench), target="uploaded")
     await bench.ask("spawn_actor", blueprint=made["blueprint_class_path"], actor_id="uploaded")
     await bench.refused("unknown_upload", "upload_model_commit", upload_id=upload["upload_id"])

@@ -92,6 +92,8 @@ class Bench:
         trusted: Whether its binary model is loaded; by default if it is on this machine.
         import_file: The user's MJCF for the checks that import one; None for one in a temporary folder.
         measured: Numbers that checks measured besides.
+        names: Names of robots and hosts in the handshakes so far, each with a word to replace it.
+        left: What could not be put back.
     """
 
     def __init__(
@@ -112,6 +114,8 @@ class Bench:
         self.trusted: bool = is_local(wire.transport.endpoint) if trusted is None else trusted
         self.import_file = import_file
         self.measured: dict[str, Any] = {}
+        self.names: dict[str, str] = {}
+        self.left: list[str] = []
         self._undo: list[tuple[str, dict[str, Any]]] = []
         self._others: set[str] = set()
         self._session_owns = False
@@ -158,6 +162,7 @@ class Bench:
         self.plain_hello, self.wire.session_id = reply, str(reply.get("session_id", ""))
         with expecting("a handshake"):
             self.hello = decode_reply(OPS["hello"], HelloOk, msgspec.msgpack.encode(reply))
+        self._note_names(self.hello)
         self.model = _model_of(self.hello) if self.trusted else None
         prefixes = {info.prefix: info.compiled_prefix for info in self.hello.articulations}
         layouts = {} if self.model is None else articulation_layouts(self.model, prefixes)
@@ -171,6 +176,15 @@ class Bench:
                 await self.wire.raw("claim_control", articulation=robot.key, force=True)
         with contextlib.suppress(URLabConnectionError):
             await self.wire.follow(self.hello)
+
+    def _note_names(self, hello: HelloOk) -> None:
+        if hello.instance is not None and hello.instance.host:
+            self.names.setdefault(hello.instance.host, "host")
+        for info in hello.articulations:
+            own = {name for name in (info.prefix, info.actor_name, info.actor_id) if name}
+            known = next((self.names[name] for name in own if name in self.names), None)
+            word = known or f"robot_{len({*self.names.values()} - {'host'}) + 1}"
+            self.names |= dict.fromkeys(own - self.names.keys(), word)
 
     def need(self, what: str) -> None:
         """Raise `NotTried` unless something is there."""
@@ -189,25 +203,29 @@ class Bench:
         """Number of ops that wait to be sent at the end."""
         return len(self._undo)
 
-    async def put_back(self, keep: int = 0) -> list[str]:
-        """Undo everything but the oldest `keep` changes; return what could not be undone."""
-        failed: list[str] = []
+    async def put_back(self, keep: int = 0) -> None:
+        """Undo everything but the oldest `keep` changes."""
+        await to_the_end(self._put_back(keep))
+
+    async def _put_back(self, keep: int) -> None:
+        loop = asyncio.get_running_loop()
+        give_up = loop.time() + _BACK_S
         while len(self._undo) > keep:
             op, fields = self._undo[-1]
             try:
-                reply = await self._persist(op, fields)
-                if reply.get("op") == "error" and reply.get("code") not in _GONE:
-                    failed.append(f"{op}: {reply.get('code')}: {reply.get('message', '')}")
+                reply = await self._persist(op, fields, give_up)
+                give_up = loop.time() + _BACK_S
+                # A lease that is gone, or another client's, is refused like a malformed request.
+                if reply.get("op") == "error" and reply.get("code") not in _GONE and op != "release_lease":
+                    self.left.append(f"{op}: {reply.get('code')}: {reply.get('message', '')}")
                 elif reply.get("state", "ready") != "ready":
-                    failed.append(f"{op}: play is {reply['state']}")
+                    self.left.append(f"{op}: play is {reply['state']}")
             except (URLabError, Differs) as error:
-                failed.append(f"{op}: {error}")
+                self.left.append(f"{op}: {error}")
             self._undo.pop()
-        return failed
 
-    async def _persist(self, op: str, fields: dict[str, Any]) -> dict[str, Any]:
-        """Send an op, also after a lost connection or session."""
-        give_up = asyncio.get_running_loop().time() + _BACK_S
+    async def _persist(self, op: str, fields: dict[str, Any], give_up: float) -> dict[str, Any]:
+        """Send an op, also after a lost connection or session, until a time of the loop's clock."""
         while True:
             try:
                 reply = await self.wire.job(op, **fields)
@@ -448,6 +466,17 @@ NEEDS: Final[Mapping[str, tuple[Callable[[Bench], object], str]]] = {
     ),
     "editor": (lambda bench: "current_level" in bench.ops, "needs an editor; this is a packaged build"),
 }
+
+
+async def to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """Await work that notes what has to be undone, and let it end if this is cancelled meanwhile."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.wait((task,))  # which, if it is cancelled, does not cancel the task
+    except asyncio.CancelledError:
+        await asyncio.gather(task, return_exceptions=True)
+        raise
+    task.result()
 
 
 def decoded(message: Message) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import re
 import socket
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, TypeAlias, cast
@@ -27,28 +27,26 @@ WORDS: Final = {Verdict.HOLDS: "holds", Verdict.DIFFERS: "differs", Verdict.NOT_
 _PRIVATE: Final = frozenset({"mjb", "mjb_base64", "mjcf_compiled", "vfs_assets", "data"})
 """Reply fields whose content stays here: models, their files, and pixels."""
 _PATH: Final = re.compile(
-    r"(?:(?<![A-Za-z])[A-Za-z]:[\\/](?!/)|(?<![\w/:])/(?!Game\b|Engine\b|Script\b))[^\s\"'<>|*?]*"
+    # C:\, \\SERVER, ipc://, or / unless a path of Unreal's follows.
+    r"(?:(?<![A-Za-z])[A-Za-z]:[\\/](?!/)|\\\\(?=\w)|(?<=ipc:/)/|(?<=file:/)/"
+    r"|(?<![\w/:])/(?!Game\b|Engine\b|Script\b))"
+    # A blank is part of it if a separator follows in the next word.
+    r"(?:[^\s\"'<>|*?]|[ ](?=[^\s\"'<>|*?:]*[\\/]))*"
 )
-_ADDRESS: Final = re.compile(r"(tcp://)(?!127\.0\.0\.1|0\.0\.0\.0|localhost|\[::1\])[^\s:/\"]+")
+_ADDRESS: Final = re.compile(r"(tcp://)(?!127\.0\.0\.1|0\.0\.0\.0|localhost|\[::1\])(?:\[[^\]\s]*\]|[^\s:/\"]+)")
 
 
-def redaction(hello: dict[str, Any], *, allowed: bool) -> Redact:
+def redaction(told: Mapping[str, str], *, allowed: bool) -> Redact:
     """Return what takes paths, host and user names, and the names of the scene out of a text.
 
     Args:
-        hello: The last handshake, which names the robots.
+        told: Names that the server told, each with a word to replace it.
         allowed: Whether everything may stay.
     """
     if allowed:
         return lambda text: text
-    names: dict[str, str] = {}
-    for number, robot in enumerate(hello.get("articulations") or [], 1):
-        for field in ("actor_name", "actor_id", "prefix"):
-            names.setdefault(str(robot.get(field) or ""), f"robot_{number}")
-    instance: dict[str, Any] = hello.get("instance") or {}
-    own = {socket.gethostname(): "host", _user(): "user", str(instance.get("host", "")): "host"}
-    names |= {name: word for name, word in own.items() if len(name) > 1}
-    names.pop("", None)
+    own = {socket.gethostname(): "host", _user(): "user"}
+    names = {name: word for name, word in {**told, **own}.items() if len(name) > 1 or name in told}
     known = sorted(names, key=len, reverse=True)
     pattern = re.compile("|".join(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])" for name in known) or r"(?!)")
 

@@ -15,7 +15,7 @@ from urlab_client.conformance import authoring as _authoring
 from urlab_client.conformance import cameras as _cameras
 from urlab_client.conformance import playing as _playing
 from urlab_client.conformance import reading as _reading
-from urlab_client.conformance.bench import Bench, decoded
+from urlab_client.conformance.bench import Bench, decoded, to_the_end
 from urlab_client.conformance.declarations import (
     CHECKS,
     Check,
@@ -108,7 +108,6 @@ async def run(bench: Bench, choice: Choice, progress: Progress = lambda _result,
     wanted = [check for check in CHECKS if choice.takes(check) and bench.dialect in check.dialects]
     results: list[CheckResult] = []
     measurements: dict[str, Any] = {}
-    left: list[str] = []
     stopped = ""
     try:
         for group in Group:
@@ -128,16 +127,15 @@ async def run(bench: Bench, choice: Choice, progress: Progress = lambda _result,
                 progress(result, len(results), len(wanted))
             if choice.measure and not obstacle and not stopped and group in choice.groups and not choice.words:
                 measurements |= await _measure(bench, group)
-            left += await asyncio.shield(bench.put_back())
+            await bench.put_back()
         for check in wanted if not stopped else ():
             if check.last:
                 results.append(await one(bench, check))
                 progress(results[-1], len(results), len(wanted))
     finally:
-        if bench.undone:
-            left += await asyncio.shield(bench.put_back())
+        await bench.put_back()
     measurements |= bench.measured
-    return Report(_server(bench), _statements(bench, results), results, measurements, left, stopped)
+    return Report(_server(bench), _statements(bench, results), results, measurements, bench.left, stopped)
 
 
 async def one(bench: Bench, check: Check) -> CheckResult:
@@ -159,7 +157,7 @@ async def one(bench: Bench, check: Check) -> CheckResult:
         verdict, detail = Verdict.DIFFERS, f"expected an end within {_LONGEST_S:g} s, got none"
     except _UNREADABLE as error:
         verdict, detail = Verdict.DIFFERS, f"expected the declared fields, got {type(error).__name__}: {error}"
-    await asyncio.shield(bench.put_back(undone))
+    await bench.put_back(undone)
     return CheckResult(check.title, check.statements, check.group, verdict, detail, (before + 1, bench.wire.count))
 
 
@@ -170,7 +168,7 @@ async def _begin(bench: Bench, group: Group, choice: Choice, checks: Collection[
     if not checks or group is Group.READ:
         return "", False
     try:
-        await (bench.play() if group is Group.PLAY else bench.author())
+        await to_the_end(bench.play() if group is Group.PLAY else bench.author())
     except NotTried as reason:
         return str(reason), False
     except (Differs, URLabError, *_UNREADABLE) as error:

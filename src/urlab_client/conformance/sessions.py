@@ -251,6 +251,7 @@ class Relay(Service):
     def _connected(self, kind: int, endpoint: str) -> Socket:
         socket = self._ports.socket(kind)
         socket.heartbeat_ivl, socket.heartbeat_timeout = HEARTBEAT_MS, SILENCE_MS
+        socket.ipv6 = "[" in endpoint
         if self._keys is not None:
             self._keys.protect(socket)
         socket.connect(endpoint)

@@ -26,7 +26,7 @@ from urlab_client.errors import URLabError
 from urlab_client.protocol.base import Floats
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
-from urlab_client.values.names import NameMap, own_aliases, split_prefix, unknown_name
+from urlab_client.values.names import NameMap, own_aliases, split_prefix
 from urlab_client.values.plain import Serializable
 
 need("mink", extra="teleop")
@@ -131,6 +131,8 @@ class InverseKinematics:
         held = _held(self._robot, _chain(model, root), None if joints is None else [*joints], f"{kind} {name!r}")
         self.joints: tuple[str, ...] = tuple(held)
         self._held = [(self._robot.joints[joint], actuator) for joint, actuator in held.items()]
+        self._places = self._robot.joints.over({joint: i for i, joint in enumerate(held)})
+        self._places.owner = f"the chain to {name!r}"
         ids = [joint.id for joint, _ in self._held]
         self._qpos: NDArray[np.intp] = np.array(model.jnt_qposadr[ids], dtype=np.intp)
         self._low, self._high = np.array([_range(joint, actuator) for joint, actuator in self._held]).T
@@ -164,9 +166,7 @@ class InverseKinematics:
         """
         qpos = self._present()
         for name, position in (joints or {}).items():
-            if name not in self.joints:
-                raise unknown_name("joint", name, self.joints, owner=f"the chain to {self.frame!r}")
-            qpos[self._qpos[self.joints.index(name)]] = finite(f"joint {name!r}", position)
+            qpos[self._qpos[self._places[name]]] = finite(f"joint {name!r}", position)
         self._configuration.update(qpos)
         return self._frame_pose()
 
@@ -176,7 +176,7 @@ class InverseKinematics:
         Args:
             joints: Positions of `self.joints`, rad or m.
         """
-        held = zip(self._held, np.clip([joints[name] for name in self.joints], self._low, self._high), strict=True)
+        held = zip(self._held, np.clip(self._positions(joints), self._low, self._high), strict=True)
         return {actuator.name: actuator.set_point_for(float(value)) for (_, actuator), value in held}
 
     def solve(
@@ -248,7 +248,7 @@ class InverseKinematics:
         root = model.body_rootid[model.jnt_bodyid[self._held[0][0].id]]
         known = self._touching(data, qpos, root)
         for i, joints in enumerate(path):
-            qpos[self._qpos] = [joints[name] for name in self.joints]
+            qpos[self._qpos] = self._positions(joints)
             for pair in self._touching(data, qpos, root) - known:
                 first, second = (model.geom(g).name or model.body(model.geom_bodyid[g]).name for g in pair)
                 return i, first, second
@@ -274,14 +274,17 @@ class InverseKinematics:
         with self._client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
             return np.array(data.qpos)
 
+    def _positions(self, joints: dict[str, float]) -> list[float]:
+        """Return the positions of all joints, in their order."""
+        given = {self._robot.joints.key(name): position for name, position in joints.items()}
+        return [given[name] for name in self.joints]
+
     def _initial_positions(self, start: dict[str, float] | None, starts: int) -> Iterable[Floats]:
         qpos = self._present()
         rng = np.random.default_rng(0)
         first: NDArray[np.float64] = qpos[self._qpos]
         for name, position in (start or {}).items():
-            if name not in self.joints:
-                raise unknown_name("joint", name, self.joints, owner=f"the chain to {self.frame!r}")
-            first[self.joints.index(name)] = finite(f"start: joint {name!r}", position)
+            first[self._places[name]] = finite(f"start: joint {name!r}", position)
         low, high = np.maximum(self._low, -np.pi), np.minimum(self._high, np.pi)
         for i in range(starts):
             if i:

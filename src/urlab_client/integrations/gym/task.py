@@ -530,6 +530,10 @@ def with_task(space: Space, task: Task | None) -> Space:
         return space
     if isinstance(space, spaces.Dict):
         by_name = cast("Mapping[str, Space]", space)
+        if "task" in by_name.keys():  # noqa: SIM118  # `in` asks a space whether a value is in it
+            raise ValueError(
+                "an articulation is named 'task', the entry for what the task observes: give it another actor id"
+            )
         return dict_space({**by_name, "task": unbounded(task.n_observed)})
     return unbounded(int(np.prod(space.shape or ())) + task.n_observed)
 

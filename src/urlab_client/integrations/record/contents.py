@@ -22,14 +22,8 @@ from urlab_client.protocol.messages.session import ArticulationState, Clock, Ent
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.values.pictures import Pixels, shown_png, without_alpha
 
-TASK: Final = "task"
-"""First part of the names of the columns with what an environment told about a state."""
-
 CHOSEN: Final = "chosen"
 """Name of the column, `task/chosen/ARTICULATION`, with the set-points that an action meant if it took effect late."""
-
-GOAL: Final = "goal"
-"""First part of the names of the columns with an episode's goal: `goal/NAME`."""
 
 _NS = 1e9
 _GAP_FACTOR = 3.0

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from urlab_client._platform.signals import APART
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations.record.contents import GOAL, TASK, Column, Table, even, farthest, visible
+from urlab_client.integrations.record.contents import Column, Table, even, farthest, visible
 from urlab_client.integrations.record.index import Progress
 from urlab_client.integrations.record.reader import Run, phases
 from urlab_client.integrations.record.transitions import (
@@ -32,7 +32,7 @@ from urlab_client.integrations.record.transitions import (
     selected_pairs,
     with_goals,
 )
-from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.integrations.record.writer import GOAL, TASK, RecordingError
 from urlab_client.protocol.base import Floats
 
 _SCRIPT = Path(__file__).with_name("_lerobot_script.py")

@@ -37,8 +37,6 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations._feed.scene import SceneLayout
 from urlab_client.integrations.record.contents import (
     CHOSEN,
-    GOAL,
-    TASK,
     Camera,
     RecordedArticulation,
     RecordedEntity,
@@ -50,7 +48,7 @@ from urlab_client.integrations.record.contents import (
 )
 from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Progress, RecordedMessage, RecordingIndex
 from urlab_client.integrations.record.tables import SampleTimes, Source, TableBuilder
-from urlab_client.integrations.record.writer import MODEL_NAME, RecordingError
+from urlab_client.integrations.record.writer import GOAL, MODEL_NAME, TASK, RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.values.html import curve, fields, table
 from urlab_client.values.pictures import thumbnail

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations.record.contents import CHOSEN, GOAL, TASK, Column, Table
+from urlab_client.integrations.record.contents import CHOSEN, Column, Table
 from urlab_client.integrations.record.reader import Run
+from urlab_client.integrations.record.writer import GOAL, TASK
 
 Episodes = Literal["kept", "success", "all"]
 """Selection of episodes: those not discarded, only successes, or all."""

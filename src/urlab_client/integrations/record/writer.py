@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, cast
+from typing import IO, Final, cast
 
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
@@ -64,6 +64,12 @@ FORMAT = "1"
 
 MODEL_NAME, MODEL_TYPE = "model.mjb.zlib", "application/zlib"
 """Attachment with the compiled model, as MuJoCo saves it; the last one before a state applies to it."""
+
+TASK: Final = "task"
+"""First part of the names of the columns with what an environment told about a state."""
+
+GOAL: Final = "goal"
+"""First part of the names of the columns with an episode's goal: `goal/NAME`."""
 
 _WAKE_S = 0.02  # in batches: waking for each state would take the interpreter lock from the stepping thread
 _STALL_S = 30.0
@@ -233,7 +239,7 @@ class WriterThread:
                 sink.flush_if_due(self._dropped_states, self._dropped_frames)
             self._drain()
             sink.finish(self._dropped_states, self._dropped_frames)
-        except OSError as error:
+        except (OSError, RecordingError) as error:
             self._fail(error)
         finally:
             with contextlib.suppress(OSError):  # already reported if writing failed
@@ -327,11 +333,21 @@ class _Sink:
                 outcome = OutcomeMessage(Time.of(now), self._clock.episode, item.outcome, item.goal)
                 self._add("/recording/outcomes", outcome, now, item.wall_ns)
             case Transition() if self.states - 1 > self._noted:
+                self._refuse_names_of_columns()
                 now, self._noted = self._clock.last or 0, self.states - 1
                 led = TransitionMessage(timestamp=Time.of(now), sample=self._noted, **asdict(item))
                 self._add("/recording/transitions", led, now, time.time_ns())
             case _:
                 pass  # of a state that is not in the file, or has one already
+
+    def _refuse_names_of_columns(self) -> None:
+        scene = self._scene
+        for name in (TASK, GOAL):
+            if scene is not None and (name in scene.layouts or name in scene.entities):
+                raise RecordingError(
+                    f"{name!r} cannot be the name of a robot or entity in a recording of an environment, whose own "
+                    f"columns begin with {name}/: give it another actor id"
+                )
 
     def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
         """Write the chunk if its oldest message is old enough, which limits the loss in a crash."""
