@@ -52,6 +52,7 @@ def serving(request: pytest.FixtureRequest) -> Iterator[Any]:
         yield served
 
 
+@pytest.mark.parametrize("serving", ["alpha", pytest.param("beta", marks=pytest.mark.long)], indirect=True)
 def test_it_follows_commands_better_than_zero_output_and_the_trot(serving: Any, figures: ModuleType) -> None:
     given: dict[str, Any] = {"episodes": 2, "max_episode_steps": 150}
     own = serving(PD)

@@ -23,7 +23,9 @@ AXE = Path(sys.prefix, "axe", "axe_playwright_python", "axe.min.js")
 
 FIND = """const done = arguments[0]; axe.run({resultTypes: ["violations"]}).then(({violations}) => done(
   violations.flatMap((one) => one.nodes.map((node) => `${one.help}: ${node.html} (${node.failureSummary})`))))"""
-FOLD = "document.querySelectorAll('main details').forEach((one) => { one.open = arguments[0]; })"
+UNFOLD = """const closed = [...document.querySelectorAll('main details:not([open])')];
+  closed.forEach((one) => { one.open = true; }); return closed"""
+FOLD = "arguments[0].forEach((one) => { one.open = false; })"
 PANELS = "[...document.querySelectorAll('.column')].map((one) => [...one.children].map(({id}) => id))"
 SPOKEN = "document.querySelector('#announcements').textContent"
 TOP = f"document.querySelector('{SLIDER}').getBoundingClientRect().top"
@@ -59,6 +61,16 @@ def still(page: Page) -> Iterator[Page]:
     page.ask("api/ops/reset", {})
     yield page
     page.driver.execute_script("document.querySelectorAll('dialog[open]').forEach((one) => one.close())")
+
+
+@contextlib.contextmanager
+def unfolded(page: Page) -> Iterator[None]:
+    """Open what is closed, and close that again: the page remembers whether its 3-D view was open."""
+    closed = page.driver.execute_script(UNFOLD)
+    try:
+        yield
+    finally:
+        page.driver.execute_script(FOLD, closed)
 
 
 def tab_to(page: Page, name: str) -> None:
@@ -110,8 +122,7 @@ def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
             still.until("getComputedStyle(document.querySelector('#sheet')).opacity === '1'")
             stack.callback(still.click, "#sheet-toggle")
         assert driver.execute_async_script(FIND) == []
-        driver.execute_script(FOLD, True)
-        stack.callback(driver.execute_script, FOLD, False)
+        stack.enter_context(unfolded(still))
         assert driver.execute_async_script(FIND) == []
         for opens, dialog in (
             ("[aria-label=Keys]", "help"),
@@ -126,9 +137,8 @@ def test_axe_finds_nothing(still: Page, scheme: str, small: bool) -> None:
 
 def test_a_screen_reader_has_a_name_for_every_control_and_hears_whether_it_is_pressed(still: Page) -> None:
     still.driver.execute_cdp_cmd("Accessibility.enable", {})
-    still.driver.execute_script(FOLD, True)
-    nodes = still.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
-    still.driver.execute_script(FOLD, False)
+    with unfolded(still):
+        nodes = still.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
     roles = {"button", "slider", "spinbutton", "combobox", "checkbox", "textbox", "image", "region", "application"}
     controls = [one for one in nodes if not one["ignored"] and one["role"]["value"] in roles]
     assert len(controls) > 100

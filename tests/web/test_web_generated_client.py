@@ -59,6 +59,7 @@ def generate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generate:
     return made
 
 
+@pytest.mark.long
 async def test_a_generated_client_drives_a_robot(generate: Generate) -> None:
     with SimulatedServer("arm", play=True) as server:
         async with URLabClient(**server.client_options()) as client:
