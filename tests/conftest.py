@@ -9,15 +9,12 @@ import os
 import signal
 import sys
 from collections.abc import Generator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from children import ended_with_a_failure
 from hypothesis import HealthCheck, settings
 from not_on_windows import listed, names
-
-TESTS = Path(__file__).parent
 
 # The tests start hundreds of processes; without bytecode files each would compile the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -127,29 +124,12 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Look for OpenGL once for all workers, which collect the tests; of a whole suite, each from another folder on.
-
-    A worker so finds the bytecode of most files written by the others, where three would write all at the same time.
-    """
-    worker: dict[str, Any] = getattr(config, "workerinput", {})
-    if worker and [Path(one).resolve() for one in config.args] == [TESTS]:
-        parts = sorted({TESTS / file.relative_to(TESTS).parts[0] for file in TESTS.rglob("test_*.py")})
-        first = int(worker["workerid"].removeprefix("gw")) * len(parts) // worker["workercount"]
-        config.args[:] = map(str, parts[first:] + parts[:first])
-        config.pluginmanager.register(InOrder())
+    """Look for OpenGL once for all workers, which collect the tests."""
     if getattr(config.option, "numprocesses", None):
         without_opengl()
     elif os.environ.pop("PYTHONDEVMODE", None):
         # Programs have the rest of the development mode: asyncio would tell of whatever takes long on a busy machine.
         os.environ.update(PYTHONWARNINGS="default", PYTHONFAULTHANDLER="1", PYTHONMALLOC="debug")
-
-
-class InOrder:
-    """Puts the tests in one order, whichever folder a worker began with."""
-
-    @pytest.hookimpl(tryfirst=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items.sort(key=lambda item: item.path.relative_to(TESTS).parts[0])
 
 
 @pytest.hookimpl(trylast=True)
