@@ -203,8 +203,8 @@ async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any
         await client.discover()
         (robot,) = client.articulations.values()
         await client.step(100)
-        reply = await client.reset(keyframe_name="home")
-        assert (reply.step, client.step_count) == (0, 0)
+        reply = await client.reset(keyframe_name="home", seed=7)
+        assert (reply.step, client.step_count, client.reset_seed) == (0, 0, 7)
         key = client.model.key(f"{robot.compiled_prefix}_home")
         assert np.array_equal(client.data.qpos, key.qpos)
         with pytest.raises(UnknownKeyframe, match=f"{robot.compiled_prefix}_home"):

@@ -113,6 +113,7 @@ def test_an_invitation_lets_one_more_in_once(http: TestClient) -> None:
     shut = http.get("/api/status", headers=stranger)
     assert (shut.status_code, shut.headers["content-type"].partition(";")[0]) == (401, "text/html")
     assert "Access denied" in shut.text
+    assert "Open the link that `urlab console` printed" in shut.text
 
 
 def test_rays_and_pushes_take_finite_numbers_and_bodies_of_robots(http: TestClient) -> None:
