@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -209,6 +210,23 @@ async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any
         assert np.array_equal(client.data.qpos, key.qpos)
         with pytest.raises(UnknownKeyframe, match=f"{robot.compiled_prefix}_home"):
             await client.reset(keyframe_name="homme")
+
+
+async def test_reset_sets_the_local_data_also_where_replies_do_not_show_it(
+    connect: Any, serve: Any, tmp_path: Path
+) -> None:
+    model = tmp_path / "muscle.xml"
+    model.write_text("""<mujoco><worldbody><body><joint name="hinge"/><geom size=".1"/></body></worldbody>
+    <actuator><general name="slow" joint="hinge" dyntype="integrator" biastype="affine"/></actuator>
+    <keyframe><key name="tense" act=".5"/></keyframe></mujoco>""")
+    with serve(str(model), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        await client.reset("tense")
+        assert client.data.act.tolist() == [0.5]
+        await client.reset()
+        assert client.data.act.tolist() == [0.0]
+        assert client.reset_seed is None
 
 
 async def test_an_ambiguous_keyframe_is_refused(connect: Any, serve: Any) -> None:
