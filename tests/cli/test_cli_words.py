@@ -185,7 +185,7 @@ def test_keys_of_the_console_are_long(monkeypatch: pytest.MonkeyPatch, capsys: p
 
 async def served(_: Any) -> None:
     try:
-        raise ValueError("lost")
+        int("lost")
     except ValueError:
         logging.getLogger("urlab_client.web").exception("it %s", "failed")
 
@@ -202,5 +202,5 @@ def test_the_console_logs_lines_of_json(monkeypatch: pytest.MonkeyPatch, capsys:
     (line,) = capsys.readouterr().err.splitlines()
     logged = json.loads(line)
     assert (logged["level"], logged["logger"], logged["message"]) == ("error", "urlab_client.web", "it failed")
-    assert "ValueError: lost" in logged["error"]
+    assert "ValueError: invalid literal" in logged["error"]
     assert logged["at"].endswith("+00:00")

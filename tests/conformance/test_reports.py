@@ -213,13 +213,14 @@ async def test_robots_of_other_clients_are_left_alone(tmp_path: Path) -> None:
         async with bench(served, tmp_path) as made, URLabClient(**served.client_options()) as other:
             await furnish(made, tmp_path)
             await other.discover()
-            first, second = other.articulations.values()
-            await first.claim()
+            await next(iter(other.articulations.values())).claim()
             await made.play()
             assert len(made.robots) == 1
             made.later("load_level", level_path="/Game/Levels/nowhere")
             assert await made.put_back() == ["load_level: load_level_failed: play is running: stop it first"]
-            await second.claim()
+            await other.discover()
+            for robot in other.articulations.values():
+                await robot.claim()
             with pytest.raises(NotTried, match="needs a robot that no other client controls"):
                 await made.play()
             await made.put_back()
