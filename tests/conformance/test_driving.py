@@ -222,10 +222,12 @@ async def test_reset_sets_the_local_data_also_where_replies_do_not_show_it(
     with serve(str(model), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
-        await client.reset("tense")
-        assert client.data.act.tolist() == [0.5]
-        await client.reset()
-        assert client.data.act.tolist() == [0.0]
+        for keyframe, activation in (("tense", 0.5), (None, 0.0)):
+            client.data.qfrc_applied[:] = client.data.xfrc_applied[:] = 1.0
+            await client.reset(keyframe)
+            assert client.data.act.tolist() == [activation]
+            assert not client.data.qfrc_applied.any()
+            assert not client.data.xfrc_applied.any()
         assert client.reset_seed is None
 
 
