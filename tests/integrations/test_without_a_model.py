@@ -99,7 +99,7 @@ def test_gains_are_checked_against_the_schema_before_they_are_sent() -> None:
         assert len(controller.kp) == len(list(controller.kp)) == len(gentle.articulations["arm"].actuators)
         assert repr(controller.kp) == repr(dict(controller.kp))
         sent = aio_of(gentle)._session.transport.stats.sent
-        for params, said in (
+        wrong: list[tuple[dict[str, Any], str]] = [
             ({"kq": 1.0}, "no parameter is called 'kq'; available: .*kp"),
             ({"kp": 3.0}, "kp takes a mapping of actuator name to number, got 3.0"),
             ({"kp": {"elbw": 3.0}}, "kp: no actuator 'elbw'; available: .*elbow"),
@@ -108,7 +108,8 @@ def test_gains_are_checked_against_the_schema_before_they_are_sent() -> None:
             ({"kp": {"elbow": -0.5}}, r"kp\['elbow'\] must be at least 0, got -0.5"),
             ({"default_kp": "stiff"}, "default_kp takes a number, got 'stiff'"),
             ({"default_kp": -1.0}, "default_kp must be at least 0, got -1.0"),
-        ):
+        ]
+        for params, said in wrong:
             with pytest.raises(ControllerSchemaViolation, match=f"arm: {said}.*Nothing was sent"):
                 controller.configure(**params)
         assert aio_of(gentle)._session.transport.stats.sent == sent
