@@ -8,7 +8,9 @@ import itertools
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -39,6 +41,26 @@ LEFT_OUT: dict[str, str] = {}
 """Tests that cannot run here, and what they need."""
 
 OPENGL = "URLAB_TESTS_WITHOUT_OPENGL"
+
+_raises: Any = pytest.raises
+
+
+def _tells(error: BaseException) -> bool:
+    """Whether what the package raised has a message; cancelling and the end of an iterator need none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = frames and "urlab_client" in Path(frames[-1].filename).parts
+    silent = not isinstance(error, Exception) or isinstance(error, StopIteration | StopAsyncIteration)
+    return silent or not ours or not {None, "", "None"} & {getattr(error, "message", str(error)), *error.args[:1]}
+
+
+@functools.wraps(_raises)
+def raises_with_a_message(*arguments: Any, **options: Any) -> Any:
+    """Expect an exception, which must have a message if the package raises it, whatever else a test asks of it."""
+    plain = len(arguments) == 1 and not {"match", "check"} & options.keys()
+    return _raises(*arguments, **options, **({"check": _tells} if plain else {}))
+
+
+pytest.raises = raises_with_a_message
 
 MISSING = {
     marker: extras

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from children import signals_kept
 
-from urlab_client import ProtocolError, URLabClient
+from urlab_client import ProtocolError, URLabClient, URLabRPCError
 from urlab_client.aio.arguments import integer
 from urlab_client.cli import main
 from urlab_client.integrations.record.recorder import record
@@ -39,6 +39,10 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
         (refused(integer, "n_steps", "two"), TypeError, "n_steps takes an integer, got 'two'."),
         (refused(URLabClient, encoding="xml"), ValueError, "encoding must be msgpack or json, not 'xml'"),
         (refused(URLabClient, shm_dir="/tmp"), ValueError, "shm_dir is for transport='shm'"),
+        (refused(URLabClient, rcv_timeout_ms=0), ValueError, "rcv_timeout_ms must be above 0, got 0"),
+        (refused(URLabClient, read_only=True, step_mode="direct"), ValueError, "read_only needs transport='zmq'"),
+        (refused(URLabClient, read_only=True, transport="shm"), ValueError, "read_only needs transport='zmq'"),
+        (refused(URLabClient, "sim://arm", read_only=True), ValueError, "read_only needs transport='zmq'"),
         (refused(URLabClient, FAR, client_key="a"), ValueError, "client_key requires server_key: the client must know"),
         (
             refused(URLabClient, "ipc://a", server_key=KEY),
@@ -160,6 +164,11 @@ def test_keys(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(KeyFileError, match=r"contains no file that ends in \.key"):
         public_keys([tmp_path / "empty"])
+
+
+def test_an_error_code_has_one_class() -> None:
+    with pytest.raises(TypeError, match="error code 'not_ready' is declared twice"):
+        type("Again", (URLabRPCError,), {}, code="not_ready")
 
 
 @pytest.mark.parametrize(

@@ -439,6 +439,16 @@ def test_a_free_joint_without_a_name_is_not_the_articulations(direct: Session) -
     assert art.qpos_array.shape == art.dof_qpos.shape == (1,)
 
 
+def test_a_camera_of_the_scene_that_a_program_holds_follows_the_next_handshake(direct: Session) -> None:
+    client, later = direct.client, greeting()
+    assert direct.ask("hello", greeting(), client.discover) is None
+    held = client.global_cameras["sky"]
+    later["global_cameras"]["sky"]["resolution"] = [4.0, 3.0]
+    assert direct.ask("hello", later, client.discover) is None
+    assert client.global_cameras["sky"] is held
+    assert tuple(held.info.resolution) == (4, 3)
+
+
 def test_any_handshake_without_a_local_model(scripted: Any) -> None:
     good = greeting()
     session = Session(scripted, "direct")

@@ -191,7 +191,7 @@ async def test_a_refused_step_leaves_no_doubt(client: URLabClient) -> None:
 async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None:
     """Beta statement 97."""
     clock = {"time": 0.0, "step": 4.0, "sim_time": {"sec": 0.0, "nsec": 0.0}, "wall_time": {"sec": 0.0, "nsec": 0.0}}
-    scripted.on("step", {"op": "error", "code": "step_timeout", "message": ""})
+    scripted.on("step", {"op": "error", "code": "step_timeout", "message": "3 steps are queued"})
     scripted.on("forward", {"op": "forward_ok", **clock, "step": 0.0, "per_articulation": {}})
     hello = scripted.answers["hello"]({}) | {"manager_present": True, "entities": {}}
     scripted.on("hello", hello)

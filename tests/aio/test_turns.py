@@ -118,6 +118,18 @@ async def test_a_wrench_is_kept_when_its_step_was_not_sent_or_refused(client: UR
     assert arm.qvel_array.any()
 
 
+async def test_an_editor_op_that_gives_up_its_turn_leaves_the_editor_to_the_next(
+    client: URLabClient, faults: Faults
+) -> None:
+    holding = await sent(client, "list_keyframes", client.runtime.list_keyframes(), faults)
+    with pytest.raises(URLabTimeoutError):
+        await client.sim.start(timeout=0.05)
+    with pytest.raises(URLabTimeoutError):
+        await client.outliner.list_actors(timeout=0.05)
+    await cancelled(holding)
+    assert await client.outliner.list_actors(timeout=DEADLINE_S)
+
+
 async def test_a_step_that_waits_for_a_mode_change_is_one_of_the_new_mode(client: URLabClient) -> None:
     await client.step(5)
     reply = (await asyncio.gather(client.runtime.set_mode("puppet"), client.step(10)))[1]

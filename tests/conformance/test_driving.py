@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -203,12 +204,31 @@ async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any
         await client.discover()
         (robot,) = client.articulations.values()
         await client.step(100)
-        reply = await client.reset(keyframe_name="home")
-        assert (reply.step, client.step_count) == (0, 0)
+        reply = await client.reset(keyframe_name="home", seed=7)
+        assert (reply.step, client.step_count, client.reset_seed) == (0, 0, 7)
         key = client.model.key(f"{robot.compiled_prefix}_home")
         assert np.array_equal(client.data.qpos, key.qpos)
         with pytest.raises(UnknownKeyframe, match=f"{robot.compiled_prefix}_home"):
             await client.reset(keyframe_name="homme")
+
+
+async def test_reset_sets_the_local_data_also_where_replies_do_not_show_it(
+    connect: Any, serve: Any, tmp_path: Path
+) -> None:
+    model = tmp_path / "muscle.xml"
+    model.write_text("""<mujoco><worldbody><body><joint name="hinge"/><geom size=".1"/></body></worldbody>
+    <actuator><general name="slow" joint="hinge" dyntype="integrator" biastype="affine"/></actuator>
+    <keyframe><key name="tense" act=".5"/></keyframe></mujoco>""")
+    with serve(str(model), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        for keyframe, activation in (("tense", 0.5), (None, 0.0)):
+            client.data.qfrc_applied[:] = client.data.xfrc_applied[:] = 1.0
+            await client.reset(keyframe)
+            assert client.data.act.tolist() == [activation]
+            assert not client.data.qfrc_applied.any()
+            assert not client.data.xfrc_applied.any()
+        assert client.reset_seed is None
 
 
 async def test_an_ambiguous_keyframe_is_refused(connect: Any, serve: Any) -> None:

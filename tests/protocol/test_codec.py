@@ -24,8 +24,16 @@ from urlab_client.errors import (
     WrongTransport,
 )
 from urlab_client.events import ClientEvent
+from urlab_client.protocol import codec
 from urlab_client.protocol.base import Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_reply, encode_message, encode_reply, encode_request
+from urlab_client.protocol.codec import (
+    check_finite,
+    check_request,
+    decode_reply,
+    encode_message,
+    encode_reply,
+    encode_request,
+)
 from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.recording import RecordingSaveOk
 from urlab_client.protocol.messages.runtime import SetModeOk, SetPausedOk, SetSimSpeed
@@ -38,12 +46,14 @@ from urlab_client.protocol.messages.session import (
     ErrorReply,
     HelloOk,
     InstanceInfo,
+    ResetOk,
     Step,
     StepOk,
     TwistState,
 )
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.sim_options import SimOptions
 from urlab_client.server.dialects import ALPHA, BETA
 from urlab_client.values.plain import plain as plain_data
 
@@ -342,3 +352,59 @@ def test_an_integer_beyond_any_float_is_a_protocol_error() -> None:
     frame = b'{"op":"step_ok","time":0,"step":1,"per_articulation":{"bot":%b}}' % state
     with pytest.raises(ProtocolError, match="step: the server's answer is not a valid step_ok"):
         decode_reply(OPS["step"], StepOk, frame)
+
+
+@pytest.mark.parametrize(
+    ("op", "fields", "named"),
+    [
+        ("set_sim_speed", {"percent": math.inf}, "percent is inf"),
+        ("set_sim_options", {"options": SimOptions(timestep=math.nan)}, "options.timestep is nan"),
+        ("set_sim_options", {"options": SimOptions(gravity=(0.0, -math.inf, 1.0))}, r"options.gravity\[1\] is -inf"),
+        ("configure_controller", {"articulation": "bot", "params": {"kp": {"elbow": math.inf}}}, None),
+        ("recording_start", {"max_duration_s": math.inf}, None),
+        ("reset", {"per_articulation_qpos": {"bot": {"elbow": math.nan}}}, "per_articulation_qpos.bot.elbow is nan"),
+    ],
+)
+def test_only_gains_and_the_window_of_a_recording_may_be_infinite(op: str, fields: Any, named: str | None) -> None:
+    request = OPS[op].request(**fields)
+    if named is None:
+        check_finite(request)
+        return
+    with pytest.raises(ValueError, match=rf"^{op}: {named}; it takes finite numbers\. Nothing was sent\.$"):
+        check_finite(request)
+
+
+def test_a_reply_is_refused_one_byte_beyond_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = encode_reply(SetPausedOk(paused=True))
+    monkeypatch.setattr(codec, "MAX_REPLY_BYTES", len(frame))
+    assert decode_reply(OPS["set_paused"], SetPausedOk, frame).paused
+    monkeypatch.setattr(codec, "MAX_REPLY_BYTES", len(frame) - 1)
+    limit = rf"set_paused: a reply of {len(frame)} bytes exceeds the limit {len(frame) - 1}"
+    with pytest.raises(ProtocolError, match=limit) as refused:
+        decode_reply(OPS["set_paused"], SetPausedOk, frame)
+    assert refused.value.op == "set_paused"
+
+
+def test_a_job_that_nobody_expects_is_named() -> None:
+    op, started = OPS["create_level"], encode_reply(OpStarted(job_id="job_7"))
+    with pytest.raises(ProtocolError, match="create_level: the server has started job_7 instead of answer") as refused:
+        decode_reply(op, op.reply, started)
+    assert refused.value.op == "create_level"
+
+
+def test_a_reply_with_a_state_is_a_snapshot() -> None:
+    bot = ArticulationState(qpos=np.array([0.5]), qvel=np.array([0.0]))
+    crate = EntityState(xpos=(1.0, 2.0, 3.0), xquat=(1.0, 0.0, 0.0, 0.0))
+    stepped = StepOk(time=3.25, step=13, per_articulation={"bot": bot}, entities={"crate": crate})
+    snapshot = StateSnapshot.of(stepped)
+    assert (snapshot.time, snapshot.step) == (3.25, 13)
+    assert snapshot.sim_time == Clock(sec=3, nsec=250_000_000)  # servers without clocks tell only the time
+    assert snapshot.wall_time == Clock(sec=0, nsec=0)
+    assert snapshot.per_articulation == {"bot": bot}
+    assert snapshot.entities == {"crate": crate}
+    assert repr(snapshot) == "<StateSnapshot step 13 at 3.250 s: bot>"
+    clocks = {"sim_time": Clock(sec=5, nsec=6), "wall_time": Clock(sec=7, nsec=8)}
+    told = StateSnapshot.of(ResetOk(time=0.0, step=0, per_articulation={}, **clocks))
+    assert (told.sim_time, told.wall_time) == (clocks["sim_time"], clocks["wall_time"])
+    assert told.entities == {}
+    assert repr(told) == "<StateSnapshot step 0 at 0.000 s: no robots>"

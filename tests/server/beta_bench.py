@@ -62,6 +62,7 @@ class Bench:
         """Send an op that must fail; return code and owner."""
         reply = self.raw(op, **fields)
         assert reply["op"] == "error", reply
+        assert isinstance(reply["message"], str)
         return reply["code"], reply.get("owner")
 
     def play(self, mode: str = "direct") -> dict[str, Any]:

@@ -223,6 +223,38 @@ def test_what_is_no_key(text: str, tmp_path: Path) -> None:
         public_key(tmp_path / "bad.key")
 
 
+@pytest.mark.parametrize("name", ["", ".lab", "lab/pc", "lab pc", "lab:pc"])
+def test_keys_are_called_as_files_are_everywhere(name: str, tmp_path: Path) -> None:
+    with pytest.raises(KeyFileError, match=f"^{name!r} is not a valid key name: use letters, digits, '-', '_' and '.'"):
+        KeyPair.new().write(tmp_path / "new", name)
+    assert not list(tmp_path.iterdir())
+    public, secret = KeyPair.new().write(tmp_path / "new", "lab-pc_2.x")
+    assert (public.name, secret.name) == ("lab-pc_2.x.key", "lab-pc_2.x.key_secret")
+    assert public_key(public) == read_pair(secret).public
+
+
+def test_no_key_is_overwritten_be_it_the_public_or_the_secret_one(tmp_path: Path) -> None:
+    for name in ("lab.key", "lab.key_secret"):
+        folder = tmp_path / name.rpartition(".")[2]
+        folder.mkdir()
+        (folder / name).write_text("mine")
+        with pytest.raises(KeyFileError, match=f"{name} exists, and keys are never overwritten"):
+            KeyPair.new().write(folder, "lab")
+        assert [file.read_text() for file in folder.iterdir()] == ["mine"]
+
+
+def test_files_that_hold_no_key(tmp_path: Path) -> None:
+    file = tmp_path / "bad.key"
+    file.write_bytes(b"\xff" * 10)
+    with pytest.raises(KeyFileError, match=r"bad\.key is not a key file.*urlab keys new"):
+        public_key(file)
+    file.write_bytes(b"#" * 1_000_000)
+    with pytest.raises(KeyFileError, match=r"bad\.key is not a key file: it is too long"):
+        public_key(file)
+    with pytest.raises(KeyFileError, match=r"nowhere\.key: the key cannot be read: No such file"):
+        public_key(tmp_path / "nowhere.key")
+
+
 # Binary models
 
 

@@ -192,6 +192,7 @@ class Wire:
         reply = self.raw({"op": op, "session_id": self.session_id, **fields})
         assert reply["op"] == "error", reply
         assert set(reply) == {"op", "code", "message"}
+        assert isinstance(reply["message"], str)
         return reply["code"], reply["message"]
 
     def until(self, op: str, /, **fields: Any) -> Iterator[dict[str, Any]]:

@@ -21,8 +21,10 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
+from urlab_client.errors import ConnectionLost, NotReady, OutcomeUnknown, URLabError, URLabTimeoutError
 from urlab_client.server import SimulatedServer
-from urlab_client.web import app
+from urlab_client.web import app, endpoints
+from urlab_client.web.endpoints import explain_error
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +115,7 @@ def test_an_invitation_lets_one_more_in_once(http: TestClient) -> None:
     shut = http.get("/api/status", headers=stranger)
     assert (shut.status_code, shut.headers["content-type"].partition(";")[0]) == (401, "text/html")
     assert "Access denied" in shut.text
+    assert "Open the link that `urlab console` printed" in shut.text
 
 
 def test_rays_and_pushes_take_finite_numbers_and_bodies_of_robots(http: TestClient) -> None:
@@ -337,3 +340,57 @@ def test_the_pace_of_the_simulation_is_shown(http: TestClient) -> None:
         told(lambda status: status["moving"] and 0.3 < status["rate"] < 0.7)
         http.post("/api/run", json={"running": False})
         told(lambda status: not status["moving"] and status["rate"] == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "code", "message"),
+    [
+        (NotReady("not_ready", "compiling"), 409, "not_ready", "compiling"),
+        (URLabTimeoutError("step: no reply", op="step"), 504, "timeout", "step: no reply"),
+        (OutcomeUnknown("step: lost", op="step"), 502, "outcome_unknown", "step: lost"),
+        (ConnectionLost("step: gone", op="step"), 503, "unreachable", "step: gone"),
+        (URLabError("odd"), 502, "failed", "odd"),
+        (FileNotFoundError(2, "No such file", "x"), 500, "io_failed", "[Errno 2] No such file: 'x'"),
+        (ValueError("7 is too many"), 400, "bad_request", "7 is too many"),
+    ],
+)
+def test_each_failure_has_its_status_and_code(error: Exception, status: int, code: str, message: str) -> None:
+    found, said = explain_error(error)
+    assert (found, said["code"], said["message"]) == (status, code, message)
+    assert said["hint"] == (getattr(error, "hint", None) or "")
+    assert explain_error(URLabError("odd", hint="Try again."))[1]["hint"] == "Try again."
+
+
+def test_parts_of_the_model_have_bounds(http: TestClient) -> None:
+    size = http.get("/viewer/model", params={"total_bytes": ""}).json()["total_bytes"]
+    for part in ({"offset_bytes": -1}, {"size_bytes": -1}):
+        assert "must not be negative" in refusal(http.get("/viewer/model", params=part))
+    whole = http.get("/viewer/model").content
+    assert len(whole) == size
+    assert http.get("/viewer/model", params={"offset_bytes": 0, "size_bytes": 0}).content == b""
+    assert http.get("/viewer/model", params={"offset_bytes": 3, "size_bytes": 4}).content == whole[3:7]
+    assert http.get("/viewer/model", params={"offset_bytes": size - 1}).content == whole[-1:]
+    assert refusal(http.get("/viewer/model", params={"crc32": "1"}), 404) == "The model has changed."
+
+
+def test_only_its_own_pages_and_hosts_may_use_it(http: TestClient) -> None:
+    strange = http.get("/api/status", headers={"host": "lab.example"})
+    assert "does not serve the host 'lab.example', only " in refusal(strange, 403)
+    assert strange.json()["error"]["code"] == "bad_host"
+    page = {"origin": "http://evil.example"}
+    assert http.get("/api/status", headers=page).status_code == 200
+    other = http.post("/api/step", json={"n_steps": 1}, headers=page)
+    assert refusal(other, 403) == "A page of 'http://evil.example' may not use this console."
+    assert other.json()["error"]["code"] == "bad_origin"
+    assert http.get("/healthz", headers={"host": "10.0.0.7"}).status_code == 200
+    basic = http.get("/api/status", headers={"authorization": http.headers["authorization"].replace("Bearer", "Basic")})
+    assert basic.status_code == 401
+    assert basic.headers["www-authenticate"] == 'Bearer realm="URLab"'
+    assert http.get("/", params={"token": "used"}, headers={"authorization": ""}).json()["error"]["code"] == "bad_token"
+
+
+def test_a_body_has_a_limit(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = b'{"n_steps": 1}'
+    monkeypatch.setattr(endpoints, "_LARGEST_BODY", len(body))
+    assert http.post("/api/step", content=body).status_code == 200
+    assert refusal(http.post("/api/step", content=body + b" ")) == f"a body is at most {len(body)} bytes"
