@@ -70,6 +70,7 @@ class TaskScene:
         self.model = model
         self.mapping = mapping
         self.data: mujoco.MjData = mujoco.MjData(model)
+        self._ids: dict[tuple[str, str], int] = {}  # tasks ask in each step
 
     def id(self, kind: str, name: str) -> int:
         """Return the id of a `body`, `site`, `geom` or `joint`.
@@ -77,7 +78,10 @@ class TaskScene:
         Raises:
             KeyError: The scene has no such element.
         """
-        return self.mapping.id(kind, name)
+        found = self._ids.get((kind, name))
+        if found is None:
+            found = self._ids[kind, name] = self.mapping.id(kind, name)
+        return found
 
     def geoms(self, name: str) -> NDArray[np.intp]:
         """Return the ids of the geoms of a body, without those of its children, or the id of one geom.

@@ -220,21 +220,21 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             truncated[list(errors)] = True
         ended = terminated | truncated
         self._totals += rewards
-        self._note(
-            acting if not errors else np.setdiff1d(acting, [*errors]),
-            lambda i: self._transition(i, flat, rewards, terminated, truncated),
-        )
-        news = ended & ~self._ended  # those that failed are marked already
-        if self.task is not None and news.any():
-            self._tell_ends(self.task, news, terminated, infos)
+        self._note(acting, errors, flat, rewards, terminated, truncated)
+        over = ended.any()
+        if over and self.task is not None:
+            self._tell_ends(self.task, ended & ~self._ended, terminated, infos)  # those that failed are marked already
         # Without autoreset, an environment may be stepped after the end of its episode.
         self._ended = ended | self._ended if self.autoreset_mode is AutoresetMode.DISABLED else ended
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+        if over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
 
-    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
-        """Tell who records some environments what led to their states. Nobody records a batch, which has no client."""
+    def _note(self, indices: Indices, errors: Mapping[int, Exception], *told: NDArray[Any]) -> None:
+        """Tell who records environments, if they did not fail, what led to their states; see `_transition`.
+
+        Nobody records a batch, which has no client.
+        """
 
     def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
         """Return the start of an environment's episode, or its action with reward, termination and truncation."""
@@ -295,7 +295,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
             self.elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
-            self._note(fresh if not errors else np.setdiff1d(fresh, [*errors]), self._transition)
+            self._note(fresh, errors)
         if errors:
             self._ended[list(errors)] = True
         return errors

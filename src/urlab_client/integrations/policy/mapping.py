@@ -53,6 +53,18 @@ class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session. The message names what was found, what is required and a fix."""
 
 
+_IDENTITY: Final = np.eye(3)
+_PRODUCTS: Final = [
+    (1 - 2 * _IDENTITY, [[2, 1, 1], [1, 1, 2], [1, 2, 1]], [[2, 2, 3], [2, 1, 3], [3, 3, 1]]),
+    (
+        np.array([[-1, -1, 1], [1, -1, -1], [-1, 1, -1]]),
+        [[3, 0, 0], [0, 3, 0], [0, 0, 2]],
+        [[3, 3, 2], [3, 3, 1], [2, 1, 2]],
+    ),
+]
+"""The products of a quaternion's components that a rotation matrix sums: signs, and both indices in (w, x, y, z)."""
+
+
 class RobotState(NamedTuple):
     """The state of one robot or of a batch.
 
@@ -92,13 +104,9 @@ class RobotState(NamedTuple):
 
     def _rotation(self) -> Floats:
         """Return the rotation from the base frame to the world frame, shape (…, 3, 3)."""
-        w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        quat = self.qpos[..., 3:7]
+        one, other = (sign * quat[..., left] * quat[..., right] for sign, left, right in _PRODUCTS)
+        return _IDENTITY + 2 * (one + other)
 
 
 class _Moment(NamedTuple):
