@@ -61,8 +61,9 @@ class OverWire(Vectorized):
         self._clients[i] = episode.client
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
-        for name, values in episode.measured().items():
-            self._measured[name][i] = values
+        if episode.measures:
+            for name, values in episode.measured().items():
+                self._measured[name][i] = values
         self._step_count[i] = episode.step_count
 
     def _state(self) -> tuple[Floats, Floats, Floats]:

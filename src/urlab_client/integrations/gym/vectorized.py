@@ -323,9 +323,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return self._recent
 
     def _now(self, indices: Indices) -> Now:
-        measured = {name: taken(values, indices) for name, values in self._measured.items()}
-        qpos, qvel, time = self._state()
-        return Now(taken(qpos, indices), taken(qvel, indices), taken(time, indices), measured)
+        qpos, qvel, time = taken(indices, *self._state())
+        return Now(qpos, qvel, time, dict(zip(self._measured, taken(indices, *self._measured.values()), strict=True)))
 
     def _judged(
         self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
@@ -418,6 +417,16 @@ def put(observations: Observation, indices: Indices | int, found: Observation) -
 def of_one(observations: Observation, i: int = 0) -> Observation:
     """Return the observation or action of one environment among those of all, as views."""
     return mapped(lambda array: array[i], observations)
+
+
+def need_same_step(env: VectorEnv[Any, Any, Any], library: str) -> None:
+    """Refuse an environment that does not reset in the step that ends an episode, as a library does."""
+    mode = env.metadata.get("autoreset_mode")
+    if mode is not AutoresetMode.SAME_STEP:
+        raise ValueError(
+            f"{library} resets in the step that ends an episode: make the environment with "
+            f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
+        )
 
 
 def info_of(infos: Mapping[str, Any], i: int = 0) -> dict[str, Any]:

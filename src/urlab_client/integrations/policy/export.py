@@ -299,9 +299,9 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], 
     else:  # a runner of RSL-RL, or a module
         module = model.alg.get_policy().as_jit() if hasattr(model, "alg") else model
         layers, answer = [*_layers([module])], _inferred(module)
-    clips = next((each.env for each in wrappers if type(each).__name__ == "ClipAction"), None)  # within these bounds
-    spaces = (_action_space(each) for each in ([clips] if clips is not None else [model, *wrappers]))
-    ours, theirs = _bounds(space), _bounds(next(filter(None, spaces), space))
+    clipped = [each.env for each in wrappers if type(each).__name__ == "ClipAction"]
+    spaces = [_action_space(each) for each in (clipped or [model, *wrappers])]
+    ours, theirs = _bounds(space), _bounds(next((each for each in spaces if each is not None), space))
     history = next((each.stacked_obs.n_stack for each in wrappers if type(each).__name__ == "VecFrameStack"), 1)
     n_inputs = size * history
     wide = next((len(arrays[0].T) for operator, arrays, _ in layers if operator == "Gemm"), n_inputs)

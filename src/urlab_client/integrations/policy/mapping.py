@@ -53,16 +53,9 @@ class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session. The message names what was found, what is required and a fix."""
 
 
-_IDENTITY: Final = np.eye(3)
-_PRODUCTS: Final = [
-    (1 - 2 * _IDENTITY, [[2, 1, 1], [1, 1, 2], [1, 2, 1]], [[2, 2, 3], [2, 1, 3], [3, 3, 1]]),
-    (
-        np.array([[-1, -1, 1], [1, -1, -1], [-1, 1, -1]]),
-        [[3, 0, 0], [0, 3, 0], [0, 0, 2]],
-        [[3, 3, 2], [3, 3, 1], [2, 1, 2]],
-    ),
-]
-"""The products of a quaternion's components that a rotation matrix sums: signs, and both indices in (w, x, y, z)."""
+_EYE: Final = np.eye(3)
+_CROSS: Final = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]), [[0, 3, 2], [3, 0, 1], [2, 1, 0]]
+"""Signs and components of a quaternion (w, x, y, z) in the matrix of the cross product with (x, y, z)."""
 
 
 class RobotState(NamedTuple):
@@ -105,8 +98,8 @@ class RobotState(NamedTuple):
     def _rotation(self) -> Floats:
         """Return the rotation from the base frame to the world frame, shape (…, 3, 3)."""
         quat = self.qpos[..., 3:7]
-        one, other = (sign * quat[..., left] * quat[..., right] for sign, left, right in _PRODUCTS)
-        return _IDENTITY + 2 * (one + other)
+        cross = _CROSS[0] * quat[..., _CROSS[1]]
+        return _EYE + 2 * (quat[..., :1, None] * cross + cross @ cross)
 
 
 class _Moment(NamedTuple):
