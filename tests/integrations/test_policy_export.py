@@ -10,9 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import ActionWrapper
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RescaleAction
+from gymnasium.wrappers import (
+    ClipAction,
+    DiscretizeAction,
+    NormalizeObservation,
+    OrderEnforcing,
+    RepeatAction,
+    TimeLimit,
+    TransformObservation,
+    TransformReward,
+    vector,
+)
 
 from urlab_client import URLabClient
 from urlab_client.cli import main as urlab
@@ -181,7 +192,7 @@ def test_without_terms_a_file_runs_in_its_task_alone(tmp_path: Path, capsys: pyt
     """Actions that training rescaled become those of the task."""
     inner = URLabBatchEnv(Reach.scene_address, 1, task=Reach(), autoreset_mode=AutoresetMode.SAME_STEP)
     one: Any = np.float32(1.0)
-    rescaled = RescaleAction(inner, -one, one)
+    rescaled = vector.RescaleAction(inner, -one, one)
     model = Model(22, rescaled.single_action_space, env=rescaled)
     path = tmp_path / "reach.onnx"
     spec = export_policy(model, Reach, path)
@@ -242,12 +253,20 @@ def test_a_file_that_differs_is_not_written(tmp_path: Path) -> None:
     assert len(export_policy(reach, Reach, tmp_path / "reach.onnx", terms=terms, tolerance=0.05).observation) == 4
 
 
-class VectorObservationWrapper:
-    """Gymnasium's, which changes observations."""
+class DummyVecEnv:
+    """Stable-Baselines3's environments in one process."""
+
+    def __init__(self, *envs: Any) -> None:
+        self.envs = envs
 
 
-class RescaleObservation(VectorObservationWrapper):
-    env = None
+class SubprocVecEnv:
+    """Stable-Baselines3's environments in other processes."""
+
+
+class Louder(ActionWrapper[Any, Any, Any]):
+    def action(self, action: Any) -> Any:
+        return 2.0 * action
 
 
 @pytest.mark.parametrize(
@@ -256,8 +275,8 @@ class RescaleObservation(VectorObservationWrapper):
         (lambda model: model.net.append(Conv2d()), "The layer Conv2d cannot be exported"),
         (lambda model: delattr(model.policy, "action_net"), "Model has no actor with continuous actions"),
         (lambda model: setattr(model, "_env", VecFrameStack(None, 2)), "maps 50 numbers .* observations of 100"),
-        (lambda model: setattr(model, "_env", RescaleObservation()), "wrapper RescaleObservation changes observations"),
         (lambda model: setattr(model, "action_space", Box(-np.inf, np.inf, (12,))), "differ .* and are not finite"),
+        (lambda model: setattr(model, "_env", SubprocVecEnv()), "SubprocVecEnv may change observations or actions"),
     ],
 )
 def test_what_cannot_be_exported_is_said(change: Callable[[Any], Any], said: str, tmp_path: Path) -> None:
@@ -265,6 +284,53 @@ def test_what_cannot_be_exported_is_said(change: Callable[[Any], Any], said: str
     change(model)
     with pytest.raises(PolicyExportError, match=said):
         export_policy(model, Walk, tmp_path / "walk.onnx")
+
+
+def test_wrappers_are_exported_or_refused_by_name(tmp_path: Path) -> None:
+    """Around a batch, or around each environment that Stable-Baselines3 steps."""
+    path = tmp_path / "reach.onnx"
+    batch = URLabBatchEnv(Reach.scene_address, 1, task=Reach(), autoreset_mode=AutoresetMode.SAME_STEP)
+    single = URLabEnv.connect(Reach.scene_address, task=Reach())
+
+    def refused(envs: Any, said: str) -> None:
+        with pytest.raises(PolicyExportError, match=said):
+            export_policy(Model(22, ARM, env=envs), Reach, path)
+        assert not path.exists()
+
+    refused(vector.TransformAction(batch, np.negative), "^TransformAction may change")
+    seen_space: Any = single.observation_space
+    refused(DummyVecEnv(TransformObservation(single, np.negative, seen_space)), "^TransformObservation may change")
+    refused(DummyVecEnv(OrderEnforcing(Louder(single))), "^Louder may change observations or actions .* not exported")
+    refused(DummyVecEnv(RepeatAction(single, 2)), "^RepeatAction may change")
+    refused(DummyVecEnv(DiscretizeAction(single, 3)), "^DiscretizeAction may change")
+    normalised = NormalizeObservation(TimeLimit(single, 10))
+    refused(DummyVecEnv(normalised, normalised), "^The 2 environments in DummyVecEnv normalise .* in its own way")
+
+    one: Any = np.float32(1.0)
+    rescaled: Any = vector.RescaleAction(batch, -one, one)
+    seen = 3.0 * np.random.default_rng(1).normal(size=22)
+    wrapped: list[tuple[Any, Any, Callable[[Any], Any]]] = [
+        (vector.ClipAction(vector.RecordEpisodeStatistics(rescaled)), rescaled.single_action_space, rescaled.actions),
+        (DummyVecEnv(ClipAction(TransformReward(single, float))), single.action_space, np.copy),
+    ]
+    for envs, limits, inner in wrapped:
+        model = Model(22, Box(-np.inf, np.inf, (7,)), env=envs)
+        export_policy(model, Reach, path)
+        chosen = model.predict(seen[None], deterministic=True)[0]
+        clipped = np.clip(chosen, limits.low, limits.high)
+        assert not np.array_equal(clipped, chosen)
+        np.testing.assert_allclose(OnnxNetwork(path)(seen), inner(clipped)[0], atol=1e-4)
+    normalised.update_running_mean = True
+    normalised.reset(seed=1)
+    for _ in range(5):
+        normalised.step(np.zeros(7, np.float32))
+    model = Model(22, single.action_space, env=DummyVecEnv(normalised))
+    export_policy(model, Reach, path)
+    normalised.update_running_mean = False
+    expected = model.predict(normalised.observation(seen)[None], deterministic=True)[0][0]
+    np.testing.assert_allclose(OnnxNetwork(path)(seen), expected, atol=1e-4)
+    single.close()
+    batch.close()
 
 
 class Further(Follow):

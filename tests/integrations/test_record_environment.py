@@ -222,6 +222,9 @@ def test_record_runs_episodes_of_a_task(tmp_path: Path, capsys: pytest.CaptureFi
     assert np.array_equal(target, expected_target(4))
     assert run(*command, "--overwrite", "--keyframe", "home") == 2
     assert "--keyframe cannot be combined with --task" in capsys.readouterr().err
+    assert run(*command, "--overwrite", "--step-mode", "live") == 2
+    assert "--step-mode live cannot be combined with --task" in capsys.readouterr().err
+    assert run(*command, "--overwrite", "--step-mode", "direct") == 0
     assert run("record", "sim://arm", tmp_path / "live.mcap", "--keyframe", "home") == 2
     assert "--keyframe resets the simulation, which needs --step-mode direct" in capsys.readouterr().err
     assert run(*command[:2], "--overwrite", "--task=urlab/Rech-v0") == 2

@@ -315,9 +315,23 @@ def test_an_outcome_needs_a_recording(http: TestClient) -> None:
     assert "no recording runs" in refusal(http.delete("/api/recording"))
 
 
+def test_an_unknown_field_of_a_request_is_refused_by_name(http: TestClient) -> None:
+    for path, sent, unknown in (
+        ("/api/replay", {"name": "own.mcap", "pace": 2}, "pace"),
+        ("/api/recording", {"camera": False}, "camera"),
+        ("/api/step", {"steps": 3}, "steps"),
+        ("/api/run", {"running": False, "speed": 3}, "speed"),
+    ):
+        assert f"unknown field `{unknown}`" in refusal(http.post(path, json=sent))
+    status = http.get("/api/status").json()
+    assert (status["replay"], status["recording"]) == (None, None)
+
+
 def test_without_play_there_is_nothing_to_record(http: TestClient) -> None:
     http.post("/api/ops/stop_pie", json={})
-    refused = http.post("/api/recording", json={}).json()["error"]
+    answer = http.post("/api/recording", json={})
+    refused = answer.json()["error"]
+    assert (answer.status_code, refused["code"]) == (409, "refused")
     assert (refused["message"], refused["hint"]) == ("There is nothing to record.", "Begin play first.")
     assert http.post("/api/ops/begin_pie", json={}).json()["state"] == "ready"
 

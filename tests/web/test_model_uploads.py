@@ -198,7 +198,7 @@ def test_what_a_viewer_sends_may_be_so_large_and_no_larger(http: TestClient, mon
     monkeypatch.setattr(recordings, "_LARGEST_FILE", len(robot))
     assert http.put("/api/models/ball.xml", content=BALL).status_code == 200
     assert f"at most {len(BALL)} bytes" in refusal(http.put("/api/models/ball.xml", content=BALL + " "))
-    assert "at most" not in refusal(http.put("/api/recordings/run.json", content=robot), 502)
+    assert "at most" not in refusal(http.put("/api/recordings/run.json", content=robot), 409)
     assert f"at most {len(robot)} bytes" in refusal(http.put("/api/recordings/run.json", content=robot + b" "))
 
 

@@ -481,7 +481,7 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         taken = http.put("/api/recordings/other.mcap", content=file.read_bytes())
         assert taken.json()["seconds"] == made["seconds"]
         assert http.put("/api/recordings/other.mcap", content=b"").status_code == 400, "the name is taken"
-        assert http.put("/api/recordings/broken.mcap", content=b"nonsense").status_code == 502
+        assert http.put("/api/recordings/broken.mcap", content=b"nonsense").status_code == 409
         assert {one["name"] for one in http.get("/api/recordings").json()["recordings"]} == {name, "other.mcap"}
         for one in (name, "other.mcap"):
             assert http.delete(f"/api/recordings/{one}").status_code == 200
@@ -506,7 +506,7 @@ def test_a_recording_of_wrong_contents_costs_its_reader_an_explanation(http: Tes
         ([good[0], good[1], bomb], "unpacks to 157"),
     ):
         refused = put(content)
-        assert refused.status_code == 502
+        assert refused.status_code == 409
         assert said in refused.json()["error"]["message"]
     try:
         assert put([good[0], middle, good[2]]).status_code == 200
@@ -516,7 +516,7 @@ def test_a_recording_of_wrong_contents_costs_its_reader_an_explanation(http: Tes
             http.get("/api/replay/states?seconds=1"),
             http.get("/api/recordings/odd.mcap?as=csv"),
         ):
-            assert (tried.status_code, "message 2 of /state/arm" in tried.json()["error"]["message"]) == (502, True)
+            assert (tried.status_code, "message 2 of /state/arm" in tried.json()["error"]["message"]) == (409, True)
         assert http.post("/api/replay", json={"time": 0.02}).json()["time"] == 0.02
     finally:
         http.delete("/api/replay")

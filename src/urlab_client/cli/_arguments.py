@@ -231,7 +231,7 @@ RECORD = f"""
 --overwrite  with --record: replace FILE if it exists
 """
 DIALECT = "--dialect alpha|beta=alpha  plugin generation to simulate: alpha (June 2026) or beta (August 2026)"
-STEP_MODE = "--step-mode live|direct=live  whether physics runs by itself, or this command steps it"
+STEP_MODE = "--step-mode live|direct{}  whether physics runs by itself, or this command steps it{}"
 RECORDING = "RECORDING  a .mcap file, or a server's .json recording"
 POLICY = """
 POLICY  the network, a .onnx file, or the .toml file beside it

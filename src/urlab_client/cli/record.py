@@ -39,9 +39,9 @@ _ROUNDING_S = 1e-9
 USAGE = f"""
 {address_usage("ADDRESS?", "a simulated server for --task, else tcp://localhost")}
 OUTPUT  the file to write, a .mcap file
-{TASK}
+{TASK.format("")}
 --seed SEED=0  with --task: seed of the episodes
-{STEP_MODE}
+{STEP_MODE.format("", " (default: live; direct with --task)")}
 --seconds S=10  simulated seconds
 --keyframe NAME  keyframe to start from, in direct mode
 {CAMERA.format("a camera to record")}
@@ -63,6 +63,8 @@ def run(arguments: Namespace) -> int:
     import_mujoco()
     if arguments.keyframe is not None and arguments.task is not None:
         raise CommandError("--keyframe cannot be combined with --task, which determines the start")
+    if arguments.task is not None and arguments.step_mode == StepMode.LIVE:
+        raise CommandError("--step-mode live cannot be combined with --task, whose episodes this command steps")
     if arguments.keyframe is not None and arguments.step_mode != StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     if arguments.task is None:
@@ -116,7 +118,7 @@ def _record_task(arguments: Namespace) -> Recorder:
 async def _record(arguments: Namespace) -> AsyncRecorder:
     from urlab_client.integrations.record import record
 
-    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
+    client = make_client(aio.URLabClient, arguments.address, arguments, step_mode=arguments.step_mode or StepMode.LIVE)
     async with client:
         with announced_wait(client):
             await client.discover()

@@ -49,7 +49,7 @@ USAGE = f"""
 --connect VIEWER  with --rerun: send to a viewer, rerun+http://HOST:9876/proxy
 --page  with --rerun: serve Rerun's page for browsers; Rerun serves it on every interface, to anyone
 --port PORT  port for --web, --foxglove or --page
-{STEP_MODE}
+{STEP_MODE.format("=live", "")}
 --seconds S  simulated seconds (default: until Ctrl-C)
 {CAMERA.format("a camera to show in Rerun or Foxglove")}
 {CAMERA_HZ.format(10)}

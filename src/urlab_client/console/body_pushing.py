@@ -47,7 +47,7 @@ class BodyList(Struct):
     radius: float
 
 
-class Pick(Struct):
+class Pick(Struct, forbid_unknown_fields=True):
     """A ray, metres in the world frame."""
 
     origin: Vector
@@ -62,7 +62,7 @@ class Picked(Struct):
     point: list[float]
 
 
-class Push(Struct):
+class Push(Struct, forbid_unknown_fields=True):
     """Pull a point of a body, given in its frame, towards a place in the world; metres."""
 
     body: int

@@ -21,7 +21,14 @@ from starlette.routing import Route
 from urlab_client.console.lease import NotDriving, Viewer
 from urlab_client.console.messages import encode
 from urlab_client.console.session import ConsoleSession
-from urlab_client.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabRPCError, URLabTimeoutError
+from urlab_client.errors import (
+    OutcomeUnknown,
+    ProtocolError,
+    URLabConnectionError,
+    URLabError,
+    URLabRPCError,
+    URLabTimeoutError,
+)
 from urlab_client.web.access import Access
 
 if TYPE_CHECKING:
@@ -214,8 +221,10 @@ def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:
             status, code = 502, "outcome_unknown"
         case URLabConnectionError():
             status, code = 503, "unreachable"
-        case URLabError():
+        case ProtocolError():
             status, code = 502, "failed"
+        case URLabError():
+            status, code = 409, "refused"
         case OSError():
             status, code = 500, "io_failed"
         case _:

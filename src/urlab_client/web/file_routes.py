@@ -22,7 +22,7 @@ from urlab_client.web.endpoints import BYTES, JOB, Call, endpoint, json_response
 _T = TypeVar("_T")
 
 
-class RecordRequest(Struct):
+class RecordRequest(Struct, forbid_unknown_fields=True):
     """Whether to record pictures of the cameras, too."""
 
     cameras: bool = True
@@ -31,13 +31,13 @@ class RecordRequest(Struct):
 _WITH_CAMERAS = RecordRequest()
 
 
-class OutcomeRequest(Struct):
+class OutcomeRequest(Struct, forbid_unknown_fields=True):
     """The outcome of the episode."""
 
     outcome: EpisodeOutcome
 
 
-class ReplayRequest(Struct):
+class ReplayRequest(Struct, forbid_unknown_fields=True):
     """A recording to replay, or where to seek and how fast to go on, seconds; null leaves a value as it is.
 
     `placing` also places the simulation's robots.

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 _FLOWING_S = 5.0
 
 
-class RunRequest(Struct):
+class RunRequest(Struct, forbid_unknown_fields=True):
     """Whether physics is to run."""
 
     running: bool
 
 
-class StepRequest(Struct):
+class StepRequest(Struct, forbid_unknown_fields=True):
     """A number of physics steps."""
 
     n_steps: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
@@ -44,7 +44,7 @@ class StepRequest(Struct):
 _ONE_STEP = StepRequest()
 
 
-class LoginRequest(Struct):
+class LoginRequest(Struct, forbid_unknown_fields=True):
     """A token, which is good for one use."""
 
     token: str

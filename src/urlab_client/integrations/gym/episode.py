@@ -112,9 +112,7 @@ class EnvEpisode:
         return data.qpos, data.qvel, data.time
 
     def measured(self) -> dict[str, Floats]:
-        """Return `sensordata`, `ctrl` and `act` of the whole scene if the task asks for them; see `States.measured`."""
-        if not self.measures:
-            return {}
+        """Return `sensordata`, `ctrl` and `act` of the whole scene; see `States.measured`."""
         data, model = require_local(self.client.data, "The state of the scene"), self.model
         sensordata = np.zeros(model.nsensordata)
         for key in self.mapping.keys:

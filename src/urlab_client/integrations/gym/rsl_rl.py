@@ -6,11 +6,11 @@ import importlib
 from typing import Any, cast
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from urlab_client._installation import need
-from urlab_client.integrations.gym.vectorized import Vectorized
+from urlab_client.integrations.gym.vectorized import Vectorized, need_same_step
 
 Tensor = Any
 
@@ -43,12 +43,8 @@ class RslRlVecEnv:
             MissingExtra: The extra `rsl-rl` is not installed.
         """
         need("torch", "tensordict", extra="rsl-rl")
-        base, mode = cast("Vectorized", env.unwrapped), env.metadata.get("autoreset_mode")
-        if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(
-                "RSL-RL resets in the step that ends an episode: make the environment with "
-                f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
-            )
+        need_same_step(env, "RSL-RL")
+        base = cast("Vectorized", env.unwrapped)
         if base.mapping.mode == "dict" or base.max_episode_steps is None:
             raise ValueError("RSL-RL needs flat spaces (space_mode='flat') and max_episode_steps")
         self._torch: Any = importlib.import_module("torch")

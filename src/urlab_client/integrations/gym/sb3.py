@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from urlab_client._installation import need
 from urlab_client.integrations.gym.spaces import Observation
-from urlab_client.integrations.gym.vectorized import info_of
+from urlab_client.integrations.gym.vectorized import info_of, need_same_step
 
 need("stable_baselines3", extra="sb3")
 
@@ -49,12 +49,7 @@ class Sb3VecEnv(_VecEnv):
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        mode = env.metadata.get("autoreset_mode")
-        if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(
-                "Stable-Baselines3 resets in the step that ends an episode: make the environment with "
-                f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
-            )
+        need_same_step(env, "Stable-Baselines3")
         self.env: Any = env
         self._actions: Any = None
         super().__init__(env.num_envs, self.env.single_observation_space, self.env.single_action_space)

@@ -70,6 +70,7 @@ class TaskScene:
         self.model = model
         self.mapping = mapping
         self.data: mujoco.MjData = mujoco.MjData(model)
+        self._ids: dict[tuple[str, str], int] = {}  # tasks ask in each step
 
     def id(self, kind: str, name: str) -> int:
         """Return the id of a `body`, `site`, `geom` or `joint`.
@@ -77,7 +78,10 @@ class TaskScene:
         Raises:
             KeyError: The scene has no such element.
         """
-        return self.mapping.id(kind, name)
+        found = self._ids.get((kind, name))
+        if found is None:
+            found = self._ids[kind, name] = self.mapping.id(kind, name)
+        return found
 
     def geoms(self, name: str) -> NDArray[np.intp]:
         """Return the ids of the geoms of a body, without those of its children, or the id of one geom.
@@ -405,7 +409,7 @@ class Memory:
     def updated(self, rows: NDArray[np.intp], actions: Floats, now: Now) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
         last, previous = self._actions
-        previous[rows] = taken(last, rows)
+        previous[rows] = last[rows]
         last[rows] = actions
         states = self.states(rows, now)
         if self._kept:
@@ -418,8 +422,8 @@ class Memory:
 
     def states(self, rows: NDArray[np.intp], now: Now) -> States:
         """Return the states of some environments, in the form that is passed to the task."""
-        last, previous = (taken(actions, rows) for actions in self._actions)
-        memory = {name: taken(values, rows) for name, values in self._kept.items()}
+        last, previous = taken(rows, *self._actions)
+        memory = dict(zip(self._kept, taken(rows, *self._kept.values()), strict=True))
         _set_writeable(memory, False)  # a write would be lost, except in `update`
         return States(
             self._scene,
@@ -435,9 +439,9 @@ class Memory:
         )
 
 
-def taken(values: Floats, rows: NDArray[np.intp]) -> Floats:
-    """Return a copy of different rows; copying all of them takes a third of the time that indexing takes."""
-    return values.copy() if len(rows) == len(values) else values[rows]
+def taken(rows: NDArray[np.intp], *arrays: Floats) -> list[Floats]:
+    """Return copies of different rows of arrays; copying all of them takes a third of the time that indexing takes."""
+    return [values.copy() if len(rows) == len(values) else values[rows] for values in arrays]
 
 
 def _set_writeable(arrays: Mapping[str, Floats], writeable: bool) -> None:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,6 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_option
 from urlab_client.errors import ClientClosed, URLabError, refused_for_good
 from urlab_client.integrations._feed.follower import Follower
-from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.episode import MEASURED, EnvEpisode
 from urlab_client.integrations.gym.settings import EpisodeOptions, EpisodeSettings, client_defaults, served_address
 from urlab_client.integrations.gym.vectorized import Applied, Floats, Indices, Vectorized, put
@@ -62,18 +61,19 @@ class OverWire(Vectorized):
         self._clients[i] = episode.client
         put(self._fields, i, observation)
         self._qpos[i], self._qvel[i], self._time[i] = episode.state()
-        for name, values in episode.measured().items():
-            self._measured[name][i] = values
+        if episode.measures:
+            for name, values in episode.measured().items():
+                self._measured[name][i] = values
         self._step_count[i] = episode.step_count
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         return self._qpos, self._qvel, self._time
 
-    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
+    def _note(self, indices: Indices, errors: Mapping[int, Exception], *told: NDArray[Any]) -> None:
         for i in indices.tolist():
-            for observer in self._clients[i].observers:
+            for observer in self._clients[i].observers if i not in errors else ():
                 if isinstance(observer, Follower) and observer.note is not None:
-                    observer.note(told(i))
+                    observer.note(self._transition(i, *told))
 
 
 @dataclass(eq=False)

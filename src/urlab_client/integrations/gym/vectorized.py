@@ -220,21 +220,21 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             truncated[list(errors)] = True
         ended = terminated | truncated
         self._totals += rewards
-        self._note(
-            acting if not errors else np.setdiff1d(acting, [*errors]),
-            lambda i: self._transition(i, flat, rewards, terminated, truncated),
-        )
-        news = ended & ~self._ended  # those that failed are marked already
-        if self.task is not None and news.any():
-            self._tell_ends(self.task, news, terminated, infos)
+        self._note(acting, errors, flat, rewards, terminated, truncated)
+        over = ended.any()
+        if over and self.task is not None:
+            self._tell_ends(self.task, ended & ~self._ended, terminated, infos)  # those that failed are marked already
         # Without autoreset, an environment may be stepped after the end of its episode.
         self._ended = ended | self._ended if self.autoreset_mode is AutoresetMode.DISABLED else ended
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+        if over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = self._same_step_reset(errors, infos)
         return self._shown(), rewards, terminated, truncated, infos
 
-    def _note(self, indices: Indices, told: Callable[[int], Transition]) -> None:
-        """Tell who records some environments what led to their states. Nobody records a batch, which has no client."""
+    def _note(self, indices: Indices, errors: Mapping[int, Exception], *told: NDArray[Any]) -> None:
+        """Tell who records environments, if they did not fail, what led to their states; see `_transition`.
+
+        Nobody records a batch, which has no client.
+        """
 
     def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
         """Return the start of an environment's episode, or its action with reward, termination and truncation."""
@@ -295,7 +295,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 put(self._sensed, i, disturbances.seen(of_one(self._observations, i)))
         if len(fresh):
             self.elapsed[fresh], self._totals[fresh], self._ended[fresh] = 0, 0.0, False
-            self._note(fresh if not errors else np.setdiff1d(fresh, [*errors]), self._transition)
+            self._note(fresh, errors)
         if errors:
             self._ended[list(errors)] = True
         return errors
@@ -323,9 +323,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return self._recent
 
     def _now(self, indices: Indices) -> Now:
-        measured = {name: taken(values, indices) for name, values in self._measured.items()}
-        qpos, qvel, time = self._state()
-        return Now(taken(qpos, indices), taken(qvel, indices), taken(time, indices), measured)
+        qpos, qvel, time = taken(indices, *self._state())
+        return Now(qpos, qvel, time, dict(zip(self._measured, taken(indices, *self._measured.values()), strict=True)))
 
     def _judged(
         self, before: Observation, actions: Any, errors: Mapping[int, Exception], infos: dict[str, Any]
@@ -418,6 +417,16 @@ def put(observations: Observation, indices: Indices | int, found: Observation) -
 def of_one(observations: Observation, i: int = 0) -> Observation:
     """Return the observation or action of one environment among those of all, as views."""
     return mapped(lambda array: array[i], observations)
+
+
+def need_same_step(env: VectorEnv[Any, Any, Any], library: str) -> None:
+    """Refuse an environment that does not reset in the step that ends an episode, as a library does."""
+    mode = env.metadata.get("autoreset_mode")
+    if mode is not AutoresetMode.SAME_STEP:
+        raise ValueError(
+            f"{library} resets in the step that ends an episode: make the environment with "
+            f"autoreset_mode=AutoresetMode.SAME_STEP, not {getattr(mode, 'name', mode)}"
+        )
 
 
 def info_of(infos: Mapping[str, Any], i: int = 0) -> dict[str, Any]:

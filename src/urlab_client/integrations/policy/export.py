@@ -78,6 +78,15 @@ _NOTHING: Final = (
 )
 """Modules that do not change a flat observation. What else they may do, the check of the network notices."""
 
+_EXPORTED: Final = ("ClipAction", "NormalizeObservation", "RescaleAction", "VecFrameStack", "VecNormalize")
+_HARMLESS: Final = (
+    *("Autoreset", "DummyVecEnv", "FlattenObservation", "HumanRendering", "Monitor", "NormalizeReward"),
+    *("OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo", "RenderCollection"),
+    *("RewardWrapper", "RslRlVecEnv", "Sb3VecEnv", "SyncVectorEnv", "TimeLimit", "VecCheckNan", "VecMonitor"),
+    *("VecVideoRecorder", "VectorRewardWrapper"),
+)
+"""Wrappers that leave flat observations, and actions, as they are."""
+
 
 class PolicyExportError(URLabError, ValueError):
     """A model cannot be exported, or its files give other numbers. The message says which, where and by how much."""
@@ -108,8 +117,10 @@ def export_policy(
         path: The ONNX file.
         terms: What `Task.observe` returns, as terms of the declaration. Without them, the declaration describes the
             observations only of a task whose `observe` returns nothing.
-        env: The training's environments, whose wrappers hold the normalisation; those of the model by default. If the
-            bounds of the model's actions differ from the task's, they mean the same, as with `RescaleAction`.
+        env: The training's environments, whose wrappers hold the normalisation; those of the model by default. Of
+            wrappers that change observations or actions, these are exported: Gymnasium's `NormalizeObservation`,
+            `RescaleAction` and `ClipAction`, and Stable-Baselines3's `VecNormalize` and `VecFrameStack`. If the bounds
+            of the model's actions differ from the task's, they mean the same, as with `RescaleAction`.
         tolerance: Largest accepted difference, relative to 1 plus the size of the number.
 
     Returns:
@@ -280,17 +291,17 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], 
         The layers of its network, from observations of the task to actions of the task; the model's own actions, shape
         (n, n_actions), for inputs, shape (n, n_inputs); and the number of observations in an input.
     """
-    if hasattr(model, "policy") and hasattr(model, "predict"):
-        given, (layers, answer) = model.get_env(), _stable_baselines(model)
-    else:
-        given, module = None, model
-        if hasattr(model, "alg"):  # a runner of RSL-RL
-            given, module = model.env, model.alg.get_policy().as_jit()
-        layers, answer = [*_layers([module])], _inferred(module)
+    of_library = hasattr(model, "policy") and hasattr(model, "predict")
+    given = model.get_env() if of_library else getattr(model, "env", None)
     wrappers = [*_wrappers(given if env is None else env)]
-    spaces = (getattr(each, "single_action_space", None) for each in wrappers)
-    ours = _bounds(space)
-    theirs = _bounds(getattr(model, "action_space", None) or next(filter(None, spaces), space))
+    if of_library:
+        layers, answer = _stable_baselines(model)
+    else:  # a runner of RSL-RL, or a module
+        module = model.alg.get_policy().as_jit() if hasattr(model, "alg") else model
+        layers, answer = [*_layers([module])], _inferred(module)
+    clipped = [each.env for each in wrappers if type(each).__name__ == "ClipAction"]
+    spaces = [_action_space(each) for each in (clipped or [model, *wrappers])]
+    ours, theirs = _bounds(space), _bounds(next((each for each in spaces if each is not None), space))
     history = next((each.stacked_obs.n_stack for each in wrappers if type(each).__name__ == "VecFrameStack"), 1)
     n_inputs = size * history
     wide = next((len(arrays[0].T) for operator, arrays, _ in layers if operator == "Gemm"), n_inputs)
@@ -310,8 +321,6 @@ def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], 
             deviation = np.sqrt(variance + wrapper.epsilon)
             normalised.append((mean, deviation, limit))
             before += [("Sub", [mean], {}), ("Div", [deviation], {}), *_clipped(-limit, limit)]
-        elif _is_a("VectorObservationWrapper", wrapper):
-            raise PolicyExportError(f"The wrapper {type(wrapper).__name__} changes observations, and is not exported.")
     factor, offset = np.ones(len(ours.T)), np.zeros(len(ours.T))
     if not np.array_equal(ours, theirs):
         if not np.isfinite([ours, theirs]).all():
@@ -337,11 +346,32 @@ def _clipped(low: Floats | float, high: Floats | float) -> list[Layer]:
     return [("Max", [low], {}), ("Min", [high], {})]
 
 
+def _action_space(env: Any) -> Any:
+    """Return the space of one environment's actions, or None."""
+    return getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
+
+
 def _wrappers(env: Any) -> Iterator[Any]:
-    """Yield environments from the outermost wrapper inwards."""
+    """Yield environments from the outermost wrapper inwards; refuse those that may change more than is exported."""
+    from urlab_client.integrations.gym import URLabEnv
+    from urlab_client.integrations.gym.vectorized import Vectorized
+
     while env is not None:
         yield env
-        env = getattr(env, "venv", None) or getattr(env, "env", None)
+        if isinstance(env, (URLabEnv, Vectorized)):
+            return
+        if not any(_is_a(name, env) for name in (*_EXPORTED, *_HARMLESS)):
+            raise PolicyExportError(
+                f"{type(env).__name__} may change observations or actions in a way that is not exported.",
+                hint="If it does not, pass as `env` the environment inside it, or one like those of the training.",
+            )
+        each = getattr(env, "envs", ())
+        if len(each) > 1 and any(_own(inner, "obs_rms") is not None for inner in _wrappers(each[0])):
+            raise PolicyExportError(
+                f"The {len(each)} environments in {type(env).__name__} normalise observations each in its own way.",
+                hint="Train with one normalisation around all of them, such as VecNormalize.",
+            )
+        env = getattr(env, "venv", None) or getattr(env, "env", None) or next(iter(each), None)
 
 
 def _own(thing: object, name: str, otherwise: Any = None) -> Any:

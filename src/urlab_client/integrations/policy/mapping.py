@@ -53,6 +53,11 @@ class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session. The message names what was found, what is required and a fix."""
 
 
+_EYE: Final = np.eye(3)
+_CROSS: Final = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]), [[0, 3, 2], [3, 0, 1], [2, 1, 0]]
+"""Signs and components of a quaternion (w, x, y, z) in the matrix of the cross product with (x, y, z)."""
+
+
 class RobotState(NamedTuple):
     """The state of one robot or of a batch.
 
@@ -92,13 +97,9 @@ class RobotState(NamedTuple):
 
     def _rotation(self) -> Floats:
         """Return the rotation from the base frame to the world frame, shape (…, 3, 3)."""
-        w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        quat = self.qpos[..., 3:7]
+        cross = _CROSS[0] * quat[..., _CROSS[1]]
+        return _EYE + 2 * (quat[..., :1, None] * cross + cross @ cross)
 
 
 class _Moment(NamedTuple):

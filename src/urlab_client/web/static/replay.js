@@ -13,10 +13,15 @@ const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
 const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
   PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
 const placing = h("button", { class: "quiet", id: "placing", title: "Also place the simulation's robots: its cameras follow, and its mode is puppet meanwhile",
-  onclick: () => ask("POST", "api/replay", { ...replay, placing: !replay.placing }) }, "Also move the simulation");
+  onclick: togglePlacing }, "Also move the simulation");
 let replay = null;
 let wanted = null;
 let seeking = false;
+
+function togglePlacing() {
+  const { name, placing, time, playing, rate } = replay;
+  return ask("POST", "api/replay", { name, placing: !placing, time, playing, rate });
+}
 
 export function toggleReplay() {
   return ask("POST", "api/replay", { playing: !replay?.playing });
