@@ -308,6 +308,21 @@ def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(
     assert abs(ends[0][8]) > 0.05
 
 
+def test_a_robot_is_bound_once_and_held_only_after_an_action(
+    quadruped: URLabClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, robot = policy_of(walk()), quadruped.articulations["quadruped"]
+    with pytest.raises(PolicyMismatch, match=r"'quadruped' has had no action yet.*Call act"):
+        policy.hold(robot)
+    bound: list[Any] = []
+    bind = policy.bind
+    monkeypatch.setattr(policy, "bind", lambda robot: bound.append(robot) or bind(robot))
+    for _ in range(3):
+        policy.act(robot)
+    assert bound == [robot]
+    assert repr(policy).endswith("for 'quadruped'>")
+
+
 def test_position_servos_take_targets_as_they_are(arm: URLabClient) -> None:
     heights: list[float] = []
 
