@@ -120,6 +120,7 @@ def arm(serving: Callable[..., str]) -> Iterator[URLabClient]:
         ("[1.5, 2.5]", "[1.0, 2.0, 3.0]", "gains.kv has 3 numbers; it takes one, or one for each of the action's 2"),
         ("[0.5, 0.25]", "[0.5]", "action: scale has 1 numbers"),
         ("[0.5, 0.25]", "nan", "action: scale contains NaN"),
+        ("[0.5, 0.25]", "[]", "action: scale is empty"),
         ("decimation = 10", "decimation = 10.5", "decimation: Expected `int`, got `float`"),
         ("decimation = 10", "decimation = 0", "decimation: Expected `int` >= 1"),
         ('"direct", "live"', '"puppet"', "step_modes can contain 'direct' and 'live', not 'puppet'"),

@@ -131,6 +131,11 @@ async def test_bad_velocities_and_names_are_refused(client: URLabClient) -> None
     assert client.articulations["arm"].get_ctrl() == set_points
     with pytest.raises(KeyError, match="no site 'hand'"):
         HandControl(client, "arm", site="hand")
+    for limit in ({"episodes": 0}, {"seconds": -1.5}, {"seconds": math.nan}):
+        ((name, value),) = limit.items()
+        with pytest.raises(ValueError, match=f"{name} must be above 0 or None, not {value:g}"):
+            await teleoperate(client, towards, **limit)
+    assert repr(hand) == "<HandControl of 'grip' of 'arm'>"
     with pytest.raises(ValueError, match="hz must be above 0 and at most"):
         await teleoperate(client, towards, hz=5000.0)
 
