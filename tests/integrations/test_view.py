@@ -438,6 +438,8 @@ def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path:
         port = int(view.address.rpartition(":")[2])
         with pytest.raises(urlab_client.URLabError, match=str(port)), foxglove_view(client, port=port):
             pass
+    with pytest.raises(urlab_client.URLabError, match="A view opens once"), view:
+        pass
 
 
 # Foxglove
