@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
@@ -53,6 +54,13 @@ def struct_fields(cls: type[msgspec.Struct]) -> tuple[msgspec.structs.FieldInfo,
 def defaults(module: ModuleType) -> Iterator[tuple[str, Any, Any]]:
     """Where a module declares a default, its annotation, and the default."""
     functions = [value for value in vars(module).values() if getattr(value, "__module__", "") == module.__name__]
+    for name, annotation in vars(module).get("__annotations__", {}).items():
+        if name in vars(module):
+            yield name, annotation, vars(module)[name]
+    for cls in classes(module):
+        for name, annotation in vars(cls).get("__annotations__", {}).items():
+            if name in vars(cls) and (shared := re.fullmatch(r"ClassVar\[(.*)\]", str(annotation))):
+                yield f"{cls.__name__}.{name}", shared[1], vars(cls)[name]
     for cls in classes(module):
         if issubclass(cls, msgspec.Struct):
             for field in struct_fields(cls):
@@ -94,6 +102,14 @@ def test_every_default_is_a_value_of_its_own_type(package: str) -> None:
     assert wrong == []
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_constant_has_a_value(package: str) -> None:
+    found = [
+        (module.__name__, name) for module in modules(package) for name, value in vars(module).items() if value is None
+    ]
+    assert [where for where in found if where[1].isupper()] == []
+
+
 @pytest.mark.parametrize("name", GROWING)
 def test_what_gains_fields_is_made_by_their_names(name: str) -> None:
     """A field that is added anywhere changes no caller."""
@@ -104,10 +120,23 @@ def test_what_gains_fields_is_made_by_their_names(name: str) -> None:
             assert kinds <= {inspect.Parameter.KEYWORD_ONLY}, module.__name__
 
 
-def test_values_that_are_handed_out_cannot_be_changed() -> None:
-    found = [cls for module in modules("values") for cls in classes(module) if issubclass(cls, msgspec.Struct)]
-    changeable = {cls.__name__ for cls in found if not cls.__struct_config__.frozen}
-    assert changeable == {"PIEStartResult", "SimOptions", "URLabAsset"}
+@pytest.mark.parametrize(
+    ("package", "changeable"),
+    [
+        ("values", "PIEStartResult SimOptions URLabAsset"),
+        ("randomise", ""),
+        ("simulation", "Past"),
+        ("integrations", "ArticulationMessage EntityMessage PolicyRun SampleClock SceneLayout"),
+        ("server", "AnyTwist LoadLevelByName RotatedBox ServerCore Snapshots Twist Uploads"),
+    ],
+)
+def test_values_that_are_handed_out_cannot_be_changed(package: str, changeable: str) -> None:
+    def frozen(cls: type[Any]) -> bool:
+        told: Any = getattr(cls, "__struct_config__", None) or getattr(cls, "__dataclass_params__", None)
+        return told is None or told.frozen
+
+    found = {cls.__name__ for module in modules(package) for cls in classes(module) if not frozen(cls)}
+    assert {name for name in found if not name.startswith("_")} == {*changeable.split()}
 
 
 def test_an_order_of_the_browser_that_says_nothing_asks_for_nothing() -> None:

@@ -160,7 +160,7 @@ def test_why_a_name_cannot_be_loaded_is_said(tmp_path: Path) -> None:
         text=True,
         timeout=60,
         check=False,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},
     )
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("ImportError: cannot load urlab_client.server.simulated: ")

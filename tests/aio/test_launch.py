@@ -129,7 +129,7 @@ async def test_a_model_that_is_not_there() -> None:
 
 async def test_a_program_that_says_something_else_is_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "sitecustomize.py").write_text("print('{\"x\": ' + '[' * 50_000)")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     async with URLabClient("sim://arm") as client:
         with pytest.raises(ServerUnreachable, match="its first line is not a server's"):
             await client.discover()

@@ -16,6 +16,7 @@ from urlab_client.cli import main
 from urlab_client.errors import URLabError
 from urlab_client.integrations.gym import PushPictures, Reach, URLabBatchEnv, URLabEnv, URLabVectorEnv
 from urlab_client.integrations.policy import OnnxDictNetwork, PolicyFileError, bootstrap_mean, evaluate_in, wilson
+from urlab_client.integrations.policy.evaluation import Evaluation, Outcome, episode_seeds
 from urlab_client.randomise import Noise, Randomisation, Vary
 from urlab_client.server import SimulatedServer
 
@@ -42,6 +43,19 @@ def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
     assert found.high - found.low == pytest.approx(2 * 1.96 * np.std(values) / 20, rel=0.05)
     assert bootstrap_mean(values) == found
     assert bootstrap_mean([3.0]) == bootstrap_mean([3.0, 3.0])
+
+
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    episode = Outcome(seed=1, total=2.0, actions=3, success=None)
+    with pytest.raises(ValueError, match="no episodes to evaluate"):
+        Evaluation.of([], 0.95)
+    for confidence in (0.0, 1.0):
+        with pytest.raises(ValueError, match=f"confidence must be between 0 and 1, not {confidence}"):
+            Evaluation.of([episode], confidence)
+    for seed, episodes in ((0, 0), (-1, 1)):
+        with pytest.raises(ValueError, match=f"at least 1 and the seed at least 0, not {episodes} and {seed}"):
+            episode_seeds(seed, episodes)
+    assert episode_seeds(0, 2)[:1] == episode_seeds(0, 1)
 
 
 def test_outcomes_are_those_of_single_episodes_whatever_the_batch() -> None:

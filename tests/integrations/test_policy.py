@@ -120,6 +120,7 @@ def arm(serving: Callable[..., str]) -> Iterator[URLabClient]:
         ("[1.5, 2.5]", "[1.0, 2.0, 3.0]", "gains.kv has 3 numbers; it takes one, or one for each of the action's 2"),
         ("[0.5, 0.25]", "[0.5]", "action: scale has 1 numbers"),
         ("[0.5, 0.25]", "nan", "action: scale contains NaN"),
+        ("[0.5, 0.25]", "[]", "action: scale is empty"),
         ("decimation = 10", "decimation = 10.5", "decimation: Expected `int`, got `float`"),
         ("decimation = 10", "decimation = 0", "decimation: Expected `int` >= 1"),
         ('"direct", "live"', '"puppet"', "step_modes can contain 'direct' and 'live', not 'puppet'"),
@@ -306,6 +307,21 @@ def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(
     quadruped.articulations["quadruped"].controller.set_defaults(kp=100, kv=5)
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)  # the server computes in single precision
     assert abs(ends[0][8]) > 0.05
+
+
+def test_a_robot_is_bound_once_and_held_only_after_an_action(
+    quadruped: URLabClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, robot = policy_of(walk()), quadruped.articulations["quadruped"]
+    with pytest.raises(PolicyMismatch, match=r"'quadruped' has had no action yet.*Call act"):
+        policy.hold(robot)
+    bound: list[Any] = []
+    bind = policy.bind
+    monkeypatch.setattr(policy, "bind", lambda robot: bound.append(robot) or bind(robot))
+    for _ in range(3):
+        policy.act(robot)
+    assert bound == [robot]
+    assert repr(policy).endswith("for 'quadruped'>")
 
 
 def test_position_servos_take_targets_as_they_are(arm: URLabClient) -> None:

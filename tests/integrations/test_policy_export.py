@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -230,6 +232,69 @@ def test_earlier_observations_are_part_of_the_input(tmp_path: Path, capsys: pyte
     assert json.loads(capsys.readouterr().out)["actions"] == 10
     assert urlab(["evaluate", str(path), "--task", spec.task, "--episodes=2", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["outcomes"]) == 2
+
+
+def layer(kind: str, act: Callable[[Any], Any], **fields: Any) -> Any:
+    """A stand-in for one of PyTorch's layers."""
+    return type(kind, (), {"__call__": lambda _, x: act(x), **fields})()
+
+
+def negative(curve: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda x: np.where(x < 0, curve(np.minimum(x, 0.0)), x)
+
+
+def erf(x: Any) -> Any:
+    return np.vectorize(math.erf)(x)
+
+
+ROOT, SELU = math.sqrt(2 / math.pi), (1.0507009873554805, 1.6732632423543772)
+ACTIVATIONS = [
+    layer("CELU", negative(lambda x: 0.5 * np.expm1(x / 0.5)), alpha=0.5),
+    layer("ELU", negative(lambda x: 0.3 * np.expm1(x)), alpha=0.3),
+    layer("GELU", lambda x: x * (1 + erf(x / math.sqrt(2))) / 2, approximate="none"),
+    layer("GELU", lambda x: x * (1 + np.tanh(ROOT * (x + 0.044715 * x**3))) / 2, approximate="tanh"),
+    layer("LeakyReLU", negative(lambda x: 0.2 * x), negative_slope=0.2),
+    layer("Mish", lambda x: x * np.tanh(np.log1p(np.exp(x)))),
+    layer("ReLU", lambda x: np.maximum(x, 0.0)),
+    layer("SELU", lambda x: SELU[0] * negative(lambda x: SELU[1] * np.expm1(x))(x)),
+    layer("SiLU", lambda x: x / (1 + np.exp(-x))),
+    layer("Sigmoid", lambda x: 1 / (1 + np.exp(-x))),
+    layer("Softplus", lambda x: np.log1p(np.exp(x))),
+    layer("Dropout", lambda x: x),
+]
+
+
+def normalised(x: Any) -> Any:
+    spread = np.sqrt(x.var(axis=-1, keepdims=True) + 0.01)
+    return np.asarray((x - x.mean(axis=-1, keepdims=True)) / spread * SCALE + SHIFT)
+
+
+SCALE, SHIFT = np.linspace(0.5, 2.0, 16).view(Tensor), np.linspace(-1.0, 1.0, 16).view(Tensor)
+
+
+def test_every_layer_that_can_be_exported_does_the_same(tmp_path: Path) -> None:
+    """The exporter compares what the file gives with what the model gives."""
+    space = Box(np.full(7, -0.5, np.float32), np.linspace(0.5, 2.0, 7, dtype=np.float32))
+    middle, half = (space.high + space.low) / 2, (space.high - space.low) / 2
+    sac = Model(22, space)  # it squashes with tanh what its last layer gives; TD3's network ends with one
+    for seed, activation in enumerate(ACTIVATIONS):
+        sac.net += [Linear(16, 16, 20 + seed), activation]
+    without_bias = type("Linear", (Linear,), {"__call__": lambda self, x: np.asarray(x @ self.weight.T)})(16, 16, 50)
+    without_bias.bias = None
+    sac.net += [layer("LayerNorm", normalised, weight=SCALE, bias=SHIFT, eps=0.01), without_bias]
+    flat, td3 = FlattenExtractor(), Model(22, space)
+    ends = Sequential([*td3.net, td3.head, Tanh()])
+    for model, actor in (
+        (sac, SimpleNamespace(features_extractor=flat, latent_pi=sac.net, mu=sac.head)),
+        (td3, SimpleNamespace(features_extractor=flat, mu=ends)),
+    ):
+        model.policy = SimpleNamespace(actor=actor, squash_output=True)
+        squashed = partial(
+            lambda model, x, deterministic: (middle + half * np.tanh(model.head(model.net(x))), None), model
+        )
+        model.predict = squashed  # type: ignore[method-assign]
+        export_policy(model, Reach, tmp_path / "reach.onnx", tolerance=1e-5)
+        (tmp_path / "reach.onnx").unlink()
 
 
 def test_a_file_that_differs_is_not_written(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
 )
 from urlab_client.integrations.record import RecordingError, Run, read_run, record
+from urlab_client.integrations.record import recorder as recording
 from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.record.reader import _DECODERS
 from urlab_client.server import Faults, Refuse, SimulatedServer
@@ -454,6 +455,28 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
     cut.write_bytes(b"PK" + whole)
     with pytest.raises(RecordingError, match="neither an MCAP file"):
         read_run(cut)
+
+
+def test_a_sample_is_left_out_if_the_file_ends_within_it(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    both = {"arm": Robot([1.0]), "leg": Robot([2.0])}
+    write_recording(path, [(both, {}), (both, {}), ({"arm": Robot([3.0])}, {})])
+    assert read_run(path).table().step.tolist() == [0, 1, 2], "a robot may leave"
+    path.write_bytes(path.read_bytes()[:-1])
+    run = read_run(path)
+    assert run.table().step.tolist() == [0, 1]
+    assert run.damage
+
+
+def test_what_is_recorded_is_soon_in_the_file(
+    client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "_FLUSH_S", 0.0)
+    path = tmp_path / "run.mcap"
+    with record(client, path, pose_hz=0):
+        for count in (1, 2):  # also what comes after it was written once
+            client.step()
+            eventually(lambda count=count: len(read_run(path).table()) == count)
 
 
 def test_messages_out_of_order_are_found_without_an_index(tmp_path: Path) -> None:

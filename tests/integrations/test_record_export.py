@@ -225,7 +225,7 @@ def lerobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     for folder in (package, package.parent):
         (folder / "__init__.py").touch()
     (package / "lerobot_dataset.py").write_text(LEROBOT, encoding="utf-8")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"), prepend=os.pathsep)
     return sys.executable
 
 

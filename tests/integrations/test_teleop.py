@@ -97,6 +97,24 @@ async def test_the_target_stops_at_the_edge_and_does_not_run_ahead(client: URLab
     assert hand.target[0] == pytest.approx(before, abs=1e-6)
 
 
+async def test_holding_sends_the_set_points_of_where_the_hand_is(client: URLabClient) -> None:
+    robot = client.articulations["arm"]
+    hand = HandControl(client)
+    for _ in range(20):
+        hand.drive((0.0, 1.0, 0.0), gripper=1.0, dt=0.02)
+        await client.step(10)
+    opening = robot.get_ctrl()["gripper"]
+    robot.set_ctrl({name: 0.0 for name in hand.set_points if name != "gripper"})
+    hand.blocked = True
+    hand.hold()
+    assert not hand.blocked
+    assert robot.get_ctrl().items() >= hand.set_points.items()
+    assert robot.get_ctrl()["gripper"] == opening > 0.0
+    there = hand.target[0]
+    await client.run_for(0.5)
+    assert hand.ik.pose()[0] == pytest.approx(there, abs=0.005)
+
+
 async def test_bad_velocities_and_names_are_refused(client: URLabClient) -> None:
     hand = HandControl(client, "arm", site="grip", gripper="gripper")
     before, set_points = hand.target[0], client.articulations["arm"].get_ctrl()
@@ -113,6 +131,11 @@ async def test_bad_velocities_and_names_are_refused(client: URLabClient) -> None
     assert client.articulations["arm"].get_ctrl() == set_points
     with pytest.raises(KeyError, match="no site 'hand'"):
         HandControl(client, "arm", site="hand")
+    for limit in ({"episodes": 0}, {"seconds": -1.5}, {"seconds": math.nan}):
+        ((name, value),) = limit.items()
+        with pytest.raises(ValueError, match=f"{name} must be above 0 or None, not {value:g}"):
+            await teleoperate(client, towards, **limit)
+    assert repr(hand) == "<HandControl of 'grip' of 'arm'>"
     with pytest.raises(ValueError, match="hz must be above 0 and at most"):
         await teleoperate(client, towards, hz=5000.0)
 

@@ -32,6 +32,7 @@ from urlab_client.integrations._feed.scene import FollowedScene
 from urlab_client.integrations.record import read_run, record
 from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 from urlab_client.integrations.view import view as viewing
+from urlab_client.integrations.view.foxglove_view import FoxgloveBackend
 from urlab_client.integrations.view.view import WindowBackend, show_recording
 from urlab_client.server import SimulatedServer
 
@@ -361,6 +362,38 @@ def test_rerun_gets_a_whole_recording_at_once(
     assert rows(path, "/world/contacts/forces", "Arrows3D:vectors")
 
 
+async def test_foxglove_gets_a_recordings_states_with_their_set_points(recording: Path) -> None:
+    from websockets.asyncio.client import connect
+
+    run, over, listening = read_run(recording), threading.Event(), asyncio.Event()
+    backend, loop = FoxgloveBackend(host="127.0.0.1", port=0, sensors=True), asyncio.get_running_loop()
+    shown = asyncio.create_task(
+        asyncio.to_thread(
+            show_recording,
+            run,
+            backend,
+            over=over.is_set,
+            opened=lambda: loop.call_soon_threadsafe(listening.set),
+        )
+    )
+    try:
+        await asyncio.wait_for(listening.wait(), DEADLINE_S)
+        async with connect(backend.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
+            seen = Foxglove(socket)
+            state: dict[str, Any] = {"step": 0}
+            while not state["step"]:  # that before the first step has no set-points yet
+                await seen.until("/state/arm")
+                state = json.loads(seen.newest["/state/arm"])
+    finally:
+        over.set()
+        await asyncio.wait_for(shown, DEADLINE_S)
+    table = run.table()
+    at = np.flatnonzero((table.episode == state["episode"]) & (table.step == state["step"]))
+    assert state["set_points"] == table.columns["arm/set_points"].values[at[0]].tolist()
+    assert 0.5 in state["set_points"]
+    assert state["qpos"] == table.columns["arm/qpos"].values[at[0]].tolist()
+
+
 def test_a_recordings_plain_entities_are_found_in_its_model() -> None:
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body name='arm_base'><geom size='.1'/></body><body name='crate'><freejoint/>"
@@ -405,6 +438,8 @@ def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path:
         port = int(view.address.rpartition(":")[2])
         with pytest.raises(urlab_client.URLabError, match=str(port)), foxglove_view(client, port=port):
             pass
+    with pytest.raises(urlab_client.URLabError, match="A view opens once"), view:
+        pass
 
 
 # Foxglove

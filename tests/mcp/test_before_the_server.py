@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 from pathlib import Path
@@ -73,7 +74,7 @@ async def test_a_simulated_server_starts_behind_the_first_answers(tmp_path: Path
         command=sys.executable,
         args=["-m", "urlab_client", "mcp", "sim://arm", "--allow-drive", "--no-console"],
         cwd=tmp_path,
-        env={"PYTHONPATH": str(tmp_path)},
+        env={"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},
     )
     told: list[str | None] = []
 

@@ -104,6 +104,36 @@ def test_drawing_works_during_play(serve: Callable[..., Wire]) -> None:
         assert (drawings.take_frame(in_play=True), drawings.take_frame(in_play=False)) == ([], [])
 
 
+@pytest.mark.parametrize(
+    ("op", "field", "default"),
+    [
+        ("draw_line", "thickness", 1.0),
+        ("draw_arrow", "thickness", 1.0),
+        ("draw_arrow", "arrow_size", 0.2),  # of a length of 1
+        ("draw_axes", "scale", 0.2),
+    ],
+)
+def test_sizes_that_are_none_are_the_default_ones(wire: Wire, op: str, field: str, default: float) -> None:
+    def drawn(**fields: float) -> list[Primitive]:
+        wire.ask("clear_markers")
+        wire.ask(op, **VALID[op], **fields, ttl=-1)
+        return wire.core.drawings.take_frame(in_play=False)
+
+    expected = drawn(**{field: default})
+    assert drawn() == drawn(**{field: math.nan}) == expected
+    assert drawn(**{field: 2 * default}) != expected
+    if field != "scale":
+        assert drawn(**{field: 0.0}) == drawn(**{field: -1.0}) == drawn(**{field: math.inf}) == expected
+
+
+def test_a_label_without_a_time_to_live_stays(wire: Wire) -> None:
+    wire.ask("clear_markers")
+    wire.ask("draw_marker", **VALID["draw_marker"], label="here")
+    sphere_and_label = wire.core.drawings.take_frame(in_play=False)
+    assert len(sphere_and_label) == 2
+    assert wire.core.drawings.take_frame(in_play=False) == sphere_and_label[1:]
+
+
 def test_colors_are_bytes_cut_off() -> None:
     assert _color((0.5, 2.0, -1.0)) == (127 / 255, 1.0, 0.0)
 

@@ -128,6 +128,17 @@ def test_a_refusal(client: URLabClient, faults: Faults, executed: bool) -> None:
     assert client.step().step == (2 if executed else 1)
 
 
+def test_a_fault_passes_by_what_comes_first_and_tells_how_often_it_struck(client: URLabClient, faults: Faults) -> None:
+    busy = Refuse("step", code="step_timeout", message="too slow", after=1, times=2)
+    with faults.add(busy) as refusal:
+        client.step()
+        for _ in range(2):
+            with pytest.raises(StepTimeout, match="too slow"):
+                client.step()
+        assert client.step().step == 2
+        assert (refusal.applied, repr(refusal)) == (2, f"<{busy} applied 2 of {refusal.seen} times>")
+
+
 @either_transport
 def test_a_delay_and_a_loss_add_up(client: URLabClient, faults: Faults) -> None:
     slow, lost, never = (faults.add(fault) for fault in (Delay(seconds=0.01), Drop("step"), Cut("step")))

@@ -69,6 +69,16 @@ def test_requests_name_the_limit_they_exceed(small: Wire) -> None:
         assert name in answer[1], (op, answer)
 
 
+def test_how_deep_a_request_may_nest_is_said_whatever_it_nests_in(small: Wire) -> None:
+    for wrap in (lambda inner: [inner], lambda inner: {"a": inner}):
+        deep: object = 1
+        for _ in range(Limits().request_depth - 2):  # below the request itself, and `params`
+            deep = wrap(deep)
+        assert small.refused("configure_controller", articulation="bot", params={"a": deep}) == "no_active_manager"
+        code, message = small.refusal("configure_controller", articulation="bot", params={"a": wrap(deep)})
+        assert (code, f"deeper than {Limits().request_depth} levels" in message) == ("bad_request", True), message
+
+
 def test_a_frame_that_is_far_too_long_costs_its_sender_the_connection(small: Wire) -> None:
     with small.connected(zmq.DEALER) as socket:
         with socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:

@@ -124,6 +124,15 @@ def test_096_worker_threads(ball: Wire) -> None:
     assert options(ball, num_worker_threads=0)["num_worker_threads"] == 0
 
 
+@pytest.mark.mujoco("3.10")
+@pytest.mark.parametrize(("told", "most"), [(3, 3), (None, 1)])
+def test_there_are_as_many_threads_as_processors(
+    ball: Wire, told: int | None, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: told)
+    assert options(ball)["max_worker_threads"] == most
+
+
 def test_switches_move_the_flags_they_are_named_after(ball: Wire) -> None:
     echo = options(ball, enable_multiccd=False, enable_sleep=True)
     assert int(echo["disableflags"]) & mujoco.mjtDisableBit.mjDSBL_MULTICCD

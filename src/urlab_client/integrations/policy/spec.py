@@ -55,19 +55,19 @@ class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, 
         _check_clip(self.clip)
 
 
-class BaseHeight(_Term, tag="base_height", kw_only=True, frozen=True):
+class BaseHeight(_Term, tag="base_height", frozen=True):
     """Height of the free base, metres, world frame; 1 number."""
 
 
-class Gravity(_Term, tag="gravity", kw_only=True, frozen=True):
+class Gravity(_Term, tag="gravity", frozen=True):
     """Direction of gravity, a unit vector in the base frame; 3 numbers."""
 
 
-class LinearVelocity(_Term, tag="linear_velocity", kw_only=True, frozen=True):
+class LinearVelocity(_Term, tag="linear_velocity", frozen=True):
     """Velocity of the free base, m/s, base frame; 3 numbers."""
 
 
-class AngularVelocity(_Term, tag="angular_velocity", kw_only=True, frozen=True):
+class AngularVelocity(_Term, tag="angular_velocity", frozen=True):
     """Angular velocity of the free base, rad/s, base frame; 3 numbers."""
 
 
@@ -101,7 +101,7 @@ class SensorTerm(_Term, tag="sensor", kw_only=True, frozen=True):
     sensor: str
 
 
-class CommandTerm(_Term, tag="command", kw_only=True, frozen=True):
+class CommandTerm(_Term, tag="command", frozen=True):
     """The command (vx, vy, yaw rate), m/s and rad/s, base frame; 3 numbers. Needs the table `command`."""
 
 
@@ -116,7 +116,7 @@ class GoalTerm(_Term, tag="goal", kw_only=True, frozen=True):
     relative_to: str = ""
 
 
-class LastAction(_Term, tag="last_action", kw_only=True, frozen=True):
+class LastAction(_Term, tag="last_action", frozen=True):
     """The network's last output after clipping, zeros at the start; one number per joint of the action."""
 
 

@@ -240,7 +240,7 @@ class TableBuilder:
         if isinstance(self._file, io.BytesIO):
             flat = np.frombuffer(self._file.getbuffer(), np.float64)
         else:
-            self._file.flush()
+            # It looks for the end of the file, which also writes what is buffered.
             flat = np.asarray(np.memmap(self._file, np.float64, "r"))
         return flat.reshape(self._count, self._width)
 

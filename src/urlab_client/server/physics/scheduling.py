@@ -160,7 +160,6 @@ class QueuedStep(Future[T]):
         super().__init__()
         self._request = request
         self._observe = observe
-        self._abandoned = False
 
     def run(self, advance: Callable[[Step], None]) -> None:
         """Run the step under the engine's lock, unless its timeout has cancelled it, and release the caller."""
@@ -168,8 +167,7 @@ class QueuedStep(Future[T]):
             return
         try:
             advance(self._request)
-            if not self._abandoned:
-                self.set_result(self._observe(StepMode.DIRECT))
+            self.set_result(self._observe(StepMode.DIRECT))
         except Exception as error:  # noqa: BLE001 - raised again where the step was requested
             self.set_exception(error)
 
@@ -184,7 +182,6 @@ class QueuedStep(Future[T]):
         except TimeoutError:
             if self.done():  # just now
                 return self.result()
-        self._abandoned = True
         fate = "was cancelled" if not runs_late and self.cancel() else "will still run to its end"
         raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
 

@@ -254,7 +254,6 @@ class StreamServer(Publisher):
         for topic in self._listening:
             self._control.unsubscribe(topic)
         self._listening = []
-        self._ticks.clear()
         if self._memory is not None:
             self._memory.end_state()
 
