@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from argparse import Namespace
 from pathlib import Path
@@ -141,3 +142,23 @@ def test_a_recording_that_cannot_be_shown_says_why(tmp_path: Path, capsys: pytes
     ):
         assert main(["console", *arguments, "--port", "0"]) == 2
         assert reason in capsys.readouterr().err
+
+
+def test_enter_prints_a_link_again_after_the_console_was_in_the_background(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read_end, write_end = os.pipe()
+    monkeypatch.setattr(console, "_BACKGROUND_S", 0.0)
+    monkeypatch.setattr(console.signal, "pthread_sigmask", lambda *_: None, raising=False)
+    places = iter([-1, read_end, read_end])  # first a terminal that cannot be read
+
+    class Terminal:
+        def fileno(self) -> int:
+            return next(places)
+
+    monkeypatch.setattr(console.sys, "stdin", Terminal())
+    with open(read_end, "rb", closefd=True):
+        os.write(write_end, b"\n")
+        os.close(write_end)
+        console._print_links(lambda: "http://link")
+    assert capsys.readouterr().out == "http://link (good for one browser)\n"

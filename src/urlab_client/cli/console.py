@@ -16,6 +16,7 @@ import logging
 import os
 import signal
 import sys
+import time
 import webbrowser
 from argparse import Namespace
 from collections.abc import Callable
@@ -41,6 +42,7 @@ from urlab_client.cli._common import CommandError, import_mujoco
 _PORT = 8355
 _KEY = "URLAB_CONSOLE_KEY"
 _KEY_CHARACTERS = 16
+_BACKGROUND_S = 1.0
 
 USAGE = f"""
 {address_usage(or_else="; or FILE.mcap, a recording")}
@@ -108,9 +110,16 @@ def _print_links(new_link: Callable[[], str]) -> None:
     """Print a link for each line that somebody enters in the terminal."""
     if hasattr(signal, "SIGTTIN"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})  # in the background, reading fails instead
-    with contextlib.suppress(OSError):
-        while os.read(sys.stdin.fileno(), 1024):  # not a method of stdin, whose lock would hinder the program's end
-            print(f"{new_link()} (good for one browser)", flush=True)
+    while True:
+        try:
+            if not os.read(
+                sys.stdin.fileno(), 1024
+            ):  # not a method of stdin, whose lock would hinder the program's end
+                return
+        except OSError:  # in the background, from which the shell may bring it back
+            time.sleep(_BACKGROUND_S)
+            continue
+        print(f"{new_link()} (good for one browser)", flush=True)
 
 
 async def _serve(arguments: Namespace) -> None:
