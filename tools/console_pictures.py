@@ -127,6 +127,7 @@ def take_all(page: Photographer, server: subprocess.Popen[str]) -> None:
         if name.endswith("sheet"):
             driver.execute_script("document.querySelector('#sheet-toggle').click()")
         page.settle()
+        page.until("!document.querySelector('#age').classList.contains('old')")  # also on a busy machine
         page.shoot(name)
     driver.execute_script("document.querySelector('#sheet-toggle').click()")
     page.resize(1440, 1000, "light")
@@ -135,7 +136,12 @@ def take_all(page: Photographer, server: subprocess.Popen[str]) -> None:
     driver.execute_script("document.querySelector('#record').click()")
     page.until("document.querySelector('[data-recording] .replay') !== null")
     driver.execute_script("clearInterval(window.moving); document.querySelector('[data-recording] .replay').click()")
-    page.until("+document.querySelector('#timeline').value > 3")
+    page.until("+document.querySelector('#timeline').value > 0")
+    driver.execute_script(
+        "const line = document.querySelector('#timeline'); line.value = 0.6 * line.max;"
+        "line.dispatchEvent(new Event('input'))"
+    )
+    page.settle()
     page.shoot("console_replay")
     driver.execute_script("document.querySelector('#replay-end').click()")
     page.until("document.querySelector('#replay').hidden")

@@ -19,6 +19,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -180,9 +181,15 @@ APART = ("cameras", "uploads")
 
 
 def field_page(op: Op) -> str:
-    """Return the page of an op's fields."""
+    """Return the page of an op's fields: what a class has on another page, its ops have, too."""
     module = op.request.__module__.rpartition(".")[2]
-    return f"protocol-{module}.md" if module in APART else namespace_page("protocol", op.ns)
+    if module in APART:
+        return f"protocol-{module}.md"
+    class_name = f"{op.ns.capitalize()}Namespace"
+    for end, _, members in OTHER_PAGES.get(class_name, ()):
+        if op.name in members:
+            return f"protocol-{op.ns}-{end}.md"
+    return namespace_page("protocol", op.ns)
 
 
 def ops_by_field_page() -> dict[str, list[Op]]:
@@ -195,8 +202,9 @@ def ops_by_field_page() -> dict[str, list[Op]]:
 
 def field_title(page: str) -> str:
     name = page.removeprefix("protocol-").removesuffix(".md")
-    namespace = namespace_title(ops_by_field_page()[page][0].ns)
-    return f"{namespace}, {name}" if name in APART else namespace
+    namespace = ops_by_field_page()[page][0].ns
+    apart = name.removeprefix(f"{namespace}-")
+    return namespace_title(namespace) + ("" if apart in (namespace, "client") else f", {apart}")
 
 
 def namespace_rows(pages: Mapping[str, tuple[str, Sequence[Op]]]) -> Iterator[list[str]]:
@@ -227,8 +235,8 @@ def render_ops() -> str:
         "",
         "## Errors",
         "",
-        "[The page of errors](ops-errors.md) lists every code that a server answers, with its exception and advice,",
-        "and all other exceptions of the package.",
+        "[Errors that a server answers](ops-errors.md) has every code, with its exception and advice. [All kinds of",
+        "errors](ops-exceptions.md) has the other exceptions of the package.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -256,9 +264,7 @@ def render_errors() -> str:
     lines = [
         FROM_PROTOCOL,
         "",
-        "# Errors",
-        "",
-        "## Errors that a server answers",
+        "# Errors that a server answers",
         "",
         "Each is a `URLabRPCError` with `op`, `code`, `message` and `hint`. A code that is not listed raises",
         "`URLabRPCError` itself.",
@@ -267,11 +273,21 @@ def render_errors() -> str:
             ["Code", "Exception", "Meaning", "What to do", "From"],
             error_rows(dict(errors.RPC_ERRORS), OPS.values(), ENVELOPE_ERRORS),
         ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def render_exceptions() -> str:
+    from urlab_client import errors
+
+    lines = [
+        FROM_PROTOCOL,
         "",
-        "## All kinds of errors",
+        "# All kinds of errors",
         "",
         "Everything derives from `URLabError`. *Also a* names the built-in exception that catches it, too. Mistakes in",
-        "arguments are plain `TypeError`, `ValueError` or `KeyError`, raised before anything is sent.",
+        "arguments are plain `TypeError`, `ValueError` or `KeyError`, raised before anything is sent. [Another",
+        "page](ops-errors.md) lists what a server answers.",
         "",
         *table(["Exception", "Kind of", "Also a", "Meaning"], own_errors(errors.URLabError)),
     ]
@@ -297,13 +313,20 @@ PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", bytes:
 
 
 STRUCTURES = {
-    "protocol-session-structures.md": ("Structures of a session", "maps in `hello`, `step` and the state"),
+    "protocol-handshake-structures.md": ("Structures of a handshake", "maps in `hello`, `meta` and the start of play"),
+    "protocol-session-structures.md": ("Structures of a session", "maps in `step` and the state"),
     "protocol-structures.md": ("Other structures", "maps in other requests and replies"),
 }
 
 
+HANDSHAKE = ("Info", "Ok", "Names", "Entry")
+"""How the names of structures of a handshake end."""
+
+
 def structure_page(struct: type[Any]) -> str:
-    return f"protocol-{'session-' if struct.__module__.endswith('.session') else ''}structures.md"
+    if not struct.__module__.endswith(".session"):
+        return "protocol-structures.md"
+    return f"protocol-{'handshake' if struct.__name__.endswith(HANDSHAKE) else 'session'}-structures.md"
 
 
 def wire_type(hint: Any, structs: list[type[Any]]) -> str:
@@ -506,6 +529,10 @@ MANY = 12
 """Names of a module that fit on one page."""
 
 
+PAGES_OF = dict.fromkeys(("Start", "States", "ResetNoise"), "states")
+"""Names that are not on the page of the module that defines them, which would get too long."""
+
+
 @cache
 def parts(module: str) -> dict[str, dict[str, str]]:
     """Return a module's names and where they are defined, by page: those of one with many, by the defining module."""
@@ -515,7 +542,7 @@ def parts(module: str) -> dict[str, dict[str, str]]:
         return {page: names}
     found: dict[str, dict[str, str]] = {}
     for name, where in names.items():
-        defining = where.rpartition(".")[0].rpartition(".")[2]
+        defining = PAGES_OF.get(name) or where.rpartition(".")[0].rpartition(".")[2]
         found.setdefault(page.replace(".md", f"-{defining}.md"), {})[name] = where
     return dict(sorted(found.items()))
 
@@ -600,41 +627,47 @@ OF_THEIR_OWN = {"URLabClient": "ClientState"}
 """Classes whose inherited members are on the page of a shared class, because there are so many."""
 
 
-SECOND_PAGES = {
+OTHER_PAGES = {
     "URLabClient": (
-        "streams",
-        "waiting, pictures, streams, diagnosis",
+        ("steps", "session, steps, waiting", ("discover", "step", "reset", "resync", "run_for", "wait_until", "close")),
         (
-            "resync", "run_for", "wait_until", "capture", "state_stream", "row_stream", "events", "call", "explain",
-            "meta", "close",
+            "streams",
+            "pictures, streams, diagnosis",
+            ("capture", "state_stream", "row_stream", "events", "call", "explain", "meta"),
         ),
     ),
     "URLabArticulation": (
-        "methods",
-        "methods",
         (
-            "describe", "move_to", "claim", "release", "apply_xfrc", "set_ctrl", "get_ctrl", "get_qpos", "get_sensors",
-            "resolve_joint", "resolve_actuator",
+            "methods",
+            "methods",
+            (
+                "describe", "move_to", "claim", "release", "apply_xfrc", "set_ctrl", "get_ctrl", "get_qpos",
+                "get_sensors", "resolve_joint", "resolve_actuator",
+            ),
         ),
     ),
     "SceneNamespace": (
-        "levels",
-        "levels, uploads, placing",
         (
-            "upload_model", "apply_scene", "create_level", "load_level", "save_level", "current_level",
-            "ensure_manager", "destroy_asset", "set_actor_transform", "actor_hierarchy",
+            "levels",
+            "levels, uploads, placing",
+            (
+                "upload_model", "apply_scene", "create_level", "load_level", "save_level", "current_level",
+                "ensure_manager", "destroy_asset", "set_actor_transform", "actor_hierarchy",
+            ),
         ),
     ),
     "RuntimeNamespace": (
-        "robots",
-        "robots, cameras, mocap bodies",
         (
-            "list_keyframes", "set_qpos", "set_twist", "set_user_channels", "read_mocap_pose", "set_mocap_pose",
-            "set_camera_delay", "set_camera_streaming",
+            "robots",
+            "robots, cameras, mocap bodies",
+            (
+                "list_keyframes", "set_qpos", "set_twist", "set_user_channels", "read_mocap_pose", "set_mocap_pose",
+                "set_camera_delay", "set_camera_streaming",
+            ),
         ),
     ),
 }  # fmt: skip
-"""Of classes with many members: the end of a second page's name, what it is about, and its members."""
+"""Of classes with many members, for each further page: the end of its name, what it is about, and its members."""
 
 
 def home_of(name: str, flavour: str) -> str:
@@ -642,8 +675,7 @@ def home_of(name: str, flavour: str) -> str:
     return f"urlab_client.aio.{core}.{name}" if flavour == "aio" else f"urlab_client.sync.{facade or core}.{name}"
 
 
-def render_second_page(name: str, flavour: str) -> str:
-    _, words, members = SECOND_PAGES[name]
+def render_other_page(name: str, flavour: str, words: str, members: Iterable[str]) -> str:
     lines = [f"{START}. Do not edit. -->", "", f"# {name}: {words}", ""]
     lines += [f"The rest of [{code(name)}]({flavour}-{CLASSES[name][0]}.md).", ""]
     for member in members:
@@ -656,10 +688,12 @@ def render_class(name: str, flavour: str, title: str) -> str:
     base = OF_THEIR_OWN.get(name)
     more = f"\nInherited members are on the page [{base}]({SHARED}-{CLASSES[base][0]}.md)." if base else ""
     options = ["inherited_members: false"] if base else []
-    if name in SECOND_PAGES:
-        end, words, members = SECOND_PAGES[name]
+    elsewhere: list[str] = []
+    for end, words, members in OTHER_PAGES.get(name, ()):
         more += f"\nA page of its own has [{words}]({flavour}-{slug}-{end}.md)."
-        options.append(f'filters: ["!^_", "!^({"|".join(members)})$"]')
+        elsewhere += members
+    if elsewhere:
+        options.append(f'filters: ["!^_", "!^({"|".join(elsewhere)})$"]')
     options = "".join(f"\n      {option}" for option in options)
     options = f"\n    options:{options}" if options else ""
     other, words = ("blocking", "blocking client") if flavour == "aio" else ("aio", "async client")
@@ -696,8 +730,9 @@ def class_pages() -> dict[str, Callable[[], str]]:
         else:
             pages[f"blocking-{slug}.md"] = partial(render_class, name, "blocking", "blocking client")
             pages[f"aio-{slug}.md"] = partial(render_class, name, "aio", "async client")
-            for flavour in ("blocking", "aio") if name in SECOND_PAGES else ():
-                pages[f"{flavour}-{slug}-{SECOND_PAGES[name][0]}.md"] = partial(render_second_page, name, flavour)
+            for flavour, (end, words, members) in product(("blocking", "aio"), OTHER_PAGES.get(name, ())):
+                page = f"{flavour}-{slug}-{end}.md"
+                pages[page] = partial(render_other_page, name, flavour, words, members)
     return pages
 
 
@@ -783,7 +818,7 @@ These pages describe the values that calls of both clients accept and return. `u
                 "errors",
                 "Exceptions",
                 "Errors that correspond to a code on the wire are in "
-                "[the table of errors](ops-errors.md#errors-that-a-server-answers), with advice for each.",
+                "[the table of errors](ops-errors.md), with advice for each.",
                 ("errors", "values.names"),
             ),
         ),
@@ -885,6 +920,7 @@ def pages() -> dict[str, Callable[[], str]]:
         **{f"{name}.md": partial(render_subjects, name) for name in SUBJECTS},
         "ops.md": render_ops,
         "ops-errors.md": render_errors,
+        "ops-exceptions.md": render_exceptions,
         "protocol.md": render_protocol,
         "integrations.md": render_integrations,
     }

@@ -26,7 +26,7 @@ ROOT_PAGES = {
 
 # Weight of pages in the search, by how their path begins: an answer comes before a class, a class before a list.
 _BOOSTS = {"howto/": 4.0, "quickstart": 3.0, "concepts": 2.0, "tutorials/": 2.0, "reference/": 0.5, "coverage": 0.1,
-           "promises": 0.1, "project/": 0.3}  # fmt: skip
+           "promises": 0.1, "evidence": 0.1, "project/": 0.3}  # fmt: skip
 
 _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
 _TAB = re.compile(

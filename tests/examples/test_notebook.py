@@ -133,3 +133,11 @@ def test_rounding_noise_is_a_straight_line() -> None:
     heights = {point.split(",")[1] for point in re.findall(r"[\d.]+,[\d.]+", curve(1e-14 * np.sin(np.arange(50.0))))}
     assert len(heights) == 1
     assert curve([1.0]) == ""
+
+
+def test_rounding_noise_is_zero_rows_of_numbers_stay_on_a_line_and_clocks_are_seconds() -> None:
+    shown = fields("", {"qpos": np.array([8.49e-15, -0.4, 1e-3]), "at": {"sec": 3, "nsec": 250_000_000}, "one": -2e-16})
+    assert "[0, -0.4, 0.001]" in shown
+    assert "3.250 s" in shown
+    assert "e-1" not in shown
+    assert re.search(r'nowrap">\[0, ', shown)

@@ -215,6 +215,31 @@ async def test_a_robot_without_torque_motors_says_why_it_holds_no_pose(tmp_path:
             await ConsoleSession(client, recordings=tmp_path).controls.hold(Viewer("key", "me"), "arm", True)
 
 
+@pytest.mark.parametrize(
+    ("joint", "motor"),
+    [("", 'gear="0"'), ('type="ball"', 'gear="0 1 0"'), ("", "")],
+    ids=["without a gear", "ball joint", "hinge"],
+)
+async def test_only_motors_that_turn_a_hinge_can_hold_a_pose(tmp_path: Path, joint: str, motor: str) -> None:
+    (tmp_path / "one.xml").write_text(
+        f"""<mujoco><worldbody><body><joint name="turn" {joint}/><geom size="0.1" pos="0.2 0 0"/></body></worldbody>
+        <actuator><motor name="motor" joint="turn" {motor}/></actuator></mujoco>""",
+        encoding="utf-8",
+    )
+    async with (
+        SimulatedServer(tmp_path / "one.xml", play=True) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        await client.discover()
+        (key,) = client.articulations
+        held = ConsoleSession(client, recordings=tmp_path).controls.hold(Viewer("key", "me"), key, True)
+        if joint or motor:
+            with pytest.raises(ValueError, match="torque motors on hinge or slide joints"):
+                await held
+        else:
+            await held
+
+
 def test_recordings_are_refused_by_what_is_wrong_with_them(http: TestClient, tmp_path: Path) -> None:
     size = len(http.get("/api/state").json()["articulations"]["quadruped"]["qpos"])
     folder = tmp_path / "recordings"

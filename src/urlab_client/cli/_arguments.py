@@ -317,6 +317,11 @@ def address(text: str) -> str:
     return f"tcp://{text}"
 
 
+def address_or_recording(text: str) -> str | Path:
+    """Parse the address of a server, or the path of a recording."""
+    return Path(text) if text.endswith(".mcap") and "://" not in text else address(text)
+
+
 def image_size(text: str) -> tuple[int, int]:
     """Parse width and height of an image, pixels."""
     width, cross, height = text.lower().partition("x")

@@ -2,7 +2,8 @@
 
 Serve a page that shows a simulation and lets you interact with it, only on this machine, and print a link that admits
 one browser. Enter in the terminal prints another link, and the page can create more; a key in URLAB_CONSOLE_KEY admits
-programs, such as Prometheus. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
+programs, such as Prometheus. A recording needs no server; MuJoCo does not check the model in it, so show only
+recordings from sources that you trust. Exits with code 0 on SIGINT (Ctrl-C) and SIGTERM.
 """
 
 from __future__ import annotations
@@ -15,33 +16,49 @@ import logging
 import os
 import signal
 import sys
+import time
 import webbrowser
 from argparse import Namespace
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
 from urlab_client import aio
 from urlab_client._installation import install_command
 from urlab_client._platform.threads import daemon
-from urlab_client.cli._arguments import PAGE, WATCHER, address_usage, check_page, host_names, make_client, page_url
+from urlab_client.cli._arguments import (
+    PAGE,
+    WATCHER,
+    address_or_recording,
+    address_usage,
+    check_page,
+    host_names,
+    make_client,
+    page_url,
+)
 from urlab_client.cli._common import CommandError, import_mujoco
 
 _PORT = 8355
 _KEY = "URLAB_CONSOLE_KEY"
 _KEY_CHARACTERS = 16
+_BACKGROUND_S = 1.0
 
 USAGE = f"""
-{address_usage()}
+{address_usage(or_else="; or FILE.mcap, a recording")}
 {PAGE.format(_PORT)}
 --json-log  write the log as lines of JSON
 {WATCHER}
 examples:
 urlab console  the server on this machine, at a link for your browser
 urlab console sim://quadruped --open  a simulated robot, opened in the browser
+urlab console run.mcap  a recording, with its curves and its time line
 urlab console --port 0  any free port for the page
 urlab console --handshake robot.hello  watch alongside the driving client
 urlab console --public-url https://lab.example/robots/  behind a proxy, which has that address
 """
+
+KINDS = {"address": address_or_recording}
 
 
 def run(arguments: Namespace) -> int:
@@ -59,6 +76,8 @@ def run(arguments: Namespace) -> int:
     if arguments.json_log:
         _log_json()
     import_mujoco()
+    if isinstance(arguments.address, Path) and (arguments.handshake or arguments.mjcf_options):
+        raise CommandError("--handshake and --mjcf-options are for servers, not for a recording")
     from urlab_client.cli._pages import graceful_exit
 
     with graceful_exit():
@@ -91,24 +110,48 @@ def _print_links(new_link: Callable[[], str]) -> None:
     """Print a link for each line that somebody enters in the terminal."""
     if hasattr(signal, "SIGTTIN"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})  # in the background, reading fails instead
-    with contextlib.suppress(OSError):
-        while os.read(sys.stdin.fileno(), 1024):  # not a method of stdin, whose lock would hinder the program's end
-            print(f"{new_link()} (good for one browser)", flush=True)
+    while True:
+        try:
+            if not os.read(
+                sys.stdin.fileno(), 1024
+            ):  # not a method of stdin, whose lock would hinder the program's end
+                return
+        except OSError:  # in the background, from which the shell may bring it back
+            time.sleep(_BACKGROUND_S)
+            continue
+        print(f"{new_link()} (good for one browser)", flush=True)
 
 
 async def _serve(arguments: Namespace) -> None:
     from prometheus_client import REGISTRY
 
     from urlab_client.cli._pages import bound, serve
+    from urlab_client.console.session import ConsoleSession
     from urlab_client.integrations.telemetry import PrometheusObserver
-    from urlab_client.web import Access, app
+    from urlab_client.web import Access
+    from urlab_client.web.application import application_of
 
     access = Access(hosts=host_names(arguments), keys=_keys())
-    # Each camera is streamed while a browser shows it.
-    client = make_client(
-        aio.URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver()
-    )
-    async with client:
+    recording = arguments.address if isinstance(arguments.address, Path) else None
+    handshake = None if arguments.handshake is None else arguments.handshake.read_bytes
+    async with contextlib.AsyncExitStack() as stack:
+        server: dict[str, Any] = {}
+        if recording is not None:
+            from urlab_client.console.replay import recorded_handshake
+            from urlab_client.integrations.record import read_run
+            from urlab_client.server import SimulatedServer
+
+            recorded = await asyncio.to_thread(lambda: recorded_handshake(read_run(recording)))
+            handshake = functools.partial(bytes, recorded)
+            bare = await stack.enter_async_context(SimulatedServer())  # without robots, it answers and no more
+            server = {**bare.client_options(), "read_only": True}
+        # Each camera is streamed while a browser shows it.
+        options: dict[str, Any] = {"live_pictures": False, "observe": PrometheusObserver()}
+        if server:
+            client = aio.URLabClient(**server, **options)
+        else:
+            client = make_client(aio.URLabClient, str(arguments.address), arguments, **options)
+        await stack.enter_async_context(client)
         with bound(arguments.host, _PORT if arguments.port is None else arguments.port) as listener:
             url = page_url(arguments, listener.getsockname()[1])
 
@@ -126,11 +169,7 @@ async def _serve(arguments: Namespace) -> None:
                     failed = functools.partial(logging.getLogger("urlab_client.web").exception, "no more links: %r")
                     daemon("urlab-console-links", _print_links, new_link, failed=failed).start()
 
-            site = app(
-                client,
-                access=access,
-                handshake=None if arguments.handshake is None else arguments.handshake.read_bytes,
-                metrics=REGISTRY,
-                recordings=arguments.recordings,
+            session = ConsoleSession(client, recordings=arguments.recordings, handshake=handshake, replayed=recording)
+            await serve(
+                application_of(session, access, REGISTRY), listener, started, public_url=arguments.public_url or ""
             )
-            await serve(site, listener, started, public_url=arguments.public_url or "")

@@ -24,7 +24,7 @@ from urlab_client.cli._arguments import (
     STEP_MODE,
     Parser,
     add_usage,
-    address,
+    address_or_recording,
     address_usage,
     cameras,
     make_client,
@@ -62,15 +62,11 @@ urlab view --rerun --camera all  the server on this machine in Rerun, with every
 urlab view sim://arm --rerun --save arm.rrd --seconds 5  five seconds as a Rerun file
 urlab view --foxglove  a server that Foxglove connects to
 urlab view run.mcap  a recording in MuJoCo's window
-urlab view run.mcap --rerun --page  a recording in Rerun's page, for browsers
+urlab view run.mcap --web  a recording in the console's page, for browsers
 """
 
 
-def _shown(text: str) -> str | Path:
-    return Path(text) if text.endswith(".mcap") and "://" not in text else address(text)
-
-
-KINDS = {"address": _shown}
+KINDS = {"address": address_or_recording}
 
 
 def run(arguments: Namespace) -> int:
@@ -82,11 +78,6 @@ def run(arguments: Namespace) -> int:
         raise CommandError("give one of --save, --connect and --page")
     recorded = isinstance(arguments.address, Path)
     if arguments.where == "web":
-        if recorded:
-            raise CommandError(
-                "--web shows a recording beside the robots that run: use `urlab console sim://MODEL --recordings "
-                "FOLDER`; without a server, --rerun --page"
-            )
         return _show_console(arguments)
     if arguments.where == "viewer":
         from urlab_client.integrations.view.view import missing_for_window
@@ -108,8 +99,8 @@ def _show_console(arguments: Namespace) -> int:
             "--camera, --sensors and --seconds do not apply to --web, which shows everything until Ctrl-C"
         )
     parser = Parser()
-    add_usage(parser, console.USAGE)
-    return console.run(parser.parse_args([arguments.address], arguments))  # the rest has its default
+    add_usage(parser, console.USAGE, console.KINDS)
+    return console.run(parser.parse_args([str(arguments.address)], arguments))  # the rest has its default
 
 
 async def _view(arguments: Namespace) -> ViewStats:

@@ -45,7 +45,7 @@ from urlab_client.protocol.registry import OPS
 if TYPE_CHECKING:
     import mujoco
 
-    from urlab_client.aio import URLabArticulation, URLabClient
+    from urlab_client.aio import Actuator, URLabArticulation, URLabClient
 
 SERVED: dict[str, Op] = {name: op for name, op in OPS.items() if op.request is not Hello}
 """The ops that viewers may perform, by name; the console itself holds the session."""
@@ -128,7 +128,8 @@ class Controls:
         try:
             reply = await _perform(self._client, request)
         except (URLabError, ValueError, TypeError, KeyError) as error:
-            self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
+            if not (self._client.config.read_only and op.effect is Effect.READ):  # which the page asks for by itself
+                self._view.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
             raise
         if op.effect is not Effect.READ:
             given = {name: value for name, value in structs.asdict(request).items() if name != "session_id"}
@@ -283,9 +284,9 @@ class _PoseHold:
     """Torques with which the motors of a robot hold its home pose, until somebody else writes set-points of them."""
 
     def __init__(self, model: mujoco.MjModel | None, art: URLabArticulation) -> None:
-        motors = [one for one in art.actuators.values() if one.joint is not None and one.describe().takes == "force"]
+        motors = [one for one in art.actuators.values() if _turns(model, art, one)]
         if model is None or not motors:
-            need = "that needs torque motors on its joints, and a local model"
+            need = "that needs torque motors on hinge or slide joints, and a local model"
             raise ValueError(f"{art.prefix} cannot hold a pose: {need}")
         joints = [art.joints[one.joint or ""] for one in motors]
         driving, driven = [one.id for one in motors], [one.id for one in joints]
@@ -311,6 +312,14 @@ class _PoseHold:
     def let_go(self) -> None:
         """End the torques."""
         self._art.ctrl_array[self._ctrl] = 0.0
+
+
+def _turns(model: mujoco.MjModel | None, art: URLabArticulation, actuator: Actuator) -> bool:
+    """Return whether an actuator's set-point is a force on one coordinate, larger than zero."""
+    if model is None or actuator.joint is None or actuator.describe().takes != "force":
+        return False
+    gain, gear = model.actuator_gainprm[actuator.id, 0], model.actuator_gear[actuator.id, 0]
+    return bool(gain and gear) and art.joints[actuator.joint].kind in ("hinge", "slide")
 
 
 async def _perform(client: URLabClient, request: Request[Any]) -> object:

@@ -103,7 +103,8 @@ class Conversion(Struct):
 class ReplayView(Struct):
     """Position of a replay, in seconds of the recording's clock. `placing`: whether the simulation's robots follow.
 
-    `cameras` lists the cameras whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+    `alone`: whether there is no simulation besides. `cameras` lists the cameras whose recorded pictures are shown, as
+    `ARTICULATION/CAMERA` or `-/CAMERA`.
     """
 
     name: str
@@ -112,6 +113,7 @@ class ReplayView(Struct):
     playing: bool
     rate: float
     placing: bool
+    alone: bool
     cameras: list[str]
 
 

@@ -2,7 +2,7 @@
 
 The replay sends no requests to the server, so it works with any server and any recording, seeks immediately, and has a
 position in seconds. Only the current moment is in memory, however long the recording is. On request, it also places the
-robots of the simulation, in puppet mode.
+robots of the simulation, in puppet mode. `recorded_handshake` describes the robots where there is no simulation.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import anyio.to_thread
 import numpy as np
 from msgspec import Struct
 
+from urlab_client._mujoco import saved_model
 from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.aio.model.mirror import require_local
@@ -27,6 +28,8 @@ from urlab_client.console.pictures import OF_SCENE, Cameras
 from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import URLabError
+from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, HelloOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 
 if TYPE_CHECKING:
@@ -61,10 +64,12 @@ class Replay:
 
     Attributes:
         cameras: Cameras of which the recording has pictures, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+        alone: Whether there is no simulation besides.
     """
 
-    def __init__(self, client: URLabClient, view: SharedView, cameras: Cameras) -> None:
+    def __init__(self, client: URLabClient, view: SharedView, cameras: Cameras, *, alone: bool = False) -> None:
         self.cameras: frozenset[str] = frozenset()
+        self.alone: bool = alone
         self._client = client
         self._view = view
         self._shown_cameras = cameras
@@ -92,6 +97,7 @@ class Replay:
             self._playing,
             self._rate,
             self._before is not None,
+            self.alone,
             [] if self._before is not None else sorted(self.cameras),
         )
 
@@ -152,7 +158,7 @@ class Replay:
         self._run, self._robots, self.cameras = run, robots, cameras
         self._start, self._seconds = start, end - start
         self._at, self._rate, self._state = 0.0, 1.0, None
-        if placing:
+        if placing and not self.alone:
             await self._take_over()
         self._playing = True
         await self._show_pictures()
@@ -263,6 +269,48 @@ class Replay:
         data.qvel[:] = 0.0
         # In mode puppet pictures come with replies alone.
         await self._client.step(0, include_cameras=dict.fromkeys(self._shown_cameras.watched(), "latest") or False)
+
+
+def recorded_handshake(run: Run) -> bytes:
+    """Return the handshake of a server with the scene of a recording, whose model MuJoCo does not check.
+
+    Raises:
+        RecordingError: The recording has no model or no states, or is damaged.
+    """
+    import mujoco
+
+    from urlab_client.integrations.record import RecordingError
+
+    model, cameras = run.model(), {name: _camera(run, name) for name in run.cameras()}
+    if not run.positions():
+        raise RecordingError(f"{run.path}: the recording has no states of robots.")
+    robots = [
+        ArticulationInfo(
+            prefix=key,
+            actor_id=key,
+            actor_name=prefix,
+            camera_topics={name: info for name, info in cameras.items() if name.startswith(f"{key}/")},
+        )
+        for key, prefix in run.prefixes().items()
+    ]
+    hello = HelloOk(
+        session_id="",
+        urlab_version="",
+        mujoco_version_int=mujoco.mj_version(),
+        mujoco_version=mujoco.mj_versionString(),
+        manager_present=True,
+        mjb=saved_model(model),
+        articulations=robots,
+        global_cameras={name: info for name, info in cameras.items() if "/" not in name},
+    )
+    return encode_reply(hello)
+
+
+def _camera(run: Run, name: str) -> CameraInfo:
+    """Describe a camera by its first picture; nobody publishes others."""
+    first = run.encoded_picture_at(name, run.time_range()[0])
+    height, width = first.pixels().shape[:2]
+    return CameraInfo(mode=first.mode, resolution=(width, height), fovy=45.0, zmq_endpoint="", zmq_topic=name)
 
 
 def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:

@@ -59,7 +59,7 @@ class ConsoleSession:
     """See the module.
 
     A client that is not read-only opens the session itself. A read-only one adopts the session of another client, whose
-    handshake the callback returns.
+    handshake the callback returns. With `replayed`, that of a recording, it shows this recording and nothing else.
 
     Attributes:
         link: The connection to the server.
@@ -73,6 +73,7 @@ class ConsoleSession:
         recordings: Path,
         lease_seconds: float = 20.0,
         handshake: Callable[[], bytes] | None = None,
+        replayed: Path | None = None,
     ) -> None:
         self.client = client
         self.link: Link = Link("connecting", since=time.time())
@@ -83,7 +84,8 @@ class ConsoleSession:
         self.mujoco_viewer: MujocoViewer = MujocoViewer(client, view)
         self.cameras: Cameras = Cameras(client, view)
         self.recordings: Recordings = Recordings(client, recordings)
-        self.replay: Replay = Replay(client, view, self.cameras)
+        self.replay: Replay = Replay(client, view, self.cameras, alone=replayed is not None)
+        self._replayed = replayed
         self.body_pushing: BodyPushing = BodyPushing(client, lease, self.mujoco_viewer, self.replay)
         self.controls: Controls = Controls(client, lease, view, self.cameras, self.body_pushing.apply)
         self.hands: HandDriving = HandDriving(client, lease, self.controls, view)
@@ -113,6 +115,7 @@ class ConsoleSession:
             self.controls.keep_stepping,
             self.hands.keep_driving,
             self.replay.keep_playing,
+            self._begin_replay,
         )
         async with anyio.create_task_group() as tasks:
             for job in jobs:
@@ -123,6 +126,11 @@ class ConsoleSession:
                 tasks.cancel_scope.cancel()
                 with anyio.CancelScope(shield=True):
                     await self.recordings.end()
+
+    async def _begin_replay(self) -> None:
+        if self._replayed is not None:
+            await self.opened()
+            await self.replay.begin(self._replayed)
 
     async def _run(self, job: Callable[[], Awaitable[None]]) -> None:
         """Run a job for as long as the console is open. Its failure is not that of the application around it."""

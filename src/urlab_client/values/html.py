@@ -15,6 +15,7 @@ _OPEN_ROWS: Final = 12
 _NUMBERS: Final = 7
 _CHARACTERS: Final = 300
 _SMALLEST_RANGE: Final = 1e-6
+_NOISE: Final = 1e-9
 _WIDTH: Final = 240
 _HEIGHT: Final = 32
 _LEFT: Final = ' style="text-align: left"'
@@ -88,6 +89,11 @@ def curve(values: ArrayLike) -> Markup:
     )
 
 
+def number(value: float) -> str:
+    """Return a number with four digits; what is as small as rounding noise is 0."""
+    return "0" if abs(value) < _NOISE else f"{value:.4g}"
+
+
 def _is_empty(value: object) -> bool:
     return value is None or (isinstance(value, str | bytes | Mapping | list | tuple) and not value)
 
@@ -103,7 +109,7 @@ def _cell(value: object) -> str:  # noqa: PLR0911 - one for each kind of value
         case list() | tuple() | np.ndarray():
             return _numbers(cast("Sequence[Any]", value))
         case float() | np.floating():
-            return f"{value:.4g}"
+            return number(float(value))
         case bytes():
             return f"{len(value)} bytes"
         case _:
@@ -112,6 +118,8 @@ def _cell(value: object) -> str:  # noqa: PLR0911 - one for each kind of value
 
 
 def _mapping(values: Mapping[str, Any]) -> str:
+    if set(values) == {"sec", "nsec"}:
+        return f"{values['sec'] + values['nsec'] / 1e9:.3f} s"
     if values and all(isinstance(one, Mapping) for one in values.values()):
         return _folded(list(values.items()))
     return fields("", values)
@@ -132,4 +140,5 @@ def _numbers(values: Sequence[Any]) -> str:
     flat: list[object] = np.ravel(np.asarray(values, dtype=object)).tolist()
     listed = ", ".join(_cell(one) for one in flat[:_NUMBERS])
     shape = " by ".join(map(str, np.shape(values)))
-    return f"[{listed}]" if len(flat) <= _NUMBERS else f"[{listed}, …] ({shape})"
+    shown = f"[{listed}]" if len(flat) <= _NUMBERS else f"[{listed}, …] ({shape})"
+    return f'<span style="white-space: nowrap">{shown}</span>'

@@ -50,7 +50,7 @@ from urlab_client.integrations.record.index import LATEST_NS, IndexedChannel, Pr
 from urlab_client.integrations.record.tables import SampleTimes, Source, TableBuilder
 from urlab_client.integrations.record.writer import GOAL, MODEL_NAME, TASK, RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.values.html import curve, fields, table
+from urlab_client.values.html import curve, fields, number, table
 from urlab_client.values.pictures import thumbnail
 
 if TYPE_CHECKING:
@@ -446,7 +446,7 @@ def _shown(run: Run) -> str:
         summary, (start, end) = run.summary(), run.time_range()
         states = [run.state_at(float(time)) for time in np.linspace(start, end, _CURVE_POINTS)]
         curves = [
-            (f"{owner}/{name}", f"{values.min():.4g} to {values.max():.4g}", curve(values))
+            (f"{owner}/{name}", f"{number(float(values.min()))} to {number(float(values.max()))}", curve(values))
             for owner, names in run.positions().items()
             for name, values in zip(names, _positions(states, owner, len(names)), strict=False)
         ]

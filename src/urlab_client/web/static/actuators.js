@@ -104,8 +104,11 @@ export function actuatorTable(group, rows) {
     rows.map((row) => row.element));
 }
 
+const TURNS = ["hinge", "slide"];
+
 /** Whether torque motors of a robot can hold its joints in a pose. */
-export const canHold = (art) => art.actuators.some((actuator) => actuator.takes === "force" && actuator.joint);
+export const canHold = (art) => art.actuators.some((actuator) => actuator.takes === "force"
+  && art.joints.some((joint) => joint.name === actuator.joint && TURNS.includes(joint.kind)));
 
 /** Whether a robot that stands on its own would collapse when physics runs, because nobody has commanded it yet. */
 export const limp = (art, state) => canHold(art) && !state?.targets && art.joints.some((joint) => joint.kind === "free")

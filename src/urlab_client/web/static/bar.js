@@ -151,7 +151,8 @@ function show(status) {
   for (const part of [document.querySelector("main"), ...document.querySelectorAll("#bar .acts")]) part.inert = !now.socket;
   if (!status || !now.socket) return;
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
-  text(ui.address, status.address);
+  if (status.replay?.alone) text(ui.link, "Recording"); // there is no server to be connected with
+  text(ui.address, status.replay?.alone ? "" : status.address);
   text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "paused");
   text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
   const unreachable = ["lost", "connecting"].includes(link) && !status.replay;

@@ -14,6 +14,7 @@ const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => a
   PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
 const placing = h("button", { class: "quiet", id: "placing", title: "Also place the simulation's robots: its cameras follow, and its mode is puppet meanwhile",
   onclick: togglePlacing }, "Also move the simulation");
+const end = h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live");
 let replay = null;
 let wanted = null;
 let seeking = false;
@@ -54,8 +55,7 @@ function keys(event) {
 }
 
 export function makeReplay() {
-  $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing,
-    h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live"));
+  $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing, end);
   // Stick below the bar if that is sticky, so that both stay visible while the user scrolls.
   new ResizeObserver(() => {
     $("replay").style.top = getComputedStyle($("bar")).position === "sticky" ? `${$("bar").offsetHeight}px` : "0";
@@ -64,6 +64,7 @@ export function makeReplay() {
     replay = status.replay;
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
+    document.body.classList.toggle("serverless", replay?.alone ?? false);
     // Controls of the simulation would act unseen.
     for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = replay !== null;
     if (!replay) return;

@@ -131,8 +131,8 @@ class Robot {
 
 const hold = (articulation, holding) => ask("POST", "api/hold", { [articulation]: holding });
 
-/** Before physics runs: make those robots hold their pose that would collapse. */
-export const steady = () => Promise.all(robots.filter((robot) => limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key))
+/** Before physics runs: make those robots hold their pose that would collapse, unless the editor's panel drives them. */
+export const steady = () => Promise.all(robots.filter((robot) => now.status.source !== "ui" && limp(robot.art, now.state?.articulations[robot.key]) && !now.status.holding.includes(robot.key))
   .map((robot) => hold(robot.key, true)));
 
 const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
