@@ -111,14 +111,13 @@ def _print_links(new_link: Callable[[], str]) -> None:
     if hasattr(signal, "SIGTTIN"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})  # in the background, reading fails instead
     while True:
-        try:
-            if not os.read(
-                sys.stdin.fileno(), 1024
-            ):  # not a method of stdin, whose lock would hinder the program's end
-                return
+        try:  # not a method of stdin, whose lock would hinder the program's end
+            entered = os.read(sys.stdin.fileno(), 1024)
         except OSError:  # in the background, from which the shell may bring it back
             time.sleep(_BACKGROUND_S)
             continue
+        if not entered:
+            return
         print(f"{new_link()} (good for one browser)", flush=True)
 
 
