@@ -145,7 +145,7 @@ def same(what: str, expected: Any, got: Any, tolerance: float = 0.0) -> None:
         gap = np.abs(one - other) > tolerance * np.maximum(1.0, np.abs(one))
         if np.any(gap | (np.isnan(one) != np.isnan(other))):
             at = int(np.argmax(gap))
-            raise Differs(f"{what}[{at}] = {one.flat[at]!r}", f"{other.flat[at]!r}")
+            raise Differs(f"{what}[{at}] = {one.item(at)!r}", other.item(at))
     elif isinstance(expected, float) and tolerance and isinstance(got, int | float):
         holds(abs(expected - got) <= tolerance, f"{what} = {expected!r}", got)
     else:
