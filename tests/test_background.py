@@ -44,6 +44,7 @@ AWAITED = {
     "sync/_loop.py:_end": "likewise",
     "console/file_jobs.py:run_job": "waits for the task and raises its error",
     "web/file_routes.py:_while_present": "waits for both tasks, and raises the error of the job",
+    "conformance/bench.py:to_the_end": "waits for the task and raises its error",
     "console/session.py:open": "starts `_run`, in which errors cannot leave `kept_running`",
     "integrations/forwarding.py:until_first": "the task group of one connection, which ends with the error",
     "integrations/gym/vector.py:_move_all": "waits for all tasks; the caller gets each result or error",

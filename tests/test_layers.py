@@ -50,7 +50,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         "sync",
     },
     "cluster": VALUES | {"_installation", "_platform", "integrations", "protocol", "sync", "types"},
-    "console": VALUES | {"_installation", "aio", "events", "integrations", "protocol", "types"},
+    "console": VALUES | {"_installation", "_mujoco", "aio", "events", "integrations", "protocol", "types"},
     "web": VALUES | {"_installation", "aio", "console", "events", "integrations", "protocol", "types"},
     "mcp": VALUES | {"_installation", "aio", "console", "integrations", "protocol", "types", "web"},
     "conformance": VALUES | {"_installation", "aio", "keys", "protocol"},

@@ -48,7 +48,10 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
             "--keyframe cannot be combined with --task, which determines the start",
         ),
         (["record", "x.csv"], "x.csv: write a file that ends in .mcap, for example x.mcap"),
-        (["view", "run.mcap", "--web"], "--web shows a recording beside the robots that run"),
+        (
+            ["console", "run.mcap", "--mjcf-options"],
+            "--handshake and --mjcf-options are for servers, not for a recording",
+        ),
         (["view", "--foxglove", "--page"], "--save, --connect and --page require --rerun"),
         (["view", "--rerun", "--connect", "rerun+http://localhost:9876/proxy", "--page"], "give one of --save"),
         (["view", "--web", "--sensors"], "--camera, --sensors and --seconds do not apply to --web"),

@@ -105,7 +105,7 @@ def test_a_request_that_we_do_not_declare_is_named_once(server: SimulatedServer,
     ("arguments", "said"),
     [
         (["sim://arm"], "sim://arm cannot be relayed: give tcp://HOST or tcp://HOST:PORT"),
-        (["tcp://localhost", "--listen", "here"], "--listen: 'here' is not a port, nor HOST:PORT"),
+        (["tcp://localhost", "--listen", "here"], "--listen: 'here' is not a port below 65535, nor HOST:PORT"),
         (["tcp://localhost", "--save", "kept.mcap"], "kept.mcap exists; choose another name"),
         (["tcp://localhost", "--save", "session.zip"], "session.zip"),
         (["--replay", "kept.mcap"], "kept.mcap is not a recorded session"),

@@ -129,6 +129,7 @@ async def test_a_pinned_mode_is_left_alone(connect: Any, serve: Any, models: Pat
         assert (await client.step()).step == 2
 
 
+@pytest.mark.opengl
 async def test_a_live_step_brings_pictures_where_the_server_sends_them(connect: Any, serve: Any, dialect: str) -> None:
     with serve("arm", play=True) as server:
         client = connect(server, step_mode="live")

@@ -21,7 +21,7 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
-from urlab_client.errors import ConnectionLost, NotReady, OutcomeUnknown, URLabError, URLabTimeoutError
+from urlab_client.errors import ConnectionLost, NotReady, OutcomeUnknown, ProtocolError, URLabError, URLabTimeoutError
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app, endpoints
 from urlab_client.web.endpoints import explain_error
@@ -388,7 +388,8 @@ def test_the_pace_of_the_simulation_is_shown(http: TestClient) -> None:
         (URLabTimeoutError("step: no reply", op="step"), 504, "timeout", "step: no reply"),
         (OutcomeUnknown("step: lost", op="step"), 502, "outcome_unknown", "step: lost"),
         (ConnectionLost("step: gone", op="step"), 503, "unreachable", "step: gone"),
-        (URLabError("odd"), 502, "failed", "odd"),
+        (URLabError("odd"), 409, "refused", "odd"),
+        (ProtocolError("step: not msgpack", op="step"), 502, "failed", "step: not msgpack"),
         (FileNotFoundError(2, "No such file", "x"), 500, "io_failed", "[Errno 2] No such file: 'x'"),
         (ValueError("7 is too many"), 400, "bad_request", "7 is too many"),
     ],
