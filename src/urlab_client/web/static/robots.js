@@ -21,7 +21,7 @@ class Robot {
       onclick: () => hold(art.key, this.hold.getAttribute("aria-pressed") !== "true") }, "Hold pose");
     // Once shown, it keeps its place: what is below must not move from under a finger.
     this.still = h("div", { class: "line still", hidden: !canHold(art) }, this.said, h("span", { class: "space" }), canHold(art) ? this.hold : null);
-    const why = h("button", { class: "quiet", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
+    const why = h("button", { class: "quiet why", title: "Check everything from the sockets to the set-points", onclick: () => explain(art.key) }, "Why does it not move?");
     const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
     this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
       h("h2", {}, art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
