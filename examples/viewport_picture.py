@@ -1,4 +1,4 @@
-"""Debug drawing in the viewport of a simulated server. Makes the picture in docs/simulated-server.md."""
+"""Debug drawing in the viewport of a simulated server. Makes the picture in docs/simulated-server-pictures.md."""
 
 import math
 

@@ -2,8 +2,8 @@
 
 The pages at the root of the repository belong to the site, too, and links between the two work in both places. Files
 that are not pages, such as sources, are named but not linked. In the navigation, pages `NAME-….md` stand below
-the page `NAME.md` that lists them, in its order; a page that the navigation does not mention is put at its end. Code
-blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
+the page `NAME.md` that lists them, in its order; a page that the navigation does not mention is put at its end. Links
+to headings that moved from `NAME.md` to one of those pages still lead to them, by `docs/assets/moved.js`. Code blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P
 _TAB = re.compile(
     r"^<!-- tab: (?P<name>[^\n]+?) -->\n(?P<body>```.*?^```$(?:\n\n```text\n.*?^```$)?)", re.MULTILINE | re.DOTALL
 )
+_HEADING = re.compile(r"^#+ +(.*?) *$", re.MULTILINE)
 _CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -83,7 +84,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead links to where the site has the page; take those away that lead out of it."""
-    del config
     uri = page.file.src_uri
     if boost := next((boost for start, boost in _BOOSTS.items() if uri.startswith(start)), None):
         page.meta["search"] = {"boost": boost}
@@ -93,7 +93,32 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     for block in _CODE.finditer(markdown):
         kept += [_LINK.sub(lambda link: _link(link, source, uri, files), markdown[end : block.start()]), block[0]]
         end = block.end()
-    return tabs("".join([*kept, _LINK.sub(lambda link: _link(link, source, uri, files), markdown[end:])]))
+    kept.append(_LINK.sub(lambda link: _link(link, source, uri, files), markdown[end:]))
+    return with_moved(tabs("".join(kept)), Path(config.docs_dir) / uri)
+
+
+def with_moved(markdown: str, page: Path) -> str:
+    """Return a page `NAME.md` with the anchors of the pages `NAME-….md` where it first links to each.
+
+    Args:
+        markdown: The page, as it is to be shown.
+        page: Where it comes from; the pages below it are in the same folder.
+    """
+    known = _anchors(markdown)
+    for name in dict.fromkeys(re.findall(rf"\]\(({re.escape(page.stem)}-[\w-]+)\.md", markdown)):
+        moved = [anchor for anchor in _anchors((page.parent / f"{name}.md").read_text("utf-8")) if anchor not in known]
+        known.update(dict.fromkeys(moved))
+        targets = "".join(f'<a id="{anchor}" data-moved="{name}.html#{anchor}"></a>' for anchor in moved)
+        markdown = re.sub(
+            rf"\[[^]]*\]\({re.escape(name)}\.md", lambda link, to=targets: to + link[0], markdown, count=1
+        )
+    return markdown
+
+
+def _anchors(markdown: str) -> dict[str, None]:
+    """Return the anchors of a page's headings in order, as the site makes them."""
+    headings = _HEADING.findall(_CODE.sub("", markdown))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-"): None for heading in headings}
 
 
 def tabs(markdown: str) -> str:

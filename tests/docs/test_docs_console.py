@@ -1,4 +1,4 @@
-"""The requests that `docs/console.md` makes with curl, made as written to the console that the page starts."""
+"""The requests that `docs/console-api.md` makes with curl, made as written to the console that `docs/console.md` starts."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pages import ROOT, Block, blocks
 from shell import Shell, same, steps
 from waiting import eventually
 
-PAGE = ROOT / "docs" / "console.md"
+DOCS = ROOT / "docs"
 
 
-def block_with(text: str) -> Block:
-    (block,) = [block for block in blocks(PAGE) if text in block.code]
+def block_with(page: str, text: str) -> Block:
+    (block,) = [block for block in blocks(DOCS / page) if text in block.code]
     return block
 
 
@@ -42,10 +42,9 @@ def knows_the_robots(port: int, key: str) -> bool:
 
 
 def test_the_requests_work_as_shown(tmp_path: Path) -> None:
-    (serve,) = [
-        command for command, _ in steps(block_with("urlab console")) if command.startswith("urlab console 'sim:")
-    ]
-    login, *others = steps(block_with("curl"))
+    commands = [command for command, _ in steps(block_with("console.md", "urlab console"))]
+    (serve,) = [command for command in commands if command.startswith("urlab console 'sim:")]
+    login, *others = steps(block_with("console-api.md", "curl"))
     shell = Shell(tmp_path)
     try:
         link = shell.run(serve)

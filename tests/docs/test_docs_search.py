@@ -1,4 +1,4 @@
-"""The search of the built site, as a browser runs it: answers come before classes, and common words have a hit."""
+"""The built site in a browser: its search puts answers before classes, and links to headings that moved lead there."""
 
 from __future__ import annotations
 
@@ -84,3 +84,17 @@ def test_common_words_lead_to_an_answer(browser: Page, site: str, word: str) -> 
 @pytest.mark.parametrize("name", ["set_ctrl", "state_stream"])
 def test_names_of_the_api_lead_to_the_reference(browser: Page, site: str, name: str) -> None:
     assert first_hit(browser, site, name).startswith("reference/")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("console.html#http", "console-api.html#http"),
+        ("simulated-server.html#pictures", "simulated-server-pictures.html#pictures"),
+        ("console.html#access", "console.html#access"),
+    ],
+)
+def test_old_links_lead_to_where_a_heading_is(browser: Page, site: str, old: str, new: str) -> None:
+    browser.driver.get(f"{site}/{old}")
+    browser.until(f"location.href === '{site}/{new}'")
+    browser.until(f"document.querySelector('h1{new[new.index('#') :]}, h2{new[new.index('#') :]}') !== null")

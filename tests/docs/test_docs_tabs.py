@@ -57,6 +57,16 @@ def test_the_navigation_goes_as_deep_as_pages_list_others(hooks: Any) -> None:
     assert {"Tasks": "reference/integrations-gym-tasks.md"} in gym
 
 
+def test_links_to_headings_that_moved_lead_to_their_page(hooks: Any, tmp_path: Path) -> None:
+    page = tmp_path / "arm.md"
+    (tmp_path / "arm-hand.md").write_text("# The hand\n\n## Use\n\n## What `grip` does\n\n```sh\n# no heading\n```\n")
+    made = hooks.with_moved("# The arm\n\n## Use\n\nIt has [a hand](arm-hand.md), [which](arm-hand.md) grips.\n", page)
+    anchors = "".join(
+        f'<a id="{anchor}" data-moved="arm-hand.html#{anchor}"></a>' for anchor in ("the-hand", "what-grip-does")
+    )
+    assert made == f"# The arm\n\n## Use\n\nIt has {anchors}[a hand](arm-hand.md), [which](arm-hand.md) grips.\n"
+
+
 def test_the_site_makes_tabs_of_neighbours_only(hooks: Any) -> None:
     tab = "<!-- tab: {0} -->\n```python\n{1}\n```\n"
     first, second, third = tab.format("Blocking", "a"), tab.format("Async", "b"), tab.format("Blocking", "c")
