@@ -1,9 +1,10 @@
 """What the site adds to the pages in `docs/`, as hooks of MkDocs.
 
 The pages at the root of the repository belong to the site, too, and links between the two work in both places. Files
-that are not pages, such as sources, are named but not linked. In the navigation, pages `NAME-….md` stand below
-the page `NAME.md` that lists them, in its order; a page that the navigation does not mention is put at its end. Links
-to headings that moved from `NAME.md` to one of those pages still lead to them, by `docs/assets/moved.js`. Code blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
+that are not pages, such as sources, are named but not linked. In the navigation, pages `NAME-….md` stand below the page
+`NAME.md` that lists them, in its order; a page that the navigation does not mention is put at its end. Links to
+headings that moved from `NAME.md` to one of those pages still lead to them, by `docs/assets/moved.js`. Code blocks
+under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
 """
 
 from __future__ import annotations

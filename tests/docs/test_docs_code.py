@@ -27,7 +27,9 @@ SERVICES = {"dockerfile", "ini", "nginx"}
 
 LONG = {
     "README.md",
+    "docs/console-api.md",
     "docs/console.md",
+    "docs/environments-many.md",
     "docs/environments.md",
     "docs/howto/agents.md",
     "docs/howto/cameras.md",
@@ -42,11 +44,15 @@ LONG = {
     "docs/policies.md",
     "docs/quickstart.md",
     "docs/randomisation.md",
+    "docs/recording-convert.md",
+    "docs/recording-episodes.md",
     "docs/recording.md",
     "docs/reference/blocking.md",
     "docs/shared-memory.md",
+    "docs/simulated-server-pictures.md",
     "docs/simulated-server.md",
     "docs/start.md",
+    "docs/tasks-details.md",
     "docs/tasks.md",
     "docs/teleoperation.md",
 }

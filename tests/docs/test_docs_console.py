@@ -1,4 +1,4 @@
-"""The requests that `docs/console-api.md` makes with curl, made as written to the console that `docs/console.md` starts."""
+"""The requests of `docs/console-api.md`, made as written to the console that `docs/console.md` starts."""
 
 from __future__ import annotations
 
