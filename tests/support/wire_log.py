@@ -23,12 +23,12 @@ class WireLog:
         transport: Any = client._transport
         send = transport.request
 
-        async def noted(frame: bytes, op: Any, **limits: Any) -> bytes:
+        async def noted(frame: bytes, op: Any, deadlines: Any, **late: Any) -> bytes:
             entry = msgspec.msgpack.decode(frame)
             before = transport.stats.sent
             self.requests.append(entry)
             try:
-                answer = await send(frame, op, **limits)
+                answer = await send(frame, op, deadlines, **late)
                 entry["reply"] = msgspec.msgpack.decode(answer)
                 return answer
             finally:
