@@ -320,16 +320,12 @@ class Session:
             check_finite(request)
             if not self._json:
                 check_request(request, frame)
-        late = self._adopt_later if op is _HELLO else None
-        sent, began = self.transport.stats.sent, time.perf_counter()
+        began = time.perf_counter()
         try:
             try:
-                answer = await self._way.request(frame, op, deadlines, late=late)
+                answer = await self._ask(frame, op, deadlines)
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, deadlines)
-            finally:
-                if late is not None and self.transport.stats.sent > sent:
-                    self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
             if log.isEnabledFor(logging.DEBUG):
                 took = 1e3 * (time.perf_counter() - began)
                 log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
@@ -411,13 +407,24 @@ class Session:
             self._adopt_abandoned_hello(reply)
         return self._abandoned_hello is None
 
+    def _ask(self, frame: bytes, op: Op, deadlines: Deadlines) -> Coroutine[Any, Any, bytes]:
+        return self._greet(frame, deadlines) if op is _HELLO else self._way.request(frame, op, deadlines)
+
+    async def _greet(self, frame: bytes, deadlines: Deadlines) -> bytes:
+        """Send a handshake, which opens a session even if its caller gives up."""
+        sent = self.transport.stats.sent
+        try:
+            return await self._way.request(frame, _HELLO, deadlines, late=self._adopt_later)
+        finally:
+            if self.transport.stats.sent > sent:
+                self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
+
     async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, deadlines: Deadlines) -> bytes:
         """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
-        late = self._adopt_later if op is _HELLO else None
         while True:
             log.debug("%s: sending the request again, because the connection was lost", op.name)
             try:
-                return await self._way.request(frame, op, deadlines, late=late)
+                return await self._ask(frame, op, deadlines)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:
