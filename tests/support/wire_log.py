@@ -21,7 +21,8 @@ class WireLog:
     def __init__(self, client: URLabClient) -> None:
         self.requests: list[dict[str, Any]] = []
         transport: Any = client._transport
-        send = transport.request
+        way = transport.shared or transport
+        send = way.request
 
         async def noted(frame: bytes, op: Any, deadlines: Any, **late: Any) -> bytes:
             entry = msgspec.msgpack.decode(frame)
@@ -35,7 +36,7 @@ class WireLog:
                 if transport.stats.sent == before:
                     self.requests.remove(entry)
 
-        transport.request = noted
+        way.request = noted
 
     def of(self, op: str) -> list[dict[str, Any]]:
         """Return the requests of one op."""

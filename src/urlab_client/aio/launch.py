@@ -186,7 +186,7 @@ class LaunchedTransport(ZmqTransport):
         self._process: _ServerProcess | None = None
         self.scene_warnings: tuple[str, ...] = ()
 
-    async def send(self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None) -> bytes:
+    async def request(self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None) -> bytes:
         """See `ZmqTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         If the server has died, a handshake starts another one; the new server would refuse any other request.
@@ -203,7 +203,7 @@ class LaunchedTransport(ZmqTransport):
             took = loop.time() - before
             reply, connect = (None if by is None else by + took for by in (deadlines.reply, deadlines.connect))
             deadlines = Deadlines(reply, connect)
-        return await super().send(frame, op, deadlines, late=late)
+        return await super().request(frame, op, deadlines, late=late)
 
     async def aclose(self) -> None:
         """See `ZmqTransport.aclose`. Waits a bounded time for the server to end."""

@@ -38,6 +38,7 @@ class CallRecords:
             raise TypeError("observe= takes a plain function, not an async one, because it is called during a request")
         self._observe = observe
         self._transport = transport
+        self._way = transport.shared or transport
         self._sent_bytes = 0
         self._received_bytes = 0
         self._on_the_way = 0.0
@@ -46,7 +47,7 @@ class CallRecords:
         self._sent_bytes += len(frame)
         began = time.perf_counter()
         try:
-            answer = await self._transport.request(frame, op, deadlines, late=late)
+            answer = await self._way.request(frame, op, deadlines, late=late)
         finally:
             self._on_the_way += time.perf_counter() - began
         self._received_bytes += len(answer)

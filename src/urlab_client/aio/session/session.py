@@ -112,7 +112,7 @@ class Session:
         self._lost_to_restart = ""
         self.transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
-        self._way = self._call_records or transport
+        self._way = self._call_records or transport.shared or transport
         self.default_timeout = default_timeout
         self._json = json
         self.control: Control = Control(self, wanted=claim_control)

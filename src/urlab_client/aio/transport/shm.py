@@ -153,7 +153,7 @@ class ShmRequests:
                         self._largest_state = len(answer)
                     return answer
         self._stats.over_zmq[why_zmq] = self._stats.over_zmq.get(why_zmq, 0) + 1
-        answer = await self._over_zmq.send(frame, op, deadlines, late=late)
+        answer = await self._over_zmq.request(frame, op, deadlines, late=late)
         if (
             has_state and not pictures and envelope_of(answer, op).op == op.reply_name
         ):  # a refusal does not show the size of the state

@@ -11,8 +11,8 @@ import asyncio
 import errno
 import logging
 import time
-from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import zmq
 
@@ -114,10 +114,10 @@ class ZmqTransport:
         """Whether the server has yet to answer a request whose caller gave up, so that it may still execute it."""
         return bool(self._abandoned)
 
-    def request(
+    async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
         self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None
-    ) -> Coroutine[Any, Any, bytes]:
-        """Send `frame` and return the reply's bytes.
+    ) -> bytes:
+        """Send `frame` over ZeroMQ and return the reply's bytes.
 
         Args:
             frame: The encoded request.
@@ -133,13 +133,6 @@ class ZmqTransport:
             OutcomeUnknown: The connection broke after sending; the op may have been executed.
             ClientClosed: The client was closed.
         """
-        send = self.send if self.shared is None else self.shared.request
-        return send(frame, op, deadlines, late=late)
-
-    async def send(  # noqa: PLR0912  # each call between a step and its socket costs every step
-        self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None
-    ) -> bytes:
-        """See `request`, over ZeroMQ."""
         opened = self._open
         if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
             opened = self._connect()
