@@ -43,6 +43,14 @@ def spans(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -
     return first + np.arange(lengths.sum(), dtype=np.intp)
 
 
+def contiguous(places: NDArray[np.intp]) -> slice | NDArray[np.intp]:
+    """Return places as a slice if they follow each other: that is written three times as fast."""
+    ordered: list[int] = places.tolist()
+    if ordered and ordered == list(range(ordered[0], ordered[0] + len(ordered))):
+        return slice(ordered[0], ordered[0] + len(ordered))
+    return places
+
+
 _NO_COLOUR = (0.5, 0.5, 0.5, 1.0)  # of geoms, as MuJoCo compiles them
 _NAME_ADDRESSES = {
     "body": "name_bodyadr",

@@ -138,7 +138,7 @@ async def test_silence_is_a_timeout_and_the_late_reply_is_dropped(client: Any, s
     await client.discover()
     call = await expired(client, client.runtime.set_paused(True, timeout=5), scripted.held.qsize)
     with pytest.raises(
-        URLabTimeoutError, match=r"set_paused: no reply from .* within (4999|5000) ms.*may still be executed"
+        URLabTimeoutError, match=r"set_paused: no reply from .* within (49\d\d|5000) ms.*may still be executed"
     ):
         await call
     scripted.release({"op": "set_paused_ok", "paused": False})

@@ -10,6 +10,7 @@ import zmq
 from waiting import DEADLINE_S
 
 from urlab_client.aio.transport import waiting
+from urlab_client.aio.transport.base import Deadlines
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.registry import OPS
 
@@ -32,7 +33,7 @@ async def test_replies_that_come_twice_keep_no_later_one_waiting(monkeypatch: py
                 for number in range(20):
                     frame = msgspec.msgpack.encode(number)
                     answered = asyncio.create_task(asyncio.to_thread(answer))
-                    assert await transport.request(frame, op, deadline=None, connect_by=None) == frame
+                    assert await transport.request(frame, op, Deadlines(None, None)) == frame
                     await answered
         finally:
             await transport.aclose()
@@ -48,7 +49,7 @@ async def test_of_handshakes_that_are_given_up_the_last_alone_is_awaited() -> No
 
         async def abandon() -> list[bytes]:
             asking = asyncio.ensure_future(
-                transport.request(b"", OPS["hello"], deadline=None, connect_by=None, late=abandoned.append)
+                transport.request(b"", OPS["hello"], Deadlines(None, None), late=abandoned.append)
             )
             arrived = await asyncio.to_thread(router.recv_multipart)
             asking.cancel()
@@ -63,7 +64,7 @@ async def test_of_handshakes_that_are_given_up_the_last_alone_is_awaited() -> No
                     router.send_multipart(envelope)
                 assert await abandoned[2] == b""
                 await abandon()  # and is never answered
-                asking = asyncio.create_task(transport.request(b"", OPS["meta"], deadline=None, connect_by=None))
+                asking = asyncio.create_task(transport.request(b"", OPS["meta"], Deadlines(None, None)))
                 router.send_multipart(await asyncio.to_thread(router.recv_multipart))
                 await asking
                 assert abandoned[3].cancelled()

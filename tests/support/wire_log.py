@@ -21,21 +21,22 @@ class WireLog:
     def __init__(self, client: URLabClient) -> None:
         self.requests: list[dict[str, Any]] = []
         transport: Any = client._transport
-        send = transport.request
+        way = transport.shared or transport
+        send = way.request
 
-        async def noted(frame: bytes, op: Any, **limits: Any) -> bytes:
+        async def noted(frame: bytes, op: Any, deadlines: Any, **late: Any) -> bytes:
             entry = msgspec.msgpack.decode(frame)
             before = transport.stats.sent
             self.requests.append(entry)
             try:
-                answer = await send(frame, op, **limits)
+                answer = await send(frame, op, deadlines, **late)
                 entry["reply"] = msgspec.msgpack.decode(answer)
                 return answer
             finally:
                 if transport.stats.sent == before:
                     self.requests.remove(entry)
 
-        transport.request = noted
+        way.request = noted
 
     def of(self, op: str) -> list[dict[str, Any]]:
         """Return the requests of one op."""

@@ -119,22 +119,22 @@ class ClientState(Local):
     @property
     def sim_time_sec(self) -> int:
         """Whole seconds of the simulation time."""
-        return self._state.clocks.sim_time_sec
+        return self._state.clocks.sim_clock.sec
 
     @property
     def sim_time_nsec(self) -> int:
         """Nanoseconds within the second of the simulation time."""
-        return self._state.clocks.sim_time_nsec
+        return self._state.clocks.sim_clock.nsec
 
     @property
     def wall_time_sec(self) -> int:
         """Whole seconds of the server's UTC clock when the last reply was built."""
-        return self._state.clocks.wall_time_sec
+        return self._state.clocks.wall_clock.sec
 
     @property
     def wall_time_nsec(self) -> int:
         """Nanoseconds within the second of the server's UTC clock when the last reply was built."""
-        return self._state.clocks.wall_time_nsec
+        return self._state.clocks.wall_clock.nsec
 
     @property
     def recv_wall_time_ns(self) -> int:

@@ -29,7 +29,7 @@ from msgspec import Struct
 
 from urlab_client._platform.signals import APART
 from urlab_client.aio.background import Tell, background_thread
-from urlab_client.aio.transport.base import LateReply
+from urlab_client.aio.transport.base import Deadlines, LateReply
 from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.shm import ShmRequests
 from urlab_client.aio.transport.shm_regions import ServerRegions
@@ -186,9 +186,7 @@ class LaunchedTransport(ZmqTransport):
         self._process: _ServerProcess | None = None
         self.scene_warnings: tuple[str, ...] = ()
 
-    async def send(
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> bytes:
+    async def request(self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None) -> bytes:
         """See `ZmqTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         If the server has died, a handshake starts another one; the new server would refuse any other request.
@@ -203,9 +201,9 @@ class LaunchedTransport(ZmqTransport):
             before = loop.time()
             await self._launch(op)
             took = loop.time() - before
-            deadline = None if deadline is None else deadline + took
-            connect_by = None if connect_by is None else connect_by + took
-        return await super().send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+            reply, connect = (None if by is None else by + took for by in (deadlines.reply, deadlines.connect))
+            deadlines = Deadlines(reply, connect)
+        return await super().request(frame, op, deadlines, late=late)
 
     async def aclose(self) -> None:
         """See `ZmqTransport.aclose`. Waits a bounded time for the server to end."""

@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Struct, inspect
 
 from urlab_client.aio.launch import transport_to
+from urlab_client.aio.transport.base import Deadlines
 from urlab_client.aio.transport.connection import ClientKeys
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
@@ -87,9 +88,8 @@ class Wire:
         loop = asyncio.get_running_loop()
         limit = max(self._timeout, op.timeout or 0.0) if timeout is None else timeout
         started = time.perf_counter()
-        reply = await self.transport.request(
-            request, op, deadline=loop.time() + limit, connect_by=loop.time() + self._timeout
-        )
+        way = self.transport.shared or self.transport
+        reply = await way.request(request, op, Deadlines(loop.time() + limit, loop.time() + self._timeout))
         took = time.perf_counter() - started
         self.count += 1
         kept = request[:_KEPT_BYTES], reply if len(reply) <= _KEPT_BYTES else thinned(reply)[:_KEPT_BYTES]

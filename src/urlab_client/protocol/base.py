@@ -139,7 +139,7 @@ class Op:
     dialects: tuple[DialectName, ...] = ("alpha", "beta")
     job: bool = False
     name: str = field(init=False)
-    reply: type[Reply] = field(init=False)
+    reply: type[Any] = field(init=False)  # a `Reply`; which one, only the request's type can tell a type checker
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", str(self.request.__struct_config__.tag))

@@ -20,6 +20,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from urlab_client.errors import ProtocolError, rpc_error
 from urlab_client.protocol.base import Needs, Op, Reply, Request
@@ -119,8 +120,7 @@ def encode_request(request: Request[Any], session_id: str, *, json: bool = False
         ValueError: The request is larger than `MAX_REQUEST_BYTES`.
     """
     if request.session_id != session_id:
-        request = cast("Any", request).__copy__()  # what `copy.copy` calls after looking it up
-        request.session_id = session_id
+        request = replace(request, session_id=session_id)
     try:
         frame = _json_ascii(request) if json else _encoder.encode(request)
     except TypeError as error:
@@ -226,6 +226,7 @@ def decode_answer(op: Op, reply: type[R], frame: Buffer) -> R | OpStarted:
     """
     if len(frame) > MAX_REPLY_BYTES:
         raise ProtocolError(f"{op.name}: a reply of {len(frame)} bytes exceeds the limit {MAX_REPLY_BYTES}", op=op.name)
+    answer: Any
     try:
         if frame[:1] == b"{":
             answer = _converted(reply, _restore_binary(msgspec.json.decode(frame)))
@@ -235,7 +236,7 @@ def decode_answer(op: Op, reply: type[R], frame: Buffer) -> R | OpStarted:
         raise _not_an_answer(op, error, bytes(frame[:256])) from error
     if isinstance(answer, ErrorReply):
         raise _refusal(op, answer, _plain(frame))
-    return cast("R | OpStarted", answer)
+    return answer
 
 
 def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:

@@ -265,8 +265,8 @@ class CallerDrivenLoop:
             # In a loop, because anything may stop the loop: another caller that wants the turn, or code of a task.
             while not (job.finished or signals.arrived or self._ended):
                 self._run_loop()
-            self._driven = None
         finally:
+            self._driven = None
             self._left = time.monotonic()
             self._turn.release()
             # Only now: a job that was queued before the release saw the turn held and woke nobody (rule 3).
@@ -339,9 +339,10 @@ class CallerDrivenLoop:
         # Dropped here, not by the caller: Python prints what a signal handler raises during weak-reference callbacks.
         job.task = None
         job.finished = True
-        job.wake()
         if self._driven is job:
             self._loop.stop()
+        else:
+            job.wake()
 
     # The thread
 

@@ -32,17 +32,18 @@ class DeferredSignals:
     not handled take effect there, one by one, as if all of them arrived then.
 
     Attributes:
+        arrived: Signals that have arrived and not been handled, each with the frame that it interrupted.
         on_arrival: Callback invoked when a signal arrives, between any two instructions of the block. Must not raise.
     """
 
-    __slots__ = ("_arrived", "_handlers", "_holding", "_numbers", "on_arrival")
+    __slots__ = ("_handlers", "_holding", "_numbers", "arrived", "on_arrival")
 
     def __init__(self) -> None:
         self.on_arrival: Callable[[], object] | None = None
         self._holding = False
         self._numbers: list[int] = []
         self._handlers: list[Any] = []
-        self._arrived: list[tuple[int, FrameType | None]] = []
+        self.arrived: list[tuple[int, FrameType | None]] = []
 
     def __enter__(self) -> Self:
         if threading.get_ident() == threading.main_thread().ident:
@@ -69,19 +70,14 @@ class DeferredSignals:
         if self._holding:
             self._put_back()
 
-    @property
-    def arrived(self) -> bool:
-        """Whether a signal has arrived and not been handled."""
-        return bool(self._arrived)
-
     def let_in(self) -> BaseException | None:
         """Run the handlers of arrived signals; return the exception of the first one that raises.
 
         The remaining signals stay deferred. The handlers stay replaced, so that none can interrupt this code.
         """
         try:
-            while self._arrived:
-                number, frame = self._arrived.pop(0)
+            while self.arrived:
+                number, frame = self.arrived.pop(0)
                 handler = _get_handler(number)
                 if handler == self._on_signal:  # unless another one was installed in the meantime
                     handler = self._replaced(number)
@@ -101,7 +97,7 @@ class DeferredSignals:
         mine = self._on_signal
         restored = [*zip(self._numbers, self._handlers, strict=False)]
         restored = [pair for pair in restored if _get_handler(pair[0]) == mine]  # others were replaced in the meantime
-        undelivered = map(_raise_soon, map(itemgetter(0), self._arrived))  # those that are still to come included
+        undelivered = map(_raise_soon, map(itemgetter(0), self.arrived))  # those that are still to come included
         try:
             _consume(starmap(_set_handler, restored))
         except BaseException:  # raised by a handler that was already restored; it ran once, so the second try succeeds
@@ -124,7 +120,7 @@ class DeferredSignals:
             # At the edges of the block, and after it if several signals have arrived there: run the handler directly.
             self._replaced(number)(number, frame)
             return
-        if all(number != other for other, _ in self._arrived):
-            self._arrived.append((number, frame))
+        if all(number != other for other, _ in self.arrived):
+            self.arrived.append((number, frame))
         if self.on_arrival is not None:
             self.on_arrival()

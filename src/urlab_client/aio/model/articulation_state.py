@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from urlab_client._mujoco import control_counts, control_starts
+from urlab_client._mujoco import contiguous, control_counts, control_starts
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, ArticulationLayout
 from urlab_client.aio.model.mirror import Mirror
 from urlab_client.enums import ControllerKind, ControlMode
@@ -201,6 +201,7 @@ class MirroredArticulation(MirroredEntity):
         data = self.mirror.data
         # Looking up MuJoCo's arrays takes as long as writing to them.
         self._mirrored = None if data is None else (data.qpos, data.qvel, data.ctrl, data.act)
+        self._places = contiguous(layout.qpos_adr), contiguous(layout.qvel_adr), contiguous(layout.ctrl_adr)
         if keep:
             return
         self.qpos: Floats = np.zeros(0) if data is None else data.qpos[layout.qpos_adr]
@@ -306,14 +307,14 @@ class MirroredArticulation(MirroredEntity):
         if state.actions is not None:
             self.actions = state.actions
         if into_mirror and self._mirrored is not None:
-            layout = self.layout
             all_qpos, all_qvel, all_ctrl, all_act = self._mirrored
-            all_qpos[layout.qpos_adr] = qpos
-            all_qvel[layout.qvel_adr] = qvel
+            qpos_places, qvel_places, ctrl_places = self._places
+            all_qpos[qpos_places] = qpos
+            all_qvel[qvel_places] = qvel
             if ctrl is not None:
-                all_ctrl[layout.ctrl_adr] = ctrl
-            if act is not None and len(layout.act_adr):
-                all_act[layout.act_adr] = act[layout.act_from]
+                all_ctrl[ctrl_places] = ctrl
+            if act is not None and len(all_act):
+                all_act[self.layout.act_adr] = act[self.layout.act_from]
 
     def write_set_points(self) -> None:
         """Write the set-points to the mirror's `ctrl` if they changed since the last call, for a puppet step.

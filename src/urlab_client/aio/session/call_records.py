@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 from urlab_client.aio.client_types import CallOutcome, CallRecord
-from urlab_client.aio.transport.base import LateReply
+from urlab_client.aio.transport.base import Deadlines, LateReply
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import URLabConnectionError, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.base import Op
@@ -38,17 +38,16 @@ class CallRecords:
             raise TypeError("observe= takes a plain function, not an async one, because it is called during a request")
         self._observe = observe
         self._transport = transport
+        self._way = transport.shared or transport
         self._sent_bytes = 0
         self._received_bytes = 0
         self._on_the_way = 0.0
 
-    async def request(
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> bytes:
+    async def request(self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None) -> bytes:
         self._sent_bytes += len(frame)
         began = time.perf_counter()
         try:
-            answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+            answer = await self._way.request(frame, op, deadlines, late=late)
         finally:
             self._on_the_way += time.perf_counter() - began
         self._received_bytes += len(answer)

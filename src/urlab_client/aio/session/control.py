@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 from urlab_client.aio.background import background_task
 from urlab_client.aio.defaults import Timeout
-from urlab_client.aio.session.turn import Deadlines
+from urlab_client.aio.transport.base import Deadlines
 from urlab_client.errors import UNCLAIMED, ControlClaimed, NotControlOwner, URLabError
 from urlab_client.protocol.base import ControlRequest, Reply
 from urlab_client.protocol.messages.runtime import (

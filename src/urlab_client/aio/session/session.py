@@ -16,7 +16,8 @@ from urlab_client.aio.features import Features
 from urlab_client.aio.session.call_records import CallRecords, Observe
 from urlab_client.aio.session.control import Control
 from urlab_client.aio.session.jobs import OnProgress, finish
-from urlab_client.aio.session.turn import Deadlines, Mutex, Settle, Turn, require_reply
+from urlab_client.aio.session.turn import Mutex, Settle, Turn, require_reply
+from urlab_client.aio.transport.base import Deadlines
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.errors import (
     ConnectionLost,
@@ -62,6 +63,7 @@ class Session:
     depend on the client's state or change it also wait for a `turn`.
 
     Attributes:
+        transport: What sends its requests.
         session_id: Id of the open session; empty without one.
         default_timeout: Seconds until the deadline of a request, by default; None for no limit.
         hello_sent: Whether a handshake was sent, with any outcome.
@@ -108,9 +110,9 @@ class Session:
         self.unsettled: dict[str, Settle] = {}
         self.unsettled_on: int = 0
         self._lost_to_restart = ""
-        self._transport = transport
+        self.transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
-        self._way = self._call_records or transport
+        self._way = self._call_records or transport.shared or transport
         self.default_timeout = default_timeout
         self._json = json
         self.control: Control = Control(self, wanted=claim_control)
@@ -124,10 +126,6 @@ class Session:
         # A handshake whose caller gave up after it was sent still opens a session.
         self._abandoned_hello: asyncio.Future[bytes] | None = None
         self._hello_unanswered = False
-
-    @property
-    def transport(self) -> ZmqTransport:
-        return self._transport
 
     async def call(
         self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
@@ -164,7 +162,7 @@ class Session:
             URLabTimeoutError: Other tasks held the scene until the deadline of that op; nothing was sent.
         """
         op = op_of(request)
-        await self.acquire(self.scene_lock, op, self.deadlines(op, timeout, self.bound_loop().time())[0])
+        await self.acquire(self.scene_lock, op, self.deadlines(op, timeout, self.bound_loop().time()).reply)
         outer = _COMPOSING.set(self)
         try:
             yield
@@ -188,7 +186,7 @@ class Session:
             status = op_of(OpStatus)
             return await finish(
                 op,
-                op_reply(request, op),
+                op.reply,
                 answer,
                 lambda question: self._exchange_alone(question, status, deadlines),
                 deadline=deadlines.reply,
@@ -234,15 +232,15 @@ class Session:
     @contextmanager
     def settling(self, what: str, settle: Settle) -> Generator[None]:
         """Keep `settle` for `resync()` if the body leaves open whether the server executed its request."""
-        before = self._transport.stats.sent
+        before = self.transport.stats.sent
         try:
             yield
         except BaseException as error:  # a cancellation, too: the request may be under way
             if not leaves_open(error):
                 self.unsettled.pop(what, None)
-            elif self._transport.stats.sent > before:
+            elif self.transport.stats.sent > before:
                 self.unsettled[what] = settle
-                self.unsettled_on = self._transport.stats.connects
+                self.unsettled_on = self.transport.stats.connects
             raise
         self.unsettled.pop(what, None)
 
@@ -261,7 +259,7 @@ class Session:
 
     async def aclose(self) -> None:
         """Close the transport; waiting calls fail with `ClientClosed`."""
-        await self._transport.aclose()
+        await self.transport.aclose()
 
     def bound_loop(self) -> asyncio.AbstractEventLoop:
         """Return the running loop, to which this session is bound. Raises `URLabError` on any other."""
@@ -322,21 +320,16 @@ class Session:
             check_finite(request)
             if not self._json:
                 check_request(request, frame)
-        late = self._adopt_later if op is _HELLO else None
-        sent, began = self._transport.stats.sent, time.perf_counter()
+        began = time.perf_counter()
         try:
             try:
-                deadline, connect_by = deadlines
-                answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                answer = await self._ask(frame, op, deadlines)
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, deadlines)
-            finally:
-                if late is not None and self._transport.stats.sent > sent:
-                    self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
             if log.isEnabledFor(logging.DEBUG):
                 took = 1e3 * (time.perf_counter() - began)
                 log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
-            return self._read(op_reply(request, op), op, stamped, answer)
+            return self._read(op.reply, op, stamped, answer)
         except SessionTakenOver as refusal:
             # An abandoned handshake of this client still opens a session. A request refused because of it was not
             # executed, and is sent again in that session.
@@ -356,7 +349,7 @@ class Session:
         if stamped != self._lost_to_restart:  # several requests may be refused for one restart
             self._lost_to_restart = stamped
             self.restarts += 1
-        return server_restarted(op.name, self._transport.endpoint, said)
+        return server_restarted(op.name, self.transport.endpoint, said)
 
     def _read(self, kind: type[R], op: Op, stamped: str, answer: bytes) -> R | OpStarted:
         """Decode the answer to a request that was sent in the session `stamped`, and update the session from it."""
@@ -414,14 +407,24 @@ class Session:
             self._adopt_abandoned_hello(reply)
         return self._abandoned_hello is None
 
+    def _ask(self, frame: bytes, op: Op, deadlines: Deadlines) -> Coroutine[Any, Any, bytes]:
+        return self._greet(frame, deadlines) if op is _HELLO else self._way.request(frame, op, deadlines)
+
+    async def _greet(self, frame: bytes, deadlines: Deadlines) -> bytes:
+        """Send a handshake, which opens a session even if its caller gives up."""
+        sent = self.transport.stats.sent
+        try:
+            return await self._way.request(frame, _HELLO, deadlines, late=self._adopt_later)
+        finally:
+            if self.transport.stats.sent > sent:
+                self.hello_sent = self._hello_unanswered = True  # `_hello_unanswered` until the reply has been read
+
     async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, deadlines: Deadlines) -> bytes:
         """Repeat an idempotent request whose connection broke, until it is answered or its deadline has passed."""
-        late = self._adopt_later if op is _HELLO else None
         while True:
             log.debug("%s: sending the request again, because the connection was lost", op.name)
             try:
-                deadline, connect_by = deadlines
-                return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                return await self._ask(frame, op, deadlines)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:
@@ -447,7 +450,7 @@ class Session:
                 await lock.acquire()
         except TimeoutError:
             raise URLabTimeoutError(
-                f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",
+                f"{op.name}: another call held {self.transport.endpoint} until the deadline. Nothing was sent.",
                 op=op.name,
                 hint="A client sends one request at a time; use a second client or a longer timeout.",
             ) from None
@@ -460,11 +463,6 @@ def leaves_open(error: BaseException) -> bool:
     if isinstance(error, URLabRPCError):
         return isinstance(error, _UNDECIDED)
     return not isinstance(error, (ServerUnreachable, TypeError, ValueError))
-
-
-def op_reply(request: Request[R], op: Op) -> type[R]:
-    """Return the reply struct of a request, with the type that the request declares."""
-    return op.reply  # type: ignore[return-value]  # Op cannot carry R: the registry holds ops of every R
 
 
 def server_restarted(what: str, endpoint: str, said: str = "") -> ServerRestarted:

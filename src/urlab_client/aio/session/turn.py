@@ -6,9 +6,10 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 from urlab_client.aio.defaults import DEFAULT, Timeout
+from urlab_client.aio.transport.base import Deadlines
 from urlab_client.errors import ProtocolError
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import op_of
@@ -21,13 +22,6 @@ R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
 
-class Deadlines(NamedTuple):
-    """Loop times until which to wait for the reply to a request, and for its connection; None waits without limit."""
-
-    reply: float | None
-    connect: float | None
-
-
 class Turn:
     """Exclusive access of one task to the client's state, and to the connection for requests that depend on it.
 
@@ -35,25 +29,23 @@ class Turn:
     depend on the client's state may be sent in between only during `aside`.
     """
 
-    __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
+    __slots__ = ("_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
 
     def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
         self._session = session
         self._op = op
         self._timeout: Timeout = timeout
         self._each = each
-        self._asked: Deadlines | None = None
-        self._first = True
-        self._ready = False
         self._began = session.bound_loop().time()
+        self._first: Deadlines | None = session.deadlines(op, timeout, self._began)  # None after the first `call`
+        self._ready = False
         self._before = 0  # requests that had been sent before the latest `call`
         self._left = False
 
     def begin_nowait(self) -> bool:
         """Begin if no other task has a turn and no request is in progress; return whether the turn has begun."""
-        session, op = self._session, self._op
-        self._asked = session.deadlines(op, self._timeout, self._began)
-        if op.needs is Needs.EDITOR or not session.state_lock.acquire_nowait():
+        session = self._session
+        if self._op.needs is Needs.EDITOR or not session.state_lock.acquire_nowait():
             return False
         if not session.request_lock.acquire_nowait():
             session.state_lock.release()
@@ -63,14 +55,12 @@ class Turn:
 
     async def begin(self) -> None:
         """Wait for the turn, or raise `URLabTimeoutError` after the deadline. Nothing was sent by then."""
-        session, op = self._session, self._op
-        deadlines = self._asked or session.deadlines(op, self._timeout, self._began)
-        self._asked = deadlines
-        await session.acquire(session.state_lock, op, deadlines.reply)
+        state_lock, deadline = self._session.state_lock, self._deadlines(self._op).reply
+        await self._session.acquire(state_lock, self._op, deadline)
         try:
-            await self._acquire_request_lock(deadlines.reply)
+            await self._acquire_request_lock(deadline)
         except BaseException:
-            session.state_lock.release()
+            state_lock.release()
             raise
 
     def end(self) -> None:
@@ -100,18 +90,16 @@ class Turn:
         Raises:
             URLabError: See `Session.call`.
         """
-        session, op, deadlines = self._session, self._op, self._asked
-        self._before = session.transport.stats.sent
-        if deadlines is None or takes is not None or type(request) is not op.request:
+        session, op = self._session, self._op
+        if type(request) is not op.request:
             op = op_of(request)
             session.check_offered(op)
-            deadlines = self._deadlines(op, takes)
-        self._asked = None
-        self._first = False
-        answer = session.exchange(request, op, deadlines)
-        if op.needs is Needs.EDITOR:
-            return _await_reply(op, answer)
-        return cast("Coroutine[Any, Any, R]", answer)  # the server answers only the editor's ops with a job
+        deadlines = self._deadlines(op, takes)
+        self._first = None
+        self._before = session.transport.stats.sent
+        answer: Coroutine[Any, Any, Any] = session.exchange(request, op, deadlines)
+        # The server answers only the editor's ops with a job.
+        return _await_reply(op, answer) if op.needs is Needs.EDITOR else answer
 
     def deadline(self, takes: float) -> float:
         """Return the loop time until which this turn may wait for something that takes `takes` seconds."""
@@ -121,6 +109,8 @@ class Turn:
 
     async def aside(self, work: Awaitable[T]) -> T:
         """Let requests that do not depend on the client's state pass while awaiting `work`, which sends nothing."""
+        self._left = self.sent
+        self._ready = False
         self._release_request_lock()
         result = await work
         await self._acquire_request_lock(self._deadlines(self._op).reply)
@@ -140,15 +130,15 @@ class Turn:
         self._ready = True
 
     def _release_request_lock(self) -> None:
-        self._left = self._session.transport.stats.sent > self._before
-        self._ready = False
         self._session.request_lock.release()
         if self._op.needs is Needs.EDITOR:
             self._session.editor_lock.release()
 
     def _deadlines(self, op: Op, takes: float | None = None) -> Deadlines:
+        if self._first is not None and op is self._op and takes is None:
+            return self._first
         # The wait for the turn counts for the first request, and for all requests if one timeout covers them.
-        counted = self._first or (self._timeout is not DEFAULT and not self._each)
+        counted = self._first is not None or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
         return self._session.deadlines(op, self._timeout, since, takes)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 
 from urlab_client.aio.arguments import finite, mapping, text
 from urlab_client.aio.articulation import compiled_prefixes
@@ -26,25 +26,26 @@ Cameras = bool | Mapping[str, "str | CameraTiming"]
 async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
     """Advance physics according to the step mode and apply the new state."""
     state.require_handshake("step")
-    if state.mode.unsettled is not None or state.mode.pause_unsettled:
-        await state.mode.settle(turn)
-    mode = state.mode.current
+    session, levels, modes = state.session, state.level, state.mode
+    if modes.unsettled is not None or modes.pause_unsettled:
+        await modes.settle(turn)
+    mode = modes.current
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
     pictures = await _pictures(state, turn, cameras, n_steps) if state.observers or cameras is not False else None
-    if mode is StepMode.LIVE and not state.mode.assumed:
+    if mode is StepMode.LIVE and not modes.assumed:
         return await _live_step(state, turn, pictures)
     request, wrenches = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
     if pictures is not None:
         pictures.ask(request)
-    assumed, before, session = state.mode.assumed, state.clocks.step_count, state.session.session_id
-    level = asked or state.level.of_session
-    request.observations = None if level == state.level.in_force else level
-    state.level.forget()  # until the reply arrives
+    assumed, before, sent_in = modes.assumed, state.clocks.step_count, session.session_id
+    level = asked or levels.of_session
+    request.observations = None if level == levels.in_force else level
+    levels.forget()  # until the reply arrives
     try:
-        reply = await turn.call(request, takes=_seconds(pictures))
-        if state.session.session_id == session:  # otherwise an abandoned handshake set the level
-            state.level.in_force = level if state.session.features.level_sticks else state.level.of_session
+        reply = await turn.call(request, takes=None if pictures is None else _seconds(pictures))
+        if session.session_id == sent_in:  # otherwise an abandoned handshake set the level
+            levels.in_force = level if session.features.level_sticks else levels.of_session
         if pictures is not None:
             await pictures.complete(turn, reply)
         state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
@@ -55,14 +56,14 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         state.pending.clear()
     if assumed:
         # If an abandoned handshake was answered meanwhile, the server's counter started anew.
-        _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
-        if state.mode.puppet and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
+        _learn_mode(state, request, reply, reply.step - (before if session.session_id == sent_in else 0))
+        if modes.puppet and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
             return await take_steps(state, turn, n_steps, cameras, asked)  # the request has only set the clock
-    if state.mode.puppet:
+    if modes.current is StepMode.PUPPET:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
     if pictures is not None:
-        pictures.account(reply, came=not state.mode.live)
+        pictures.account(reply, came=not modes.live)
     return reply
 
 
@@ -86,12 +87,17 @@ def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int,
 
 
 async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None) -> StepOk:
-    wrenches = take_wrenches(state)  # without effect on servers that ignore them in this mode
+    ours = _ours(state)
+    wrenches = _take_wrenches(state, ours)  # without effect on servers that ignore them in this mode
     try:
-        request = Step(per_articulation=live_commands(state, wrenches) or None)
+        if state.session.features.live_pictures_in_steps:
+            commands = _direct_commands(state, ours, wrenches)
+        else:
+            commands = {record.name: record.live_command() for record in ours}
+        request = Step(per_articulation=commands or None)
         if pictures is not None:
             pictures.ask(request)
-        reply = await turn.call(request, takes=_seconds(pictures))
+        reply = await turn.call(request, takes=None if pictures is None else _seconds(pictures))
         if pictures is not None:
             await pictures.complete(turn, reply)
         state.absorb(reply, "step")
@@ -105,9 +111,10 @@ async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None)
 
 
 def _direct_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
-    wrenches = take_wrenches(state)
+    ours = _ours(state)
+    wrenches = _take_wrenches(state, ours)
     try:
-        commands = direct_commands(state, wrenches)
+        commands = _direct_commands(state, ours, wrenches)
     except ValueError:
         restore_wrenches(wrenches)
         raise
@@ -120,7 +127,7 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, SentWrenches]:
     mirror = state.mirror
     model = require_local(mirror.model, "step: puppet mode", op="step")
     data = require_local(mirror.data, "step: puppet mode", op="step")
-    if take_wrenches(state):
+    if _take_wrenches(state, _ours(state)):
         warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=4)
     with mirror.lock:
         for record in state.objects.records.values():
@@ -185,14 +192,15 @@ def _too_few(n_steps: int, mode: StepMode) -> str:
     return f"step: n_steps must be at least 1 in step mode {mode}, got {n_steps}. Only a puppet step may take 0."
 
 
-def _seconds(pictures: StepPictures | None) -> float | None:
+def _seconds(pictures: StepPictures) -> float | None:
     """Return the seconds that a step with pictures may take; None for the default of a step."""
-    return None if pictures is None or not pictures.seconds else (op_of(Step).timeout or 0.0) + pictures.seconds
+    return (op_of(Step).timeout or 0.0) + pictures.seconds if pictures.seconds else None
 
 
-def direct_commands(state: SimState, wrenches: SentWrenches) -> dict[str, ArticulationCommand]:
+def _direct_commands(
+    state: SimState, ours: Collection[MirroredArticulation], wrenches: SentWrenches
+) -> dict[str, ArticulationCommand]:
     """Return the commands of a step, including its wrenches."""
-    ours = _ours(state)
     if not wrenches:  # true for nearly every step
         return {record.name: record.direct_command(None) for record in ours}
     commands = {record.name: record.direct_command(wrenches.get(record)) for record in ours}
@@ -210,23 +218,16 @@ def direct_commands(state: SimState, wrenches: SentWrenches) -> dict[str, Articu
     return commands
 
 
-def live_commands(state: SimState, wrenches: SentWrenches) -> dict[str, ArticulationCommand]:
-    """Return the commands of a step in live mode."""
-    if state.session.features.live_pictures_in_steps:
-        return direct_commands(state, wrenches)
-    return {record.name: record.live_command() for record in _ours(state)}
-
-
-def _ours(state: SimState) -> Iterable[MirroredArticulation]:
+def _ours(state: SimState) -> Collection[MirroredArticulation]:
     # A server whose robots have owners rejects a step that writes to another client's robots, so send only our own.
     records = state.objects.records.values()
     return [record for record in records if record.driven] if state.session.features.claims else records
 
 
-def take_wrenches(state: SimState) -> SentWrenches:
+def _take_wrenches(state: SimState, ours: Collection[MirroredArticulation]) -> SentWrenches:
     """Return the wrenches for the step being built and clear their buffers."""
     wrenches: SentWrenches = {}
-    for record in _ours(state):
+    for record in ours:
         if record.wrenches:
             wrenches[record] = record.take_wrenches()
     for entity in state.objects.entity_records.values():

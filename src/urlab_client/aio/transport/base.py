@@ -17,6 +17,13 @@ or is cancelled if none can arrive.
 """
 
 
+class Deadlines(Struct, frozen=True):
+    """Loop times until which to wait for the reply to a request, and for its connection; None waits without limit."""
+
+    reply: float | None
+    connect: float | None
+
+
 class TransportStats(Struct):
     """Counters of one client's requests.
 

@@ -183,9 +183,9 @@ class Connection:
         self._watches.append(Watch(loop, self.read_events, fd=self._monitor.fileno(), tell=tell))
         loop.call_soon(self.read_events)
 
-    def watch(self, on_readable: Callable[[], object], *, on_demand: bool = False) -> Watch:
+    def watch(self, on_readable: Callable[[], object], *, expected: Callable[[], bool] = lambda: True) -> Watch:
         """Call `on_readable` whenever the socket is readable; see `Watch`."""
-        watch = Watch(self._loop, on_readable, fd=self.socket.fileno(), on_demand=on_demand)
+        watch = Watch(self._loop, on_readable, fd=self.socket.fileno(), expected=expected)
         self._watches.append(watch)
         return watch
 

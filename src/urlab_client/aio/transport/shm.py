@@ -18,7 +18,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Final
 
-from urlab_client.aio.transport.base import LateReply, SentRequest, lost, no_reply
+from urlab_client.aio.transport.base import Deadlines, LateReply, SentRequest, lost, no_reply
 from urlab_client.aio.transport.shm_channel import RegionChannel, RegionInUse, answers, envelope_of
 from urlab_client.aio.transport.shm_regions import ServerRegions
 from urlab_client.aio.transport.waiting import BusyPoll
@@ -125,12 +125,10 @@ class ShmRequests:
                 return
             await asyncio.sleep(_SETTLE_LOOK_S)  # a region has no event
 
-    async def request(
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> bytes:
+    async def request(self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None) -> bytes:
         """See `ZmqTransport.request`."""
         if self._channel is not None and self._channel.abandoned_at is not None:
-            await self._let_it_end(op, deadline)
+            await self._let_it_end(op, deadlines.reply)
         pictures = op.name == "step" and b"include_cameras" in frame
         has_state = issubclass(op.reply, StateReply)  # whose size is nearly constant
         why_zmq = _always_over_zmq(op) or ("pictures" if pictures else self._refused.get(op.name, ""))
@@ -147,16 +145,15 @@ class ShmRequests:
             elif has_state and not 0 < self._largest_state * _GROWTH <= channel.limit:
                 why_zmq = "reply may be too large" if self._largest_state else "size of the reply not known yet"
             else:
-                answer = await self._over_shm(
-                    channel, frame, SentRequest(op, loop.create_future(), now, deadline), loop
-                )
+                sent = SentRequest(op, loop.create_future(), now, deadlines.reply)
+                answer = await self._over_shm(channel, frame, sent, loop)
                 why_zmq = self._refusal(answer, op)
                 if not why_zmq:
                     if has_state and len(answer) > self._largest_state:
                         self._largest_state = len(answer)
                     return answer
         self._stats.over_zmq[why_zmq] = self._stats.over_zmq.get(why_zmq, 0) + 1
-        answer = await self._over_zmq.send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+        answer = await self._over_zmq.request(frame, op, deadlines, late=late)
         if (
             has_state and not pictures and envelope_of(answer, op).op == op.reply_name
         ):  # a refusal does not show the size of the state

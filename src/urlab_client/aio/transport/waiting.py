@@ -52,8 +52,9 @@ class Watch:
         has_news: Whether a region has news. Called on the thread until `close`; must not block or raise.
         block: Sleeps until a region's server signals, for at most the given seconds; None without signals.
         fastest_s: Pause between two looks at a region in the first millisecond, seconds.
-        on_demand: Whether the thread watches a socket only from `expect` until it is readable, because waking it would
-            delay a reply that the loop polls for itself. So it always does for a region.
+        expected: Whether the thread is to watch a socket at first, and again after news. Waking the thread delays a
+            reply that the loop polls for itself, so other news are expected only from `expect` on, and those of a
+            region always.
         tell: Publishes the event that a watching thread died. Another one follows after a pause.
     """
 
@@ -66,7 +67,7 @@ class Watch:
         has_news: Callable[[], bool] | None = None,
         block: Callable[[float], object] | None = None,
         fastest_s: float = 0.0,
-        on_demand: bool = False,
+        expected: Callable[[], bool] = lambda: True,
         tell: Tell | None = None,
     ) -> None:
         self.fd = fd
@@ -76,7 +77,7 @@ class Watch:
         self._loop = loop
         self._on_news = on_news
         self.fastest_s = fastest_s
-        self._on_demand = on_demand or fd is None
+        self._expected = (lambda: False) if fd is None else expected
         self._since = 0.0
         self._armed = False
         self._closed = False
@@ -86,13 +87,8 @@ class Watch:
                 loop.add_reader(fd, on_news)
                 return
         self._watcher = _Watcher.of(loop, self)
-        if not self._on_demand:
+        if self._expected():
             self.expect()
-
-    @property
-    def by_loop(self) -> bool:
-        """Whether the loop itself watches, always."""
-        return self._watcher is None
 
     def expect(self) -> None:
         """Watch until the next news, if that was left to this call."""
@@ -130,7 +126,7 @@ class Watch:
             if not self._closed:
                 self._on_news()
         finally:
-            if not self._on_demand:
+            if self._expected():
                 self.expect()
 
 

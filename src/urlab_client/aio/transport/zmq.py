@@ -11,13 +11,13 @@ import asyncio
 import errno
 import logging
 import time
-from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import zmq
 
 from urlab_client.aio.background import running_loop
-from urlab_client.aio.transport.base import LateReply, SentRequest, TransportStats, lost, no_reply
+from urlab_client.aio.transport.base import Deadlines, LateReply, SentRequest, TransportStats, lost, no_reply
 from urlab_client.aio.transport.connection import (
     FAILED_HANDSHAKES,
     UNANSWERED,
@@ -114,40 +114,33 @@ class ZmqTransport:
         """Whether the server has yet to answer a request whose caller gave up, so that it may still execute it."""
         return bool(self._abandoned)
 
-    def request(
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> Coroutine[Any, Any, bytes]:
-        """Send `frame` and return the reply's bytes.
+    async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
+        self, frame: bytes, op: Op, deadlines: Deadlines, *, late: LateReply | None = None
+    ) -> bytes:
+        """Send `frame` over ZeroMQ and return the reply's bytes.
 
         Args:
             frame: The encoded request.
             op: Its op, which errors name and which determines the meaning of a lost reply.
-            deadline: Loop time at which to give up; None waits without limit.
-            connect_by: Loop time by which a connection must be open; None waits without limit.
+            deadlines: Loop times at which to give up.
             late: Callback invoked with a future for the reply when this call is cancelled or times out after sending
                 over ZeroMQ; None drops the reply.
 
         Raises:
-            ServerUnreachable: No connection was open by `connect_by`; nothing was sent.
-            URLabTimeoutError: The request was sent, but no reply arrived by `deadline`.
+            ServerUnreachable: No connection was open in time; nothing was sent.
+            URLabTimeoutError: The request was sent, but no reply arrived in time.
             ConnectionLost: The connection broke after sending; the op changes nothing.
             OutcomeUnknown: The connection broke after sending; the op may have been executed.
             ClientClosed: The client was closed.
         """
-        send = self.send if self.shared is None else self.shared.request
-        return send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-
-    async def send(  # noqa: PLR0912  # each call between a step and its socket costs every step
-        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
-    ) -> bytes:
-        """See `request`, over ZeroMQ."""
         opened = self._open
         if opened is None or asyncio._get_running_loop() is not opened.loop:  # noqa: SLF001
             opened = self._connect()
         loop, _, _, replies, send, get = opened
+        deadline = deadlines.reply
         while True:
             if not self.connected:
-                await self._wait_connected(loop, op, connect_by)
+                await self._wait_connected(loop, op, deadlines.connect)
             started = loop.time()
             if deadline is not None and started >= deadline:
                 raise self._too_late(op)
@@ -176,7 +169,7 @@ class ZmqTransport:
                 await self._busy_poll.look(op.name, reply, self._look)
             elif get(_EVENTS) & _POLLIN:
                 # Sending may have consumed the edge of the descriptor.
-                loop.call_soon(self._on_readable)
+                loop.call_soon(self._take)
             if not reply.done():
                 replies.expect()
             answer = await reply
@@ -242,7 +235,7 @@ class ZmqTransport:
         except ValueError:
             shared_context.give_back(context)
             raise
-        replies = connection.watch(self._on_readable, on_demand=True)
+        replies = connection.watch(self._take, expected=self._reply_expected)
         send = cast("_Send", super(zmq.Socket, socket).send)  # without the overhead of the wrapper
         self._open = _Open(loop, context, connection, replies, send, cast("_Get", socket.get))
         return self._open
@@ -319,14 +312,10 @@ class ZmqTransport:
         if self._open is not None and self._open.get(_EVENTS) & _POLLIN:
             self._take()
 
-    def _on_readable(self) -> None:
-        self._take()
-        if self._open is None or self._open.replies.by_loop:
-            return
-        # A reply may be expected to an abandoned request, too.
+    def _reply_expected(self) -> bool:
+        """Return whether a reply may come, possibly to an abandoned request."""
         unanswered = self._abandoned or self._silent_since is not None
-        if unanswered or not all(sent.reply.done() for sent in self._sent.values()):
-            self._open.replies.expect()
+        return bool(unanswered) or not all(sent.reply.done() for sent in self._sent.values())
 
     def _take(self) -> None:
         """Receive replies until no request waits for one."""

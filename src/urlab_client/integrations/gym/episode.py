@@ -305,7 +305,7 @@ class EnvEpisode:
                 return articulation.act_array
             case "sensors":
                 readings = articulation.get_sensors()
-                found = [np.atleast_1d(readings[name]) for name in self._sensors[key]]
+                found = [readings[name] for name in self._sensors[key]]
                 return np.concatenate(found) if found else np.zeros(0)
 
 

@@ -35,7 +35,7 @@ class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
     lease_id: Annotated[str | None, doc("Lease of the holder, with code `busy`.")] = None
 
 
-class Clock(Serializable, Struct, kw_only=True):
+class Clock(Serializable, Struct, kw_only=True, frozen=True):
     """A point in time as two integers, truncated, not rounded."""
 
     sec: Annotated[int, doc("Whole seconds.")]
