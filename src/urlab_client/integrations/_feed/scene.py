@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -148,9 +149,14 @@ class FollowedScene:
         )
 
 
-def joint_columns(names: list[str], dof: bool = False) -> list[str]:
-    """Return the names in a layout that belong to hinge and slide joints, which have no component."""
-    return [name for name in names if name.rpartition(".")[2] not in (_FREE_QVEL if dof else _FREE_QPOS)]
+def component(name: str, names: AbstractSet[str]) -> str:
+    """Return the last part of the name of one of several values of a joint; empty for the value of a hinge or slide.
+
+    Hinges and slides, too, may be called `x`, or have a dot in their names.
+    """
+    joint, dot, part = name.rpartition(".")
+    groups = _FREE_QPOS[3:], _FREE_QVEL[3:]
+    return part if any(all(joint + dot + other in names for other in group) for group in groups) else ""
 
 
 class Simulation:
