@@ -31,6 +31,7 @@ from urlab_client.errors import URLabError
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, HelloOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.values.names import NameMap, lasting_names, robot_prefixes
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
@@ -147,19 +148,25 @@ class Replay:
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
         """Show a recording from its start."""
-        run, (start, end), names, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
+        run, (start, end), names, prefixes, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
         if not names:
             raise ValueError(f"{file.name} holds no states of robots.")
-        robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
+        arts, recorded = self._client.articulations, {name: key for key, name in lasting_names(prefixes).items()}
+        known = {key: recorded.get(name, "") for key, name in lasting_names(compiled_prefixes(arts)).items()}
+        robots = {
+            key: found
+            for key, art in arts.items()
+            if (found := _robot(names, key if key in names else known[key], art))
+        }
         if not robots:
             there = ", ".join(self._client.articulations) or "none"
             raise ValueError(f"{file.name} is a recording of other robots than the current ones ({there}).")
         await self.end()
+        if placing and not self.alone:
+            await self._take_over()
         self._run, self._robots, self.cameras = run, robots, cameras
         self._start, self._seconds = start, end - start
         self._at, self._rate, self._state = 0.0, 1.0, None
-        if placing and not self.alone:
-            await self._take_over()
         self._playing = True
         await self._show_pictures()
         self._wake.set()
@@ -198,8 +205,10 @@ class Replay:
         data = self._client.data
         if before is not None and data is not None and data.qpos.shape == before.qpos.shape:
             data.qpos[:], data.qvel[:] = before.qpos, before.qvel
-            await self._client.step(0)
-            await self._client.runtime.set_mode(before.mode)
+            try:
+                await self._client.step(0)
+            finally:
+                await self._client.runtime.set_mode(before.mode)
 
     async def keep_playing(self) -> None:
         """Advance the replay while it plays."""
@@ -313,16 +322,23 @@ def _camera(run: Run, name: str) -> CameraInfo:
     return CameraInfo(mode=first.mode, resolution=(width, height), fovy=45.0, zmq_endpoint="", zmq_topic=name)
 
 
-def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
+def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], NameMap[str], frozenset[str]]:
     from urlab_client.integrations.record import read_run
 
     run = read_run(file)
     cameras = (name if "/" in name else OF_SCENE + name for name in run.cameras())
-    return run, run.time_range(), run.positions(), frozenset(cameras)
+    prefixes = robot_prefixes((key, "", prefix) for key, prefix in run.prefixes().items())
+    return run, run.time_range(), run.positions(), prefixes, frozenset(cameras)
 
 
 def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> _Robot | None:
-    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not."""
+    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not.
+
+    Args:
+        names: Names of joint positions by articulation of the recording.
+        key: Key of the robot there.
+        art: The robot.
+    """
     size = len(art.qpos_array)
     if key in names:
         return _Robot(key, size) if len(names[key]) == size else None
