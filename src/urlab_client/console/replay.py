@@ -64,12 +64,12 @@ class Replay:
     """The replay of one console, at most one at a time.
 
     Attributes:
-        cameras: Cameras of which the recording has pictures, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+        cameras: Names in the recording of the cameras of which it has pictures, by `ARTICULATION/CAMERA` or `-/CAMERA`.
         alone: Whether there is no simulation besides.
     """
 
     def __init__(self, client: URLabClient, view: SharedView, cameras: Cameras, *, alone: bool = False) -> None:
-        self.cameras: frozenset[str] = frozenset()
+        self.cameras: dict[str, str] = {}
         self.alone: bool = alone
         self._client = client
         self._view = view
@@ -124,10 +124,10 @@ class Replay:
 
     async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
         """Return a camera's picture at the replay's position, and its time in seconds from the recording's start."""
-        run, at = self._run, self._moment
-        if run is None:
+        run, at, name = self._run, self._moment, self.cameras.get(camera)
+        if run is None or name is None:
             return None
-        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(camera.removeprefix(OF_SCENE), at))
+        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(name, at))
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
@@ -164,7 +164,12 @@ class Replay:
         await self.end()
         if placing and not self.alone:
             await self._take_over()
-        self._run, self._robots, self.cameras = run, robots, cameras
+        self._run, self._robots, keys = run, robots, {robot.source: key for key, robot in robots.items()}
+        parts = {name: name.partition("/") for name in cameras}
+        self.cameras = {
+            f"{keys.get(owner, owner)}/{short}" if slash else OF_SCENE + name: name
+            for name, (owner, slash, short) in parts.items()
+        }
         self._start, self._seconds = start, end - start
         self._at, self._rate, self._state = 0.0, 1.0, None
         self._playing = True
@@ -322,13 +327,12 @@ def _camera(run: Run, name: str) -> CameraInfo:
     return CameraInfo(mode=first.mode, resolution=(width, height), fovy=45.0, zmq_endpoint="", zmq_topic=name)
 
 
-def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], NameMap[str], frozenset[str]]:
+def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], NameMap[str], list[str]]:
     from urlab_client.integrations.record import read_run
 
     run = read_run(file)
-    cameras = (name if "/" in name else OF_SCENE + name for name in run.cameras())
     prefixes = robot_prefixes((key, "", prefix) for key, prefix in run.prefixes().items())
-    return run, run.time_range(), run.positions(), prefixes, frozenset(cameras)
+    return run, run.time_range(), run.positions(), prefixes, run.cameras()
 
 
 def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> _Robot | None:
