@@ -294,6 +294,7 @@ def test_what_the_server_has_saved_is_replayed_too(http: TestClient, server: Sim
     assert http.delete("/api/replay").status_code == 200
 
 
+@pytest.mark.opengl
 @pytest.mark.parametrize(
     ("recorded", "shown"),
     [(("alpha", "plugin"), ("beta", "plugin")), (("alpha", "model"), ("alpha", "plugin"))],
@@ -308,13 +309,16 @@ async def test_a_recording_is_replayed_whatever_the_engine_called_its_robots(
         ):
             await client.discover()
             if (dialect, naming) == recorded:
-                async with record(client, tmp_path / "run.mcap"):
+                async with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"]):
                     await client.step(5)
             else:
                 console = ConsoleSession(client, recordings=tmp_path)
                 await console.replay.begin(tmp_path / "run.mcap")
                 await console.replay.change(at=1.0, playing=False)
                 assert {*console.view.snapshot.per_articulation} == {*client.articulations}
+                camera = f"{client.articulations.key('arm')}/wrist"
+                assert [*console.replay.cameras] == [camera]
+                assert await console.replay.picture(camera) is not None
 
 
 async def test_a_replay_that_cannot_place_the_robots_does_not_begin(server: SimulatedServer, tmp_path: Path) -> None:
