@@ -1,9 +1,7 @@
 """What holds for every test."""
 
-import contextlib
 import functools
 import gc
-import importlib
 import importlib.metadata
 import importlib.util
 import itertools
@@ -193,27 +191,8 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
     return [f"tests are left out by -m {config.option.markexpr!r}"] if config.option.markexpr else []
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
-    """Have the workers of a fresh checkout divide the files among them: rewriting the asserts of all takes long.
-
-    Each finds in the cache what the others have rewritten. Nothing that is imported becomes garbage meanwhile.
-    """
-    gc.disable()
-    worker = getattr(session.config, "workerinput", None)
-    if worker is None:
-        return
-    files = sorted({file for folder in session.config.args for file in Path(folder).resolve().rglob("test_*.py")})
-    for file in files[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
-        if str(file.parent) not in sys.path:
-            sys.path.insert(0, str(file.parent))
-        with contextlib.suppress(Exception):  # which is told where the file is collected
-            importlib.import_module(file.stem)
-
-
 def pytest_collection_finish() -> None:
     """Keep the collected tests out of the garbage collector's rounds: some tests run it again and again."""
-    gc.enable()
     gc.freeze()
 
 
