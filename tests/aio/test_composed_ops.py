@@ -69,3 +69,26 @@ async def test_two_replays_do_not_start_each_others_sessions(client: URLabClient
     ops = [r["op"] for r in log.requests]
     assert ("replay_load", "replay_start") in pairwise(ops)
     assert ("replay_load", "replay_load") not in pairwise(ops)
+
+
+@pytest.mark.parametrize("mode", ["direct", "live"])
+async def test_a_reset_meanwhile_does_not_prolong_what_waits_for_simulation_time(mode: str) -> None:
+    async with (
+        SimulatedServer("ball", play=True) as server,
+        URLabClient(**server.client_options(), step_mode=mode) as client,
+    ):
+        await client.discover()
+        if mode == "live":
+            await client.runtime.set_paused(False)
+        await client.run_for(1.0)
+        began, resets = client.sim_time, list[asyncio.Task[object]]()
+
+        def reset_on_the_way() -> bool:
+            if not resets and client.sim_time > began + 0.1:
+                resets.append(asyncio.create_task(client.reset()))
+            return False
+
+        with pytest.raises(URLabTimeoutError, match=r"within 0\.3 s of simulation time"):
+            await client.wait_until(reset_on_the_way, timeout=0.3)
+        await resets[0]
+        assert client.sim_time < 0.9, "it waited for the time of before the reset"

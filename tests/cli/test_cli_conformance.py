@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import signal
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from urlab_client.cli import conformance as cli_conformance
 from urlab_client.cli import main
 from urlab_client.conformance import statement_titles
 from urlab_client.conformance.reports import redaction
@@ -109,6 +112,34 @@ def test_what_cannot_be_tried(capsys: pytest.CaptureFixture[str]) -> None:
     assert "connection refused" in capsys.readouterr().err
     assert main(["conformance", "--statement", "Beta 320"]) == 2
     assert "'Beta 320' is not a statement. Did you mean" in capsys.readouterr().err
+
+
+def test_ctrl_c_keeps_what_was_found(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextlib.contextmanager
+    def interrupting(*_: object) -> Iterator[Callable[[float], None]]:
+        pressed: list[None] = []
+
+        def show(share: float) -> None:
+            if share > 0.1 and not pressed:
+                pressed.append(signal.raise_signal(signal.SIGINT))
+
+        yield show
+
+    monkeypatch.setattr(cli_conformance, "progress_bar", interrupting)
+    files = {name: tmp_path / name for name in ("r.json", "r.html", "r.zip")}
+    options = ["--json", str(files["r.json"]), "--html", str(files["r.html"]), "--bundle", str(files["r.zip"])]
+    assert main(["conformance", address, "--play", "--no-measurements", *options]) == 130
+    captured = capsys.readouterr()
+    assert "interrupted; what came after was not tried" in captured.err
+    assert re.search(r"^Session 5\.2 +holds", captured.out, re.MULTILINE)
+    report = json.loads(files["r.json"].read_text())
+    assert report["stopped"] == "interrupted"
+    details = {row["detail"] for row in report["statements"] if row["verdict"] == "not_tried"}
+    assert {"interrupted", "changes the world, so it needs --author"} <= details
+    assert "interrupted" in files["r.html"].read_text()
+    assert zipfile.is_zipfile(files["r.zip"])
 
 
 def test_nothing_tried_is_no_success(address: str, capsys: pytest.CaptureFixture[str]) -> None:

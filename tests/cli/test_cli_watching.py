@@ -79,6 +79,22 @@ async def test_what_a_server_simulated_before_does_not_count(server: SimulatedSe
     assert passed[0] < 0.2 <= passed[-1] + 1e-9
 
 
+async def test_resets_do_not_prolong_it(server: SimulatedServer) -> None:
+    async with URLabClient(**server.client_options(), step_mode="direct") as client:
+        await client.discover()
+        resets, passed = list[asyncio.Task[object]](), list[float]()
+
+        def progress(done: float) -> None:
+            passed.append(done)
+            if client.sim_time > 0.2 and all(reset.done() for reset in resets):
+                resets.append(asyncio.create_task(client.reset()))
+
+        await run_session(client, 0.5, over=lambda: len(resets) > 10, progress=progress)
+    assert len(resets) in (2, 3), "one after each 0.2 s"
+    assert passed == sorted(passed)
+    assert passed[-1] == pytest.approx(0.5)
+
+
 async def test_live_mode_ends_when_play_does(server: SimulatedServer) -> None:
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()

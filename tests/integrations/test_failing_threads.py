@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -19,7 +21,7 @@ from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.gym import vector
 from urlab_client.integrations.record import RecordingError, read_run, record
 from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.view.view import AsyncView
+from urlab_client.integrations.view.view import AsyncView, WindowBackend
 from urlab_client.server import SimulatedServer
 from urlab_client.simulation.opengl import RenderingUnavailable
 from urlab_client.simulation.painting import Painter, Visible
@@ -157,3 +159,51 @@ def test_the_restart_of_an_environment(caplog: pytest.LogCaptureFixture, monkeyp
             envs.reset(seed=1)
         finally:
             envs.close()
+
+
+async def test_a_recording_whose_beginning_is_cancelled_ends(
+    client: URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening, go_on, made = threading.Event(), threading.Event(), list[writing.WriterThread]()
+
+    class SlowToOpen(writing.WriterThread):
+        def __init__(self, *arguments: Any) -> None:
+            opening.set()
+            go_on.wait(DEADLINE_S)
+            super().__init__(*arguments)
+            made.append(self)
+
+    monkeypatch.setattr("urlab_client.integrations.record.recorder.WriterThread", SlowToOpen)
+    path = tmp_path / "run.mcap"
+    beginning = asyncio.create_task(record(client, path).__aenter__())
+    await until(opening.is_set)
+    beginning.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await beginning
+    go_on.set()
+    await until(lambda: made and not made[0]._thread.is_alive())
+    assert read_run(path).summary().complete
+
+
+async def test_a_view_whose_beginning_is_cancelled_is_closed(client: URLabClient) -> None:
+    opening, go_on = threading.Event(), threading.Event()
+
+    class SlowToOpen(WindowBackend):
+        closed = False
+
+        def open(self) -> None:
+            opening.set()
+            go_on.wait(DEADLINE_S)
+
+        def close(self) -> None:
+            self.closed = True
+
+    backend = SlowToOpen()
+    view = AsyncView(client, backend, "view", cameras=(), camera_hz=10.0, max_hz=30.0, contacts=False)
+    beginning = asyncio.create_task(view.__aenter__())
+    await until(opening.is_set)
+    beginning.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await beginning
+    go_on.set()
+    await until(lambda: backend.closed)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +29,7 @@ from urlab_client.integrations.gym import (
     URLabEnv,
     Walk,
 )
+from urlab_client.integrations.record import read_run, record, transitions_of
 from urlab_client.randomise import Delay, Noise, Randomisation, Vary
 from urlab_client.randomise import Push as Shove
 from urlab_client.server import ControllerConfig, SimulatedServer
@@ -121,3 +123,64 @@ def test_a_task_comes_to_the_same_whatever_its_robots_are_called(name: str) -> N
         assert all(same(ours, theirs) for ours, theirs in zip(seen, expected, strict=True)), where
     beta = [seen for where, seen in found.items() if "beta" in where]
     assert all(np.array_equal(*pair) for seen in beta for pair in zip(seen, beta[0], strict=True))
+
+
+def test_dictionaries_are_the_same_whatever_robots_are_called() -> None:
+    found: dict[str, Any] = {}
+    for dialect, naming in NAMINGS:
+        with SimulatedServer("quadruped", "arm", play=True, dialect=dialect, actor_names=naming) as server:
+            address = f"{server.address}:{server.step_port}"
+            options: dict[str, Any] = {"space_mode": "dict", "observations": ["qvel", "qpos"]}
+            with closing(URLabEnv.connect(address, **options)) as wire:
+                spaces: Any = wire.observation_space, wire.action_space
+                start, _ = wire.reset(seed=1)
+                action = {name: np.full(space.shape, 0.1, np.float32) for name, space in spaces[1].items()}
+                then = wire.step(action)[0]
+                own = {wire.articulations.key(name): part for name, part in action.items()}
+                assert np.array_equal(wire.mapping.flat(own), wire.mapping.flat(action))
+                with pytest.raises(ValueError, match=r"one entry for each of quadruped, arm, not \['arm'\]"):
+                    wire.step({"arm": action["arm"]})
+            with closing(URLabBatchEnv(address, 1, **options)) as batch:
+                assert (batch.single_observation_space, batch.single_action_space) == spaces
+                assert [*batch.reset(seed=[1])[0]] == [*start]
+            where = f"{dialect}, {naming}"
+            found[where] = [*map(repr, spaces)], [np.concatenate([*fields.values()]) for fields in then.values()]
+            assert [*spaces[0], *spaces[1], *start, *then] == ["quadruped", "arm"] * 4, "in the order of the robots"
+            assert [*spaces[0]["arm"], *start["arm"]] == ["qvel", "qpos"] * 2, "in the order of the request"
+    expected = found["alpha, model"]
+    for where, (spaces, then) in found.items():
+        assert spaces == expected[0], where
+        assert all(np.array_equal(*pair) for pair in zip(then, expected[1], strict=True)), where
+
+
+@pytest.mark.opengl
+def test_recordings_are_the_same_whatever_robots_are_called(tmp_path: Path) -> None:
+    found: dict[str, dict[str, Any]] = {}
+    late = Randomisation(delay=Delay(action=(1, 1)))
+    for dialect, naming in NAMINGS:
+        where, path = f"{dialect}, {naming}", tmp_path / f"{dialect}-{naming}.mcap"
+        with SimulatedServer("block", "arm", play=True, dialect=dialect, actor_names=naming) as server:
+            address = f"{server.address}:{server.step_port}"
+            with (
+                closing(URLabEnv.connect(address, randomise=late)) as env,
+                record(env.client, path, cameras=["arm/wrist"]),
+            ):
+                env.reset(seed=1)
+                for _ in range(3):
+                    env.step(np.full(env.action_space.shape, 0.1, np.float32))
+        run = read_run(path)
+        (topic,) = run.cameras()
+        assert {*run.positions()} == {"block", "arm"}, where
+        assert topic == "arm/wrist", where
+        assert run.picture_at("arm/wrist", 1.0) is not None
+        state = run.state_at(1.0)
+        assert state is not None
+        assert {*state.articulations} == {"block", "arm"}
+        found[where] = {**run.table().arrays(), **transitions_of(run).arrays()}
+        del found[where]["wall_ns"]
+    expected = found["alpha, model"]
+    assert {"arm/qpos", "arm/action", "arm/applied", "block/qvel", "task/chosen/arm"} <= expected.keys()
+    for where, arrays in found.items():
+        assert arrays.keys() == expected.keys(), where
+        for name, values in arrays.items():
+            assert np.array_equal(values, expected[name], equal_nan=True), (where, name)

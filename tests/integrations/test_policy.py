@@ -28,7 +28,7 @@ from urlab_client.integrations.policy import (
     run,
     run_blocking,
 )
-from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server import ControllerConfig, Drop, Faults, SimulatedServer
 
 PD = {"quadruped": ControllerConfig()}
 
@@ -492,6 +492,38 @@ async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch:
         with pytest.raises(URLabError, match="Physics stands still"):
             await run(client, policy, seconds=60.0, on_action=pause)
         await tasks[0]
+
+
+async def test_a_live_policy_says_that_somebody_reset_the_simulation() -> None:
+    with SimulatedServer("quadruped", play=True, controllers=PD) as server:
+        async with aio.URLabClient(**server.client_options(), step_mode="live") as client:
+            await client.discover()
+            await client.runtime.set_paused(False)
+            resets: list[asyncio.Task[Any]] = []
+
+            def reset(so_far: Any) -> None:
+                if so_far.sim_time > 0.5 and not resets:
+                    resets.append(asyncio.create_task(client.reset()))
+
+            with pytest.raises(URLabError, match=r"clock went back from 0\.\d+ s to 0\.\d+ s: somebody else reset"):
+                await run(client, policy_of(WALK), seconds=60.0, on_action=reset)
+            await resets[0]
+
+
+async def test_a_policy_whose_gains_were_not_acknowledged_puts_back_those_of_before() -> None:
+    faults = Faults()
+    with SimulatedServer("quadruped", play=True, controllers=PD, faults=faults) as server:
+        async with aio.URLabClient(**server.client_options(), step_mode="direct") as client:
+            await client.discover()
+            controller = client.articulations["quadruped"].controller
+            before = dict(controller.params)
+            lost = faults.add(Drop("configure_controller", times=1))
+            running = asyncio.create_task(run(client, policy_of(WALK)))
+            await until(lambda: lost.applied)
+            running.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await running
+            assert await controller.refresh() == before
 
 
 class Overslept:

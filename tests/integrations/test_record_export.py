@@ -430,10 +430,38 @@ def test_plot_draws_the_joints_that_are_named(
     assert "arm/shoulder_pan" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+def test_plot_draws_joints_that_are_called_like_coordinates(
+    field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tmp_path / "cart.xml"
+    model.write_text(
+        '<mujoco model="cart"><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/>'
+        '<body><joint name="y"/><joint name="wx" axis="0 1 0"/><geom size="0.1"/></body></body>'
+        '<body name="ball"><freejoint name="root"/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    with (
+        SimulatedServer(str(model), play=True, model_roots=[tmp_path]) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap"):
+            client.step()
+    drawn: list[Curves] = []
+    monkeypatch.setattr("urlab_client.cli.plot.plot_curves", lambda _title, _time, curves, _path: drawn.extend(curves))
+    assert run("plot", tmp_path / "run.mcap", "--field", field) == 0
+    assert [one.names for one in drawn] == [["x"], ["y", "wx"]]
+
+
 def test_values_say_what_they_measure() -> None:
-    layout = SceneLayout(qpos=["base.x", "base.qw", "elbow", "rail"], slides=["rail"], sensors={"imu": "accelerometer"})
-    angles = quantities(layout, "qpos", layout.qpos)
-    assert angles == ["position (m)", "orientation (w, x, y, z)", "angle (rad)", "position (m)"]
+    base, hinges, slides = [f"base.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")], ["y", "leg.x"], ["x"]
+    layout = SceneLayout(qpos=base + hinges + slides, slides=slides, sensors={"imu": "accelerometer"})
+    expected = ["position (m)"] * 3 + ["orientation (w, x, y, z)"] * 4 + ["angle (rad)"] * 2 + ["position (m)"]
+    assert quantities(layout, "qpos", layout.qpos) == expected
+    speeds = [f"base.{part}" for part in ("vx", "vy", "vz", "wx", "wy", "wz")]
+    expected = ["velocity (m/s)"] * 3 + ["angular velocity (rad/s)"] * 3
+    assert quantities(layout, "qvel", [*speeds, "wx", "x"]) == [*expected, "angular velocity (rad/s)", "velocity (m/s)"]
+    assert quantities(SceneLayout(), "qvel", ["vx", "vy", "vz", "wx", "wy", "wz"]) == expected, "of a plain entity"
     assert quantities(layout, "sensors", ["imu.0", "odd"]) == ["linear acceleration (m/s²)", "reading"]
     assert [component_name(layout, name) for name in ("imu.0", "imu.2", "odd.1")] == ["imu.x", "imu.z", "odd.1"]
     # A recording of an earlier release does not say which joints slide.

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from waiting import DEADLINE_S, eventually
 from urlab_client import URLabError
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
+from urlab_client.cli import teleop as cli_teleop
 from urlab_client.cli.teleop import _StatusLine, terminal_keys
 from urlab_client.integrations.gym import Reach
 from urlab_client.integrations.record import read_run, record, transitions_of
@@ -243,6 +245,41 @@ def test_keys_move_while_they_repeat() -> None:
     typed.append("wd\rr")
     assert operator(VIEW).verdict == "success"
     assert operator(VIEW).linear == (0.0, 0.0, 1.0)  # of the next episode
+
+
+@pytest.mark.parametrize(
+    ("sequence", "linear"),
+    [
+        ("\x1b[A", (1.0, 0.0, 0.0)),
+        ("\x1bOB", (-1.0, 0.0, 0.0)),  # as some terminals send it
+        ("\x1b[1;2A", (0.2, 0.0, 0.0)),
+        ("\x1b[1;2B", (-0.2, 0.0, 0.0)),
+        ("\x1b[1;2C", (0.0, -0.2, 0.0)),
+        ("\x1b[1;2D", (0.0, 0.2, 0.0)),
+        ("\x1b[1;5D", (0.0, 1.0, 0.0)),
+        ("\x1b[3~", (0.0, 0.0, 0.0)),
+        ("\x1b[H", (0.0, 0.0, 0.0)),
+        ("\x1b[F", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_arrows_move_like_their_letters_and_other_keys_do_nothing(
+    sequence: str, linear: tuple[float, float, float]
+) -> None:
+    for cut in range(1, len(sequence) + 1):  # a terminal may deliver the parts of a sequence one after the other
+        typed = [sequence[:cut], sequence[cut:]]
+        operator = KeyboardOperator(lambda typed=typed: typed.pop(0), clock=lambda: 0.0)
+        operator(VIEW)
+        assert operator(VIEW) == TeleopCommand(linear=linear)
+
+
+def test_arrows_are_read_on_windows_and_other_keys_without_a_character_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = [*"w", "\xe0", *"H", "\0", *"S", *"d"]
+    console = SimpleNamespace(kbhit=lambda: bool(typed), getwch=lambda: typed.pop(0))
+    monkeypatch.setattr(cli_teleop, "os", SimpleNamespace(name="nt"))
+    monkeypatch.setitem(sys.modules, "msvcrt", console)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    with terminal_keys() as read:
+        assert read() == "w\x1b[Ad"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a pseudo-terminal of Unix")

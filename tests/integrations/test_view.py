@@ -7,6 +7,7 @@ import base64
 import contextlib
 import io
 import json
+import socket
 import sys
 import threading
 import time
@@ -18,12 +19,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from ports import free_ports
+from ports import free_port, free_ports
 from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
 from urlab_client.cli import main
+from urlab_client.errors import URLabError
 from urlab_client.integrations._feed import samples
 from urlab_client.integrations._feed.geometry import Kind, shapes_of
 from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
@@ -423,6 +425,25 @@ def test_a_recordings_pictures_are_shown(tmp_path: Path) -> None:
     assert np.array_equal(np.frombuffer(bytes(buffer), "<f4").reshape(depth.shape), depth)
     assert len(rows(path, "/world/cameras/arm/overview/image", "EncodedImage:blob")) == 2
     assert rows(path, "/world/cameras/arm/overview", "Pinhole:image_from_camera")
+
+
+def test_a_port_of_reruns_page_that_another_program_holds_is_named(client: urlab_client.URLabClient) -> None:
+    held, grpc = free_port(), free_port()
+
+    def is_free() -> bool:
+        try:
+            socket.create_server(("0.0.0.0", grpc)).close()
+        except OSError:
+            return False
+        return True
+
+    with (
+        socket.create_server(("0.0.0.0", held)),
+        pytest.raises(URLabError, match=rf"rerun_view: port {held} cannot be used.* choose another"),
+        rerun_view(client, web=True, web_port=held, grpc_port=grpc),
+    ):
+        pass
+    assert eventually(is_free), "the port of the data"
 
 
 def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path: Path) -> None:

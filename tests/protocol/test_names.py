@@ -12,6 +12,7 @@ from urlab_client.values.names import (
     NameMap,
     UnknownName,
     element_ids,
+    lasting_names,
     own_aliases,
     owner_of,
     robot_prefixes,
@@ -246,3 +247,21 @@ def test_what_two_elements_of_a_robot_may_be_called_is_ambiguous_but_a_compiled_
     assert own_aliases(["left_hand", "hand"], "arm_C_0", robots)["arm_left_hand"] == ["left_hand", "hand"]
     named = robot_prefixes([("arm", "arm_left", "arm")])
     assert own_aliases(["left_hand", "hand"], "arm", named)["arm_left_hand"] == ["left_hand"]
+
+
+@pytest.mark.parametrize(
+    ("robots", "names"),
+    [
+        ([("arm", "arm", "arm")], ["arm"]),
+        ([("arm", "arm", "arm_C_0")], ["arm"]),
+        ([("left", "left", "arm_C_0")], ["left"]),
+        ([("arm_C_0", "left", "arm_C_0"), ("arm_C_1", "", "arm_C_1")], ["left", "arm_C_1"]),
+        ([("arm_C_7", "", "arm_C_7")], ["arm"]),
+        ([("cart_C_0", "arm", "cart_C_0"), ("arm_C_0", "x", "arm_C_0")], ["arm", "x"]),
+        ([("arm_C_0", "twin", "arm_C_0"), ("arm_C_1", "twin", "arm_C_1")], ["arm_C_0", "arm_C_1"]),
+    ],
+)
+def test_names_for_data_do_not_depend_on_the_engines_numbers(
+    robots: list[tuple[str, str, str]], names: list[str]
+) -> None:
+    assert [*lasting_names(robot_prefixes(robots)).values()] == names

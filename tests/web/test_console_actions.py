@@ -21,7 +21,16 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.mujoco_viewer import MujocoViewer
 from urlab_client.console.session import ConsoleSession
 from urlab_client.console.shared_view import SharedView
-from urlab_client.errors import ConnectionLost, NotReady, OutcomeUnknown, ProtocolError, URLabError, URLabTimeoutError
+from urlab_client.errors import (
+    ConnectionLost,
+    ModeLocked,
+    NotReady,
+    OutcomeUnknown,
+    ProtocolError,
+    URLabError,
+    URLabTimeoutError,
+)
+from urlab_client.integrations.record import record
 from urlab_client.server import SimulatedServer
 from urlab_client.web import app, endpoints
 from urlab_client.web.endpoints import explain_error
@@ -283,6 +292,56 @@ def test_what_the_server_has_saved_is_replayed_too(http: TestClient, server: Sim
     shown = http.get("/api/state").json()["articulations"]["quadruped"]["qpos"]
     assert shown == pytest.approx(fallen, abs=2e-5)
     assert http.delete("/api/replay").status_code == 200
+
+
+@pytest.mark.opengl
+@pytest.mark.parametrize(
+    ("recorded", "shown"),
+    [(("alpha", "plugin"), ("beta", "plugin")), (("alpha", "model"), ("alpha", "plugin"))],
+)
+async def test_a_recording_is_replayed_whatever_the_engine_called_its_robots(
+    recorded: tuple[Any, Any], shown: tuple[Any, Any], tmp_path: Path
+) -> None:
+    for dialect, naming in (recorded, shown):
+        async with (
+            SimulatedServer("arm", "block", dialect=dialect, actor_names=naming, play=True) as server,
+            URLabClient(**server.client_options(), step_mode="direct") as client,
+        ):
+            await client.discover()
+            if (dialect, naming) == recorded:
+                async with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"]):
+                    await client.step(5)
+            else:
+                console = ConsoleSession(client, recordings=tmp_path)
+                await console.replay.begin(tmp_path / "run.mcap")
+                await console.replay.change(at=1.0, playing=False)
+                assert {*console.view.snapshot.per_articulation} == {*client.articulations}
+                camera = f"{client.articulations.key('arm')}/wrist"
+                assert [*console.replay.cameras] == [camera]
+                assert await console.replay.picture(camera) is not None
+
+
+async def test_a_replay_that_cannot_place_the_robots_does_not_begin(server: SimulatedServer, tmp_path: Path) -> None:
+    async with URLabClient(**server.client_options(), step_mode="direct") as client:
+        await client.discover()
+        async with record(client, tmp_path / "run.mcap"):
+            await client.step()
+        await client.sim.stop()
+        await client.sim.start()
+        console = ConsoleSession(client, recordings=tmp_path)
+        set_mode = client.runtime.set_mode
+
+        async def refuse(_: object) -> None:
+            raise ModeLocked("mode_locked_by_server", "the project pins direct", op="set_mode")
+
+        client.runtime.set_mode = refuse
+        with pytest.raises(ModeLocked):
+            await console.replay.begin(tmp_path / "run.mcap", placing=True)
+        assert not console.replay.open
+        client.runtime.set_mode = set_mode
+        await console.replay.begin(tmp_path / "run.mcap", placing=True)
+        await console.replay.end()
+        assert client.step_mode == "direct"
 
 
 async def test_bodies_are_shown_where_robots_and_other_things_are(tmp_path: Path) -> None:

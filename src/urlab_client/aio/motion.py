@@ -112,37 +112,31 @@ class Motion:
             await self._locate()
         if done():
             return 0.0, True
-        start = state.clocks.sim_time
+        start = last = state.clocks.sim_time
         restarts = self._session.restarts
         passed = 0.0
-        async with aclosing(self._passing(what, limit, slice_s)) as times:
+        steps = self._stepped_times(lambda: limit - passed, slice_s)
+        async with aclosing(self._live_times(what) if live else steps) as times:
             async for now in times:
                 self._check_restarts(what, restarts)
                 if live:  # the client's own time may be stale: count from the first snapshot
                     start, live = now, False
-                # A reset sets the clock back: count from there.
-                start = min(start, now)
-                passed = now - start
+                elif now < last:  # a reset sets the clock back, and what passed before counts too
+                    start = now - passed
+                last, passed = now, now - start
                 if done():
                     return passed, True
+                if passed >= limit:
+                    break
         return passed, False
 
-    async def _passing(self, what: str, limit: float, slice_s: float) -> AsyncGenerator[float, None]:
+    async def _stepped_times(self, left: Callable[[], float], slice_s: float) -> AsyncGenerator[float, None]:
         state = self._state
-        if state.mode.live:
-            end: float | None = None
-            async with aclosing(self._live_times(what)) as times:
-                async for now in times:
-                    yield now
-                    end = now + limit if end is None else end
-                    if now >= end:
-                        return
-        end = state.clocks.sim_time + limit
         model = state.mirror.model
         timestep = 0.0 if model is None else float(model.opt.timestep)
-        while (left := end - state.clocks.sim_time) > timestep / 2:
+        while left() > timestep / 2:
             before = state.clocks.sim_time
-            n = max(1, round(min(left, slice_s) / timestep)) if timestep else 1
+            n = max(1, round(min(left(), slice_s) / timestep)) if timestep else 1
             await self._step(n)
             timestep = timestep or max(0.0, state.clocks.sim_time - before)
             yield state.clocks.sim_time

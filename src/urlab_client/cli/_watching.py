@@ -77,15 +77,18 @@ async def run_session(
         URLabError: The server refused a request, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
-    start = math.inf
+    start = last = math.inf
+    done = 0.0
     lost_at: float | None = None
     async with client.events() as events:
         if not direct:
             await client.runtime.set_paused(False)
         while not over():
             if direct or client.recv_wall_time_ns:  # otherwise no state has come yet
-                start = min(start, client.sim_time)  # a reset puts the clock back
-            done = max(0.0, client.sim_time - start)
+                now = client.sim_time
+                if now < last:  # the first state; or a reset puts the clock back, and what passed before counts too
+                    start = now - done
+                last, done = now, now - start
             progress(done)
             if seconds is not None and done >= seconds - 1e-9:
                 return

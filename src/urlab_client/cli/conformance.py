@@ -4,7 +4,8 @@ Check a server against the statements about the wire that this project rests on,
 differs (with what was expected and what came), or was not tried. Without options it only reads, but it opens a session,
 which takes the server over from the client that drives it. --play drives the robots of a play session, and begins one
 if none runs. --author makes a level of its own, and opens yours again: save yours first. Exits with 0 if nothing
-differs, with 1 if something does, and with 2 if the server cannot be checked.
+differs, with 1 if something does, and with 2 if the server cannot be checked. Ctrl-C puts back what was changed, and
+reports what was found until then.
 """
 
 from __future__ import annotations
@@ -125,6 +126,7 @@ async def _checked(
     trusted = True if arguments.trust_server or keys is not None else None
     file = getattr(arguments, "import") or own_robot
     bench = Bench(wire, own_server=own_robot is not None, trusted=trusted, import_file=file)
+    partial: list[Report] = []
     try:
         try:
             await bench.open()
@@ -132,10 +134,12 @@ async def _checked(
             raise CommandError(f"{arguments.address} cannot be checked: {error}") from error
         bench.state_port = arguments.state_port or wire.transport.state_port or bench.state_port
         with progress_bar("checking", 1.0) as show:
-            return bench, await run_checks(bench, choice, lambda _, done, whole: show(done / max(whole, 1)))
+            return bench, await run_checks(
+                bench, choice, lambda _, done, whole: show(done / max(whole, 1)), partial.append
+            )
     except asyncio.CancelledError:
-        sys.stderr.write("urlab conformance: interrupted; it put back what it had changed\n")
-        _print_left(bench.left)
+        for report in partial:
+            _write(arguments, bench, report)
         raise
     finally:
         await asyncio.shield(wire.aclose())
@@ -157,11 +161,6 @@ def _write(arguments: Namespace, bench: Bench, report: Report) -> None:
     _print(arguments, report)
 
 
-def _print_left(lines: list[str]) -> None:
-    for line in lines:
-        sys.stderr.write(f"urlab conformance: not put back: {line}\n")
-
-
 def _folded(table: str) -> str:
     """Return a table whose last column is folded at a terminal."""
     if not sys.stdout.isatty():
@@ -180,6 +179,7 @@ def _print(arguments: Namespace, report: Report) -> None:
     print(f"{counts(report.statements)}, by {len(report.checks)} checks and {server['requests']} requests.")
     if not arguments.all:
         print("--all also prints what was not tried, and what that needs.")
-    _print_left(report.left)
+    for line in report.left:
+        sys.stderr.write(f"urlab conformance: not put back: {line}\n")
     if report.stopped:
         sys.stderr.write(f"urlab conformance: {report.stopped}; what came after was not tried\n")

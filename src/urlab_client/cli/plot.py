@@ -70,7 +70,7 @@ def run(arguments: Namespace) -> int:
 
 
 def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
-    from urlab_client.integrations._feed.scene import joint_columns
+    from urlab_client.integrations._feed.scene import component
 
     chosen: dict[str, list[str]] = {}
     there: list[str] = []
@@ -80,7 +80,8 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
             continue
         there += [f"{owner}/{name}" for name in column.names]
         plain = arguments.joints is None and field in {"qpos", "qvel"}
-        names = joint_columns(column.names, dof=field == "qvel") if plain else column.names
+        every = frozenset(column.names)
+        names = [name for name in column.names if not (plain and component(name, every))]
         labels = dict(zip(column.names, column.labels, strict=True))
         found = [
             name

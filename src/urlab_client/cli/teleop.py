@@ -18,7 +18,7 @@ import select
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -123,6 +123,9 @@ def _counts(tally: TeleopTally) -> str:
     return f"{tally.success} success, {tally.failure} failure, {tally.discarded} discarded"
 
 
+_WINDOWS_ARROWS: Final = {"H": "\x1b[A", "P": "\x1b[B", "K": "\x1b[D", "M": "\x1b[C"}
+
+
 @contextlib.contextmanager
 def terminal_keys() -> Generator[Callable[[], str]]:
     """Yield a function that returns the characters typed since its last call; restore the terminal afterwards."""
@@ -134,7 +137,9 @@ def terminal_keys() -> Generator[Callable[[], str]]:
         def typed() -> str:
             found = ""
             while console.kbhit() and len(found) < _MOST:
-                found += console.getwch()
+                key = console.getwch()
+                # Keys without a character come in two parts; an arrow is returned as other terminals send it.
+                found += _WINDOWS_ARROWS.get(console.getwch(), "") if key in "\0\xe0" else key
             return found
 
         yield typed

@@ -100,15 +100,25 @@ Progress = Callable[[CheckResult, int, int], None]
 """Called after each check with its result, its number and the number of all."""
 
 
-async def run(bench: Bench, choice: Choice, progress: Progress = lambda _result, _number, _all: None) -> Report:
+async def run(
+    bench: Bench,
+    choice: Choice,
+    progress: Progress = lambda _result, _number, _all: None,
+    interrupted: Callable[[Report], None] = lambda _: None,
+) -> Report:
     """Run the chosen checks against an opened bench, and bring the user's world back.
 
-    Cancelling it brings the world back, too. What was found until then is lost.
+    Cancelling it brings the world back, too; then `interrupted` is called with what was found until then.
     """
     wanted = [check for check in CHECKS if choice.takes(check) and bench.dialect in check.dialects]
     results: list[CheckResult] = []
     measurements: dict[str, Any] = {}
     stopped = ""
+
+    def report() -> Report:
+        measured = measurements | bench.measured
+        return Report(_server(bench), _statements(bench, results), results, measured, bench.left, stopped)
+
     try:
         for group in Group:
             chosen = [check for check in wanted if check.group is group and not check.last]
@@ -132,10 +142,21 @@ async def run(bench: Bench, choice: Choice, progress: Progress = lambda _result,
             if check.last:
                 results.append(await one(bench, check))
                 progress(results[-1], len(results), len(wanted))
+    except asyncio.CancelledError:
+        await bench.put_back()
+        stopped, done = "interrupted", {result.title for result in results}
+        results += (
+            CheckResult(
+                check.title, check.statements, check.group, Verdict.NOT_TRIED, _closed(check.group, choice) or stopped
+            )
+            for check in wanted
+            if check.title not in done
+        )
+        interrupted(report())
+        raise
     finally:
         await bench.put_back()
-    measurements |= bench.measured
-    return Report(_server(bench), _statements(bench, results), results, measurements, bench.left, stopped)
+    return report()
 
 
 async def one(bench: Bench, check: Check) -> CheckResult:
@@ -161,10 +182,14 @@ async def one(bench: Bench, check: Check) -> CheckResult:
     return CheckResult(check.title, check.statements, check.group, verdict, detail, (before + 1, bench.wire.count))
 
 
+def _closed(group: Group, choice: Choice) -> str:
+    return "" if group in choice.groups else f"changes the world, so it needs --{group}"
+
+
 async def _begin(bench: Bench, group: Group, choice: Choice, checks: Collection[Check]) -> tuple[str, bool]:
     """Prepare the world for a group; return what stands in the way, and whether the server answers wrongly."""
-    if group not in choice.groups:
-        return f"changes the world, so it needs --{group}", False
+    if closed := _closed(group, choice):
+        return closed, False
     if not checks or group is Group.READ:
         return "", False
     try:

@@ -31,6 +31,7 @@ from urlab_client.errors import URLabError
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.messages.session import ArticulationInfo, CameraInfo, HelloOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.values.names import NameMap, lasting_names, robot_prefixes
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
@@ -63,12 +64,12 @@ class Replay:
     """The replay of one console, at most one at a time.
 
     Attributes:
-        cameras: Cameras of which the recording has pictures, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+        cameras: Names in the recording of the cameras of which it has pictures, by `ARTICULATION/CAMERA` or `-/CAMERA`.
         alone: Whether there is no simulation besides.
     """
 
     def __init__(self, client: URLabClient, view: SharedView, cameras: Cameras, *, alone: bool = False) -> None:
-        self.cameras: frozenset[str] = frozenset()
+        self.cameras: dict[str, str] = {}
         self.alone: bool = alone
         self._client = client
         self._view = view
@@ -123,10 +124,10 @@ class Replay:
 
     async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
         """Return a camera's picture at the replay's position, and its time in seconds from the recording's start."""
-        run, at = self._run, self._moment
-        if run is None:
+        run, at, name = self._run, self._moment, self.cameras.get(camera)
+        if run is None or name is None:
             return None
-        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(camera.removeprefix(OF_SCENE), at))
+        found = await anyio.to_thread.run_sync(lambda: run.encoded_picture_at(name, at))
         return found.time - self._start, found
 
     async def past(self, seconds: float) -> list[StateSnapshot]:
@@ -147,19 +148,30 @@ class Replay:
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
         """Show a recording from its start."""
-        run, (start, end), names, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
+        run, (start, end), names, prefixes, cameras = await anyio.to_thread.run_sync(lambda: _opened(file))
         if not names:
             raise ValueError(f"{file.name} holds no states of robots.")
-        robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
+        arts, recorded = self._client.articulations, {name: key for key, name in lasting_names(prefixes).items()}
+        known = {key: recorded.get(name, "") for key, name in lasting_names(compiled_prefixes(arts)).items()}
+        robots = {
+            key: found
+            for key, art in arts.items()
+            if (found := _robot(names, key if key in names else known[key], art))
+        }
         if not robots:
             there = ", ".join(self._client.articulations) or "none"
             raise ValueError(f"{file.name} is a recording of other robots than the current ones ({there}).")
         await self.end()
-        self._run, self._robots, self.cameras = run, robots, cameras
-        self._start, self._seconds = start, end - start
-        self._at, self._rate, self._state = 0.0, 1.0, None
         if placing and not self.alone:
             await self._take_over()
+        self._run, self._robots, keys = run, robots, {robot.source: key for key, robot in robots.items()}
+        parts = {name: name.partition("/") for name in cameras}
+        self.cameras = {
+            f"{keys.get(owner, owner)}/{short}" if slash else OF_SCENE + name: name
+            for name, (owner, slash, short) in parts.items()
+        }
+        self._start, self._seconds = start, end - start
+        self._at, self._rate, self._state = 0.0, 1.0, None
         self._playing = True
         await self._show_pictures()
         self._wake.set()
@@ -198,8 +210,10 @@ class Replay:
         data = self._client.data
         if before is not None and data is not None and data.qpos.shape == before.qpos.shape:
             data.qpos[:], data.qvel[:] = before.qpos, before.qvel
-            await self._client.step(0)
-            await self._client.runtime.set_mode(before.mode)
+            try:
+                await self._client.step(0)
+            finally:
+                await self._client.runtime.set_mode(before.mode)
 
     async def keep_playing(self) -> None:
         """Advance the replay while it plays."""
@@ -313,16 +327,22 @@ def _camera(run: Run, name: str) -> CameraInfo:
     return CameraInfo(mode=first.mode, resolution=(width, height), fovy=45.0, zmq_endpoint="", zmq_topic=name)
 
 
-def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
+def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], NameMap[str], list[str]]:
     from urlab_client.integrations.record import read_run
 
     run = read_run(file)
-    cameras = (name if "/" in name else OF_SCENE + name for name in run.cameras())
-    return run, run.time_range(), run.positions(), frozenset(cameras)
+    prefixes = robot_prefixes((key, "", prefix) for key, prefix in run.prefixes().items())
+    return run, run.time_range(), run.positions(), prefixes, run.cameras()
 
 
 def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> _Robot | None:
-    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not."""
+    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not.
+
+    Args:
+        names: Names of joint positions by articulation of the recording.
+        key: Key of the robot there.
+        art: The robot.
+    """
     size = len(art.qpos_array)
     if key in names:
         return _Robot(key, size) if len(names[key]) == size else None

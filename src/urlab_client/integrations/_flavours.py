@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar, cast, overload
+
+import anyio.to_thread
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.errors import ClientClosed
@@ -67,6 +71,17 @@ class BlockingBlock(Block):
             self.portal.call(self._end, exc)
         except ClientClosed:
             self._finish()
+
+
+async def opened(open_it: Callable[[], T], close: Callable[[T], object]) -> T:
+    """Open something in a worker thread and return it; it is closed if the caller is cancelled meanwhile."""
+    made = Future[T]()
+    try:
+        await anyio.to_thread.run_sync(lambda: made.set_result(open_it()))
+    except asyncio.CancelledError:
+        made.add_done_callback(lambda made: close(made.result()))
+        raise
+    return made.result()
 
 
 class Flavoured(Protocol[P, A_co, B_co]):

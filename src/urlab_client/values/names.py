@@ -306,7 +306,24 @@ def robot_prefixes(robots: Iterable[tuple[str, str, str]]) -> NameMap[str]:
             aliases.setdefault(alias, []).append(key)
         if found := _ENGINE_NAME.fullmatch(prefix):
             classes.setdefault(found["stem"], []).append(key)
-    return NameMap(prefixes, classes | aliases, kind="articulation")
+    others = {stem: keys for stem, keys in classes.items() if stem not in aliases}
+    return NameMap(prefixes, aliases | others, kind="articulation")
+
+
+def lasting_names(prefixes: NameMap[str]) -> dict[str, str]:
+    """Return the names of robots by key, for data that outlives the session, in which the engine numbers its actors.
+
+    They are the keys, except for those that are names of the engine: instead of these the actor id or, without one, the
+    class, where that means no other robot.
+
+    Args:
+        prefixes: As from `robot_prefixes`.
+    """
+    names: dict[str, str] = {}
+    for alias, (key, *others) in prefixes.aliases.items():
+        if prefixes[key] == key and not others:
+            names.setdefault(key, alias)
+    return {key: names.get(key, key) for key in prefixes}
 
 
 def spellings(names: Sequence[str], prefixes: NameMap[str]) -> list[tuple[str, ...]]:

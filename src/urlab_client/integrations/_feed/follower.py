@@ -12,6 +12,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from msgspec import Struct
 
+from urlab_client.aio.articulation import compiled_prefixes
 from urlab_client.aio.background import background_task
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
@@ -25,6 +26,7 @@ from urlab_client.integrations._feed.scene import CameraLayout, FollowedScene
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.values.names import lasting_names
 
 log = logging.getLogger("urlab_client.feed")
 
@@ -178,7 +180,9 @@ class Follower(ClientObserver):
     def _views(self) -> list[tuple[str, URLabCameraView]]:
         """Return the requested cameras; raises `KeyError` for an unknown one, unless an earlier scene had it."""
         client, wanted = self._client, set[int]()
-        own = {f"{key}/{name}": view for key, art in client.articulations.items() for name, view in art.cameras.items()}
+        called = lasting_names(compiled_prefixes(client.articulations))
+        arts = client.articulations.items()
+        own = {f"{called[key]}/{name}": view for key, art in arts for name, view in art.cameras.items()}
         every = [*own.items(), *client.global_cameras.items()]
         if self._wanted_cameras == "all":
             return every
@@ -199,7 +203,11 @@ class Follower(ClientObserver):
         clock, wall = reply.sim_time, reply.wall_time
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
         wall_ns = client.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
-        set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
+        called = scene.called
+        set_points = {called.get(key, key): art.ctrl_array.tolist() for key, art in client.articulations.items()}
+        if called:
+            states, reply = reply.per_articulation, copy.copy(reply)
+            reply.per_articulation = {called.get(key, key): state for key, state in states.items()}
         restarts = isinstance(reply, ResetOk)
         if restarts:
             self._pictures = Schedule(self._camera_ns)  # one of the start is due

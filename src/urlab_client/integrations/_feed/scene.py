@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,7 +29,7 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations._variation import server_variation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
-from urlab_client.values.names import NameMap, cleaned_name
+from urlab_client.values.names import NameMap, cleaned_name, lasting_names
 
 if TYPE_CHECKING:
     import mujoco
@@ -91,8 +92,9 @@ class FollowedScene:
 
     Attributes:
         model: The local model, or None.
-        layouts: Layouts by articulation key.
-        names: Names by articulation key.
+        called: Names of articulations here, by the client's keys that are names of the engine.
+        layouts: Layouts by articulation.
+        names: Names by articulation.
         entities: Offsets of the free joint in `qpos` and in `qvel`, or None, by name of the plain entity.
         mocap: Mocap ids of the plain entities that have one.
         cameras: Cameras to record, by the identity of the client's camera.
@@ -100,6 +102,7 @@ class FollowedScene:
     """
 
     model: mujoco.MjModel | None
+    called: dict[str, str]
     layouts: dict[str, ArticulationLayout]
     names: dict[str, SceneLayout]
     entities: dict[str, tuple[int, int] | None]
@@ -111,9 +114,12 @@ class FollowedScene:
     def of(cls, client: URLabClient, cameras: Sequence[tuple[str, Lens]]) -> FollowedScene:
         plain = {name: one for name, one in client.entities.items() if not isinstance(one, URLabArticulation)}
         bodies = {name: (one.body_id, one.qpos_offset, one.qvel_offset) for name, one in plain.items()}
-        scene = cls._made(client.model, compiled_prefixes(client.articulations), bodies, cameras)
-        model = scene.model
-        return scene if model is None else replace(scene, variation=server_variation(client, model, scene.layouts))
+        prefixes = compiled_prefixes(client.articulations)
+        called = lasting_names(prefixes)
+        scene = cls._made(client.model, NameMap({called[key]: it for key, it in prefixes.items()}), bodies, cameras)
+        model, others = scene.model, {key: name for key, name in called.items() if key != name}
+        varied = None if model is None else server_variation(client, model, scene.layouts)
+        return replace(scene, called=others, variation=varied)
 
     @classmethod
     def recorded(
@@ -139,6 +145,7 @@ class FollowedScene:
             mocap = {name: int(model.body_mocapid[body]) for name, (body, _, _) in bodies.items() if body >= 0}
         return cls(
             model=model,
+            called={},
             layouts=layouts,
             names={key: _layout(model, layout, prefixes[key]) for key, layout in layouts.items()},
             entities={name: None if q is None or v is None else (q, v) for name, (_, q, v) in bodies.items()},
@@ -148,9 +155,14 @@ class FollowedScene:
         )
 
 
-def joint_columns(names: list[str], dof: bool = False) -> list[str]:
-    """Return the names in a layout that belong to hinge and slide joints, which have no component."""
-    return [name for name in names if name.rpartition(".")[2] not in (_FREE_QVEL if dof else _FREE_QPOS)]
+def component(name: str, names: AbstractSet[str]) -> str:
+    """Return the last part of the name of one of several values of a joint; empty for the value of a hinge or slide.
+
+    Hinges and slides, too, may be called `x`, or have a dot in their names.
+    """
+    joint, dot, part = name.rpartition(".")
+    groups = _FREE_QPOS[3:], _FREE_QVEL[3:]
+    return part if any(all(joint + dot + other in names for other in group) for group in groups) else ""
 
 
 class Simulation:

@@ -32,7 +32,8 @@ class EpisodeOptions(TypedDict, total=False):
     Attributes:
         task: What the robots are to do. It sets rewards and episode ends, and may change the start that `keyframe` and
             `reset_noise` give. One instance serves one environment, single or vector, until its `close()`.
-        space_mode: `flat` for one array (the default), or `dict` for dictionaries by articulation and field.
+        space_mode: `flat` for one array (the default), or `dict` for dictionaries by articulation (its
+            actor id, if its key is a name of the engine) and field.
         observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
             sequence of those fields. `standard` without a task.
         actions: How actions become set-points, for all articulations or by key. Without a task, and for articulations

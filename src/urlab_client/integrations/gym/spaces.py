@@ -17,7 +17,7 @@ from urlab_client.aio.model.layout import ArticulationLayout, articulation_layou
 from urlab_client.enums import CameraMode
 from urlab_client.errors import UnknownKeyframe
 from urlab_client.protocol.base import Floats
-from urlab_client.values.names import NameMap, UnknownName
+from urlab_client.values.names import NameMap, UnknownName, lasting_names
 
 if TYPE_CHECKING:
     import mujoco
@@ -84,6 +84,7 @@ class SpaceMapping:
 
     Attributes:
         keys: Articulation keys, in order.
+        names: Name of each articulation in dictionaries, by key: its actor id where the key is a name of the engine.
         observed: Keys of the observed articulations.
         fields: Observed fields, in order.
         mode: `flat` or `dict`.
@@ -126,6 +127,7 @@ class SpaceMapping:
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
         self.keys: tuple[str, ...] = tuple(prefixes)
+        self.names: dict[str, str] = lasting_names(prefixes)
         self.prefixes: NameMap[str] = prefixes
         self.observed: tuple[str, ...] = self.keys if observed is None else self._keys("cannot observe", observed)
         self.fields: tuple[Field, ...] = tuple(fields)
@@ -225,9 +227,8 @@ class SpaceMapping:
                 for name, part in action.items()
             }
             if parts.keys() != self._inputs.keys():
-                raise ValueError(
-                    f"the action needs one entry for each of {', '.join(self._inputs)}, not {sorted(action)}"
-                )
+                wanted = ", ".join(self.names[key] for key in self._inputs)
+                raise ValueError(f"the action needs one entry for each of {wanted}, not {sorted(action)}")
             for key, where in self._inputs.items():
                 _check_width(f"the action of {key}", parts[key], where.stop - where.start)
             whole = np.concatenate([parts[key] for key in self._inputs], axis=-1)
@@ -295,7 +296,9 @@ class SpaceMapping:
     def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
         """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
         if self.mode == "dict":
-            return {key: {field: np.array(read(key, field)) for field in self.fields} for key in self.observed}
+            return {
+                self.names[key]: {field: np.array(read(key, field)) for field in self.fields} for key in self.observed
+            }
         parts = [read(key, field) for key in self.observed for field in self.fields]
         return np.concatenate(parts, axis=-1) if parts else np.zeros(0)
 
@@ -315,12 +318,13 @@ class SpaceMapping:
         if key not in self.observed:
             raise ValueError(f"{key!r} is not observed; the observed articulations are: {', '.join(self.observed)}")
         if self.mode == "dict":
-            return observation[key][field]
+            return observation[self.names[key]][field]
         return observation[..., self._where[key, field]]
 
     def _make_action_space(self) -> Space:
         if self.mode == "dict":
-            return dict_space({key: _bounded(self._low[at], self._high[at]) for key, at in self._inputs.items()})
+            bounds = {self.names[key]: _bounded(self._low[at], self._high[at]) for key, at in self._inputs.items()}
+            return dict_space(bounds)
         return _bounded(self._low, self._high)
 
     def _make_observation_space(self) -> Space:
@@ -328,7 +332,7 @@ class SpaceMapping:
             return unbounded(sum(where.stop - where.start for where in self._where.values()))
         return dict_space(
             {
-                key: dict_space({field: unbounded(self.width(key, field)) for field in self.fields})
+                self.names[key]: dict_space({field: unbounded(self.width(key, field)) for field in self.fields})
                 for key in self.observed
             }
         )
@@ -375,7 +379,7 @@ def mapped(function: Callable[[NDArray[Any]], NDArray[Any]], tree: Any) -> Any:
 
 def dict_space(entries: Mapping[str, Space]) -> Space:
     """Return a `Dict` of spaces, in the given order."""
-    return spaces.Dict(dict(entries))
+    return spaces.Dict([*entries.items()])  # of a mapping, Gymnasium would sort the names
 
 
 def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
@@ -384,7 +388,7 @@ def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
         return mapping.observation_space
     if mapping.mode != "dict":
         raise ValueError("a flat observation cannot contain images: use space_mode='dict' with cameras")
-    if "cameras" in mapping.keys:
+    if "cameras" in mapping.names.values():
         raise ValueError("an articulation is named 'cameras', which is the entry for images: give it another actor id")
     observed = cast("Mapping[str, Space]", mapping.observation_space)
     return dict_space({**observed, "cameras": dict_space(cameras)})

@@ -245,7 +245,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             return Transition(actions=0, **told)
         if self.randomise is not None and self.randomise.delays_actions:
             meant = self.mapping.split(self.mapping.scaled(actions[i]))
-            told["chosen"] = {key: values.tolist() for key, values in meant.items()}
+            told["chosen"] = {self.mapping.names[key]: values.tolist() for key, values in meant.items()}
         reward, terminated, truncated = (values[i].item() for values in judged)
         told |= {"reward": reward, "terminated": terminated, "truncated": truncated}
         return Transition(actions=int(self.elapsed[i]), action=actions[i].tolist(), **told)

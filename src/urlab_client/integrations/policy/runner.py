@@ -178,16 +178,17 @@ async def run(
 
     Raises:
         PolicyMismatch: The policy cannot control this robot in this session. Nothing was moved.
-        URLabError: The server refused a request, or physics is paused in live mode.
+        URLabError: The server refused a request, or in live mode physics is paused, or somebody else resets it.
     """
     robot = require(client, policy, articulation)
-    before: dict[str, dict[str, float]] = {}
+    wanted = before = dict[str, dict[str, float]]()
     controller = robot.controller if policy.spec.action.via == "controller" else None
     if controller is not None:
         wanted = policy.bind(robot).gains()
         before = {name: {key: controller.params[name][key] for key in wanted[name]} for name in wanted}
-        await controller.configure(timeout=DEFAULT, **wanted)
     try:
+        if controller is not None:
+            await controller.configure(timeout=DEFAULT, **wanted)
         return await _PolicyLoop(client, robot, policy, on_action).until(seconds, seed, until_fall=until_fall)
     finally:
         if controller is not None and client.connected:
@@ -278,9 +279,17 @@ class _PolicyLoop:
         self._policy.act(self._robot, client.sim_time - self._began)
         await client.step()  # sends the set-points and reads the state
         self._due += period
-        deadline = loop.time() + _STANDSTILL_S
+        seen, deadline = client.sim_time, loop.time() + _STANDSTILL_S
         while (missing := self._due - client.sim_time) > 0:
-            if loop.time() > deadline:
+            if client.sim_time < self._last_time:
+                raise URLabError(
+                    f"The simulation clock went back from {self._last_time:.2f} s to {client.sim_time:.2f} s: somebody "
+                    "else reset the simulation.",
+                    hint="Run the policy again.",
+                )
+            if client.sim_time > seen:
+                seen, deadline = client.sim_time, loop.time() + _STANDSTILL_S
+            elif loop.time() > deadline:
                 raise URLabError(
                     f"Physics stands still at {client.sim_time:.2f} s.",
                     hint="If it is paused, call client.runtime.set_paused(False). Otherwise run `urlab doctor`.",

@@ -111,7 +111,8 @@ class Table:
         wall_ns: The server's UTC clock, nanoseconds.
         step: Step counter.
         episode: Number of preceding resets.
-        columns: Columns by `ARTICULATION/FIELD`, with fields as in `client.articulations`: `qpos`, `qvel`, `ctrl`,
+        columns: Columns by `ARTICULATION/FIELD`. An articulation whose key is a name of the engine is called by its
+            actor id. Fields are those of `client.articulations`: `qpos`, `qvel`, `ctrl`,
             `set_points`, `act`, `sensors`; plain entities have `pose` and `qvel`. What an environment told about a
             state is in `task/actions`, `action`, `reward`, `terminated`, `truncated`, `success` and `goal/NAME`.
     """

@@ -21,7 +21,7 @@ from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
-from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour, opened
 from urlab_client.integrations._variation import wire_variation
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.randomise.variation import declared_in
@@ -96,8 +96,7 @@ class Recording(Block):
         self._follower.check()
         self._used = True
         about = _about(self._client)
-        writer = await anyio.to_thread.run_sync(WriterThread, self._path, self._options, about)
-        self._writer = writer
+        self._writer = writer = await opened(lambda: WriterThread(self._path, self._options, about), WriterThread.close)
         self._follower.start(
             writer.put, room=writer.room, lost=writer.lose_frames, failed=writer.give_up, note=writer.note
         )

@@ -16,7 +16,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from urlab_client.integrations._feed.scene import SceneLayout
+from urlab_client.integrations._feed.scene import SceneLayout, component
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
 
@@ -264,11 +264,12 @@ def _column(source: Source, name: str, values: Floats) -> Column:
 
 def quantities(layout: SceneLayout, field: str, names: list[str]) -> list[str]:
     """Return quantity and unit of each value of a field, as axis labels."""
+    every = frozenset(names)
     match field:
         case "qpos":
-            return [_position(layout, name) for name in names]
+            return [_position(layout, name, component(name, every)) for name in names]
         case "qvel":
-            return [_velocity(layout, name) for name in names]
+            return [_velocity(layout, name, component(name, every)) for name in names]
         case "sensors":
             return [_SENSORS.get(_kind(layout, name), _kind(layout, name) or "reading") for name in names]
         case "pose":
@@ -293,23 +294,17 @@ def _kind(layout: SceneLayout, name: str) -> str:
     return layout.sensors.get(name) or layout.sensors.get(name.rpartition(".")[0], "")
 
 
-def _position(layout: SceneLayout, name: str) -> str:
-    component = name.rpartition(".")[2]
-    if component in ("x", "y", "z"):
-        return "position (m)"
-    if component in ("qw", "qx", "qy", "qz"):
-        return "orientation (w, x, y, z)"
+def _position(layout: SceneLayout, name: str, part: str) -> str:
+    if part:
+        return "orientation (w, x, y, z)" if part.startswith("q") else "position (m)"
     if layout.slides is None:
         return "position (rad, m)"
     return "position (m)" if name in layout.slides else "angle (rad)"
 
 
-def _velocity(layout: SceneLayout, name: str) -> str:
-    component = name.rpartition(".")[2]
-    if component in ("vx", "vy", "vz"):
-        return "velocity (m/s)"
-    if component in ("wx", "wy", "wz"):
-        return "angular velocity (rad/s)"
+def _velocity(layout: SceneLayout, name: str, part: str) -> str:
+    if part:
+        return "angular velocity (rad/s)" if part.startswith("w") else "velocity (m/s)"
     if layout.slides is None:
         return "velocity (rad/s, m/s)"
     return "velocity (m/s)" if name in layout.slides else "angular velocity (rad/s)"

@@ -73,7 +73,7 @@ class HandControl:
         self.set_points: dict[str, float] = {}
         found = self.ik.gripper if gripper is None else self._robot.actuators[gripper]
         if found is not None and found.ctrlrange is None:
-            raise ValueError(f"the gripper {gripper!r} has no control range")
+            raise ValueError(f"the gripper {found.name!r} has no control range")
         self.gripper: str | None = None if found is None else found.name
         self._range = (found and found.ctrlrange) or (0.0, 0.0)
         self.hold()

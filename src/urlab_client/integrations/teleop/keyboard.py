@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -36,7 +37,10 @@ _VERDICTS: Final[dict[str, Verdict]] = {
     "\x03": "quit",
     "\x04": "quit",
 }
-_ARROWS: Final = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
+_SPECIAL_KEY: Final = re.compile(r"\x1b[\[O](?P<modifiers>[0-9;]*)(?P<key>[A-Za-z~])")
+"""What terminals send for arrows and other keys without a character; the modifiers of an arrow end with 2 for shift."""
+_UNFINISHED: Final = re.compile(r"\x1b(?:[\[O][0-9;]*)?$")
+_ARROWS: Final = {"A": "w", "B": "s", "D": "a", "C": "d"}
 
 HELP: Final = (
     ("w s, a d, r f", "move along x, y, z; also the arrows for x and y; with shift slowly"),
@@ -74,9 +78,9 @@ class KeyboardOperator:
         """See `Operator`."""
         del view
         pressed, now = self._rest + self.keys(), self._clock()
-        self._rest = ""
-        for sequence, key in _ARROWS.items():
-            pressed = pressed.replace(sequence, key)
+        pressed = _SPECIAL_KEY.sub(_spelled, pressed)
+        unfinished = _UNFINISHED.search(pressed)
+        self._rest = unfinished[0] if unfinished else ""
         for i, key in enumerate(pressed):
             if key in _VERDICTS:
                 self._until[:] = -np.inf
@@ -93,3 +97,9 @@ class KeyboardOperator:
         return TeleopCommand(
             linear=(speed[0], speed[1], speed[2]), angular=(speed[3], speed[4], speed[5]), gripper=self._gripper
         )
+
+
+def _spelled(special: re.Match[str]) -> str:
+    """Return the character that an arrow stands for; nothing for other keys."""
+    key = _ARROWS.get(special["key"], "")
+    return key.upper() if special["modifiers"].endswith(";2") else key

@@ -67,7 +67,14 @@ class RerunBackend(ViewBackend):
             recording.connect_grpc(self._connect)
         elif self._web:
             address = recording.serve_grpc(grpc_port=self._grpc_port)
-            rr.serve_web_viewer(web_port=self._web_port, open_browser=False, connect_to=address)
+            try:
+                rr.serve_web_viewer(web_port=self._web_port, open_browser=False, connect_to=address)
+            except RuntimeError as error:
+                recording.disconnect()
+                raise URLabError(
+                    f"rerun_view: port {self._web_port} cannot be used: {error}",
+                    hint="Another program may hold it; choose another with web_port (--port).",
+                ) from None
         else:
             recording.spawn(port=self._grpc_port)
         self._stream = recording

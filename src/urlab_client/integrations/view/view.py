@@ -24,7 +24,7 @@ from urlab_client.errors import URLabError
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
 from urlab_client.integrations._feed.scene import FollowedScene, Lens, RecordedCamera, Simulation, camera_id
-from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour
+from urlab_client.integrations._flavours import AsyncBlock, Block, BlockingBlock, flavoured, in_flavour, opened
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -194,7 +194,7 @@ class Viewing(Block):
             raise URLabError("A view opens once.", hint="Call the function that made it again.")
         scene = self._follower.check()
         self._opened = True
-        await anyio.to_thread.run_sync(self._backend.open)
+        await opened(self._backend.open, lambda _: self._backend.close())
         if not self._client.config.read_only:  # a read-only client has no state until the first one is published
             self._states.append(self._start(scene))
         self._thread.start()
