@@ -87,9 +87,12 @@ class Serializable:
         return cast("Self", msgspec.structs.replace(cast("Struct", self), **changes))
 
     def _repr_html_(self) -> str | None:
+        return html.fields(type(self).__name__, self._shown())
+
+    def _shown(self) -> dict[str, Any]:
+        """Return what a notebook shows, by field."""
         struct = cast("Struct", self)
-        values = {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
-        return html.fields(type(self).__name__, values)
+        return {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
