@@ -77,6 +77,8 @@ def run(arguments: Namespace) -> int:
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
         raise CommandError("give one of --save, --connect and --page")
     recorded = isinstance(arguments.address, Path)
+    if recorded:
+        arguments.address.stat()  # whether the file exists matters more than whether there is a display
     if arguments.where == "web":
         return _show_console(arguments)
     if arguments.where == "viewer":
