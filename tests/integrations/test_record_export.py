@@ -430,6 +430,13 @@ def test_plot_draws_the_joints_that_are_named(
     assert "arm/shoulder_pan" in capsys.readouterr().err
 
 
+def test_a_recording_without_states_has_nothing_to_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    write_recording(path, [])
+    assert run("plot", path) == 2
+    assert capsys.readouterr().err == f"urlab plot: {path} has no states\n"
+
+
 def test_values_say_what_they_measure() -> None:
     layout = SceneLayout(qpos=["base.x", "base.qw", "elbow", "rail"], slides=["rail"], sensors={"imu": "accelerometer"})
     angles = quantities(layout, "qpos", layout.qpos)

@@ -94,7 +94,9 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
         ]
         if found:
             chosen[key] = found
-    if not chosen or not len(table):
+    if not len(table):
+        raise CommandError(f"{arguments.recording} has no states")
+    if not chosen:
         wanted = arguments.joints or ["*"]
         close = did_you_mean(wanted[0], [*there, *(name.rpartition("/")[2] for name in there)])
         raise CommandError(
