@@ -64,6 +64,15 @@ def test_without_a_display_the_window_is_refused_and_others_are_named(
     assert "--web, --rerun --page or --foxglove" in line
 
 
+def test_a_recording_that_does_not_exist_is_named_even_without_a_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    missing = str(tmp_path / "run.mcap")
+    assert missing in refused(capsys, missing)
+
+
 def test_options_of_another_view_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "require --rerun" in refused(capsys, "--foxglove", "--save", "a.rrd")
     assert "give one of" in refused(capsys, "--rerun", "--page", "--save", "a.rrd")

@@ -118,6 +118,15 @@ async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.Mon
             await going
 
 
+async def test_live_mode_ends_when_no_state_arrives(server: SimulatedServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_watching, "_FIRST_STATE_S", 0.2)
+    options = server.client_options() | {"state_port": free_port()}
+    async with URLabClient(**options, step_mode="live") as client:
+        await client.discover()
+        with pytest.raises(CommandError, match=r"no state arrived within 0\.2 s; .* pass --state-port"):
+            await run_session(client, 1.0, over=lambda: False)
+
+
 @pytest.mark.parametrize("mode", ["direct", "live"])
 def test_ctrl_c_ends_a_recording_early_and_whole(mode: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"

@@ -33,6 +33,13 @@ async def test_a_state_stream_that_cannot_be_reached_is_a_note(connect: Any, ser
     assert note.text.startswith(f"127.0.0.1:{port}: Connection refused; is the server running")
 
 
+async def test_the_default_port_of_the_state_stream_is_tried(connect: Any) -> None:
+    diagnosis = await connect(address="tcp://localhost", step_port=1, rcv_timeout_ms=300).explain()
+    (found,) = [finding for finding in diagnosis.findings if finding.subject == "state stream"]
+    tried = ("localhost:5555 accepts connections.", "localhost:5555: Connection refused")  # something may listen there
+    assert found.text.startswith(tried)
+
+
 async def test_no_session(connect: Any, serve: Any) -> None:
     with serve("arm", play=True) as server:
         assert "Call discover() first" in problems(await connect(server).explain())

@@ -118,6 +118,20 @@ def test_pictures_show_themselves() -> None:
         assert "4x3" in repr(sample)
 
 
+@pytest.mark.opengl
+def test_a_step_shows_its_pictures() -> None:
+    with (
+        SimulatedServer("arm", play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        reply = client.step(include_cameras={"arm/overview": "sync"})
+    assert reply.cameras is not None
+    for shown in (reply._repr_html_(), reply.cameras["arm/overview"]._repr_html_()):
+        assert 'src="data:image/png;base64,' in (shown or "")
+        assert " bytes" not in (shown or "")
+
+
 def test_names_are_escaped() -> None:
     assert "<script>" not in table([("<script>", {"<script>": "<script>"})], heads=["<script>"], caption="<script>")
 

@@ -216,7 +216,7 @@ def test_two_recordings_at_once_and_one_inside_the_other(client: urlab_client.UR
 def test_an_existing_file_is_not_overwritten_unasked(client: urlab_client.URLabClient, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(FileExistsError), record(client, path):
+    with pytest.raises(FileExistsError, match="overwrite=True replaces it"), record(client, path):
         pass
     assert path.read_bytes() == b"precious"
     with record(client, path, overwrite=True):

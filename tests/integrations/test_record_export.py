@@ -453,6 +453,13 @@ def test_plot_draws_joints_that_are_called_like_coordinates(
     assert [one.names for one in drawn] == [["x"], ["y", "wx"]]
 
 
+def test_a_recording_without_states_has_nothing_to_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    write_recording(path, [])
+    assert run("plot", path) == 2
+    assert capsys.readouterr().err == f"urlab plot: {path} has no states\n"
+
+
 def test_values_say_what_they_measure() -> None:
     base, hinges, slides = [f"base.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")], ["y", "leg.x"], ["x"]
     layout = SceneLayout(qpos=base + hinges + slides, slides=slides, sensors={"imu": "accelerometer"})

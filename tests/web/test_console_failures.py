@@ -22,6 +22,7 @@ from urlab_client.console.lease import Viewer
 from urlab_client.console.pictures import Feed
 from urlab_client.console.replay import Replay
 from urlab_client.console.session import ConsoleSession
+from urlab_client.console.shared_view import SharedView
 from urlab_client.enums import StepMode
 from urlab_client.errors import ServerUnreachable
 from urlab_client.protocol.messages.runtime import SetMode
@@ -87,6 +88,16 @@ def errors(console: ConsoleSession) -> dict[str, str]:
 
 def logged(caplog: pytest.LogCaptureFixture, name: str) -> bool:
     return any(f"{name} ended unexpectedly" in record.getMessage() and record.exc_info for record in caplog.records)
+
+
+def test_an_error_names_its_op_once(caplog: pytest.LogCaptureFixture) -> None:
+    view = SharedView(URLabClient("tcp://127.0.0.1"))
+    view.note("error", "console", "step", "step: no reply from tcp://127.0.0.1:5559.")
+    view.note("error", "console", "connect", "hello: connection refused.")
+    assert [record.getMessage() for record in caplog.records] == [
+        "step: no reply from tcp://127.0.0.1:5559.",
+        "connect: hello: connection refused.",
+    ]
 
 
 async def test_a_number_that_the_program_wrote_stops_the_steps_and_nothing_else(

@@ -757,5 +757,5 @@ class URLabClient(ClientState):
         if chosen is None:
             hello = self._state.hello
             announced = None if hello is None or hello.instance is None else hello.instance.state_port
-            chosen = announced or STATE_PORT
+            chosen = announced or int(STATE_PORT)  # sockets refuse subclasses of int as ports
         return self._transport.state_port or chosen

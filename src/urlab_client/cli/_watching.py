@@ -26,6 +26,7 @@ _LOOK_S = 0.05
 _AT_ONCE_S = 0.5
 _AWAY_S = 5.0
 """How long a server may be unreachable."""
+_FIRST_STATE_S = 10.0
 
 
 @contextlib.contextmanager
@@ -73,7 +74,7 @@ async def run_session(
         progress: Callback invoked with the number of simulated seconds that have passed.
 
     Raises:
-        CommandError: Play has ended, or the server is gone or has restarted.
+        CommandError: No state arrives, play has ended, or the server is gone or has restarted.
         URLabError: The server refused a request, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
@@ -83,6 +84,7 @@ async def run_session(
     async with client.events() as events:
         if not direct:
             await client.runtime.set_paused(False)
+        state_due = asyncio.get_running_loop().time() + _FIRST_STATE_S
         while not over():
             if direct or client.recv_wall_time_ns:  # otherwise no state has come yet
                 now = client.sim_time
@@ -97,6 +99,11 @@ async def run_session(
             else:
                 await asyncio.sleep(_LOOK_S)
                 lost_at = _lost_at(events, lost_at)
+                if not client.recv_wall_time_ns and asyncio.get_running_loop().time() > state_due:
+                    raise CommandError(
+                        f"no state arrived within {_FIRST_STATE_S:g} s; if the server's state stream has a port of its "
+                        "own, pass --state-port (`urlab serve` prints it)"
+                    )
 
 
 def recording_options(arguments: Namespace) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from urlab_client._installation import need
 from urlab_client._platform.files import replaced
 from urlab_client.cli._arguments import RECORDING
-from urlab_client.cli._common import CommandError, check_ending, progress_bar
+from urlab_client.cli._common import CommandError, check_ending, counted, progress_bar
 from urlab_client.values.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -65,7 +65,8 @@ def run(arguments: Namespace) -> int:
             labels = [column.labels[place] for place in chosen]
             curves.append(Curves(f"{owner}\n{quantity}", labels, column.values[:, chosen]))
     plot_curves(arguments.recording.name, table.time, curves, target)
-    print(f"{target}  {sum(len(one.names) for one in curves)} curves, {len(table)} states")
+    drawn = sum(len(one.names) for one in curves)
+    print(f"{target}  {counted(drawn, 'curve')}, {counted(len(table), 'state')}")
     return 0
 
 
@@ -94,7 +95,9 @@ def _chosen(table: Table, arguments: Namespace) -> dict[str, list[str]]:
         ]
         if found:
             chosen[key] = found
-    if not chosen or not len(table):
+    if not len(table):
+        raise CommandError(f"{arguments.recording} has no states")
+    if not chosen:
         wanted = arguments.joints or ["*"]
         close = did_you_mean(wanted[0], [*there, *(name.rpartition("/")[2] for name in there)])
         raise CommandError(

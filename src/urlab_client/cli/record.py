@@ -26,7 +26,7 @@ from urlab_client.cli._arguments import (
     make_client,
     task_named,
 )
-from urlab_client.cli._common import CommandError, check_recording, import_mujoco, progress_bar, refusing
+from urlab_client.cli._common import CommandError, check_recording, counted, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, recording_options, run_session, task_environment
 from urlab_client.enums import StepMode
 
@@ -77,7 +77,8 @@ def run(arguments: Namespace) -> int:
     with refusing(KeyError):
         recorder = asyncio.run(_record(arguments)) if arguments.task is None else _record_task(arguments)
     stats = recorder.stats
-    text = f"{arguments.output}  {stats.states} states, {stats.frames} pictures, {stats.file_bytes / 2**20:.1f} MiB"
+    held = f"{counted(stats.states, 'state')}, {counted(stats.frames, 'picture')}, {stats.file_bytes / 2**20:.1f} MiB"
+    text = f"{arguments.output}  {held}"
     if stats.dropped_states or stats.dropped_frames:
         text += f"; dropped {stats.dropped_states} and {stats.dropped_frames}"
     print(text)

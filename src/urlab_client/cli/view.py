@@ -29,7 +29,7 @@ from urlab_client.cli._arguments import (
     cameras,
     make_client,
 )
-from urlab_client.cli._common import CommandError, import_mujoco, refusing
+from urlab_client.cli._common import CommandError, counted, import_mujoco, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, run_session
 from urlab_client.enums import StepMode
 
@@ -77,6 +77,8 @@ def run(arguments: Namespace) -> int:
     if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
         raise CommandError("give one of --save, --connect and --page")
     recorded = isinstance(arguments.address, Path)
+    if recorded:
+        arguments.address.stat()  # whether the file exists matters more than whether there is a display
     if arguments.where == "web":
         return _show_console(arguments)
     if arguments.where == "viewer":
@@ -89,7 +91,8 @@ def run(arguments: Namespace) -> int:
         import_mujoco()
     with refusing(KeyError, ValueError):
         stats = asyncio.run((_view_recording if recorded else _view)(arguments))
-    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states skipped")
+    shown = f"{counted(stats.states, 'state')}, {counted(stats.frames, 'picture')} shown"
+    print(f"{shown}; {counted(stats.dropped_states, 'state')} skipped")
     return 0
 
 

@@ -72,7 +72,7 @@ class SharedView:
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
         """Add a line to the log."""
         if (kind, who) == ("error", "console"):
-            log.warning("%s: %s", what, text)
+            log.warning("%s: %s", what, text.removeprefix(f"{what}: "))
         self._n += 1
         self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
         self.notify()

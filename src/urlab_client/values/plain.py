@@ -87,9 +87,12 @@ class Serializable:
         return cast("Self", msgspec.structs.replace(cast("Struct", self), **changes))
 
     def _repr_html_(self) -> str | None:
+        return html.fields(type(self).__name__, self._shown())
+
+    def _shown(self) -> dict[str, Any]:
+        """Return what a notebook shows, by field."""
         struct = cast("Struct", self)
-        values = {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
-        return html.fields(type(self).__name__, values)
+        return {name: one for name, one in _fields(struct, None).items() if name in struct.__struct_fields__}
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
@@ -144,7 +147,7 @@ def plain(value: Any, arrays: ArrayForm | None) -> Any:  # noqa: PLR0911
             raise TypeError(f"{kind.__name__} has no form in plain data")
 
 
-_ALREADY_PLAIN: Final[frozenset[type]] = frozenset({bool, int, str, type(None)})
+_ALREADY_PLAIN: Final[frozenset[type]] = frozenset({bool, int, str, NoneType})
 
 
 def _name_of(value: float) -> str:
@@ -218,12 +221,11 @@ def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for ea
         return _NAMES[data]
     if kind is float and type(data) in {int, float}:
         return _said(where, lambda: float(data))
-    if kind is Any or (type(data) is kind and kind in _AS_THEY_ARE):
+    if kind is Any or (type(data) is kind and kind in _ALREADY_PLAIN):
         return data
     raise ValueError(f"{where}: {data!r:.80} does not fit {_named(kind)}")
 
 
-_AS_THEY_ARE: Final = frozenset({bool, int, str, NoneType})
 _NAMES: Final[Mapping[Any, float]] = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 

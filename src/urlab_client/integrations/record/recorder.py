@@ -119,7 +119,7 @@ class Recording(Block):
         stats = writer.stats
         if missing := self.without_pictures:
             log.warning(
-                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
+                "%s: no picture of %s came. Physics was paused, or the server has no OpenGL, as its log says.",
                 self._path,
                 ", ".join(missing),
             )

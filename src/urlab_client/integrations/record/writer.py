@@ -273,7 +273,10 @@ class _McapFile:
 
     def __init__(self, path: Path, mode: str) -> None:
         self.written = 0
-        self._raw = io.FileIO(path, mode)
+        try:
+            self._raw = io.FileIO(path, mode)
+        except FileExistsError as error:
+            raise FileExistsError(error.errno, "The file exists; overwrite=True replaces it", str(path)) from None
 
     def write(self, data: bytes) -> int:
         rest = memoryview(data)

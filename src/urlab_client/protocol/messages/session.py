@@ -8,7 +8,9 @@ from typing import Annotated, Any, Final, TypeAlias
 import msgspec
 from msgspec import Struct, field
 
+from urlab_client.enums import CameraMode
 from urlab_client.protocol.base import ControlRequest, Effect, Floats, Int32, Needs, Op, QuatWXYZ, Reply, Request, doc
+from urlab_client.values.pictures import decode_camera, thumbnail
 from urlab_client.values.plain import Serializable
 from urlab_client.values.rotation import Vec3
 
@@ -106,6 +108,14 @@ class CameraFrame(Serializable, Struct, kw_only=True, omit_defaults=True):
     dtype: Annotated[str, doc("`bgra8`, or `float32` for depth in centimetres.")]
     data: Annotated[bytes, doc("width * height * 4 bytes.")]
 
+    def _shown(self) -> dict[str, Any]:
+        return super()._shown() | {"data": _thumbnail(self, "picture")}
+
+
+def _thumbnail(frame: CameraFrame, name: str) -> str:
+    mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
+    return thumbnail(decode_camera(frame.data, mode, frame.width, frame.height).pixels, mode, name)
+
 
 class Perturbation(Serializable, Struct, kw_only=True):
     """A mouse drag in the editor's viewport."""
@@ -165,6 +175,10 @@ class StepOk(StateReply, tag="step_ok", kw_only=True):
         super().__post_init__()
         if self.scene is not None:
             self.entities = self.scene
+
+    def _shown(self) -> dict[str, Any]:
+        pictures = {name: _thumbnail(frame, name) for name, frame in (self.cameras or {}).items()}
+        return super()._shown() | {"cameras": pictures}
 
 
 class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):

@@ -6,6 +6,7 @@ import { setPoint } from "./link.js";
 const HELD_MS = 700;
 const UNKNOWN = { position: [-Math.PI, Math.PI], velocity: [-5, 5], force: [-10, 10], "": [-1, 1] };
 const MEANINGS = { position: "Position", velocity: "Velocity", force: "Force or torque", "": "Control" };
+const FORCES = { "N m": "Torque", N: "Force" };
 
 export function share(value, [low, high]) {
   return Math.min(1, Math.max(0, (value - low) / (high - low || 1)));
@@ -96,7 +97,7 @@ export function actuatorTable(group, rows) {
   const act = (what) => rows.forEach((row) => row[what]());
   return h("div", { class: "table actuators" },
     h("div", { class: "line head" },
-      h("span", { class: "name" }, `${MEANINGS[group.takes]}${group.unit ? ` · ${group.unit}` : ""}`),
+      h("span", { class: "name" }, `${FORCES[group.unit] ?? MEANINGS[group.takes]}${group.unit ? ` · ${group.unit}` : ""}`),
       h("span", {}, "set-point"), h("span", {}, "command"), h("span", { class: "right" }, rows.some((row) => row.joint) ? "measured" : "applied"),
       h("span", { class: "few" },
         h("button", { class: "tiny", title: "All to 0", "aria-label": "All to 0", onclick: () => act("zero") }, "0"),
