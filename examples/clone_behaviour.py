@@ -103,8 +103,8 @@ def pairs(file: Path, task: Reach) -> tuple[Floats, Floats]:
     table = transitions_of(read_run(file), only="success")
     state = [table.columns[f"arm/{name}"].values for name in ("qpos", "qvel", "action")]
     qpos, qvel, action = state
-    goals = [{"target": target} for target in table.columns["goal/target"].values]
-    observed = task.observe(States(task.scene, qpos, qvel, table.sim_time, goals))
+    goal = {"target": table.columns["goal/target"].values}
+    observed = task.observe(States(task.scene, qpos, qvel, table.sim_time, goal))
     return np.hstack([qpos, qvel, observed]), action
 
 

@@ -126,10 +126,11 @@ class EpisodeSettings:
         """
         if self.task is None:
             return None
-        _SERVING[id(self.task)] = self
         scene = TaskScene(model, mapping)
         self.task.setup(scene)
-        return Memory(self.task, scene, n)
+        memory = Memory(self.task, scene, n)
+        _SERVING[id(self.task)] = self
+        return memory
 
     def release(self) -> None:
         """Let the task serve another environment."""

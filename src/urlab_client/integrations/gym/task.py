@@ -105,11 +105,11 @@ class Start:
 
     Attributes:
         scene: The scene.
-        qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write in place.
+        qpos: Positions of the whole scene, shape (nq,), initially those of the keyframe or the model. Write them.
         qvel: Velocities of the whole scene, shape (nv,), likewise.
         goal: Goal of the episode, by name: numbers or arrays whose shape is the same in all episodes.
         index: Index of the environment.
-        memory: What the task keeps of the environment, by name, initially zeros. Write in place.
+        memory: What the task keeps of the environment, by name, initially zeros. Write it.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Start:
         self.qpos = qpos
         self.qvel = qvel
         self.index = index
-        self.memory = memory
+        self.memory: dict[str, Any] = dict(memory)
         self.goal: dict[str, Floats] = {}
 
     def joint(self, name: str, position: float, velocity: float | None = None) -> None:
@@ -209,7 +209,8 @@ class States:
         qpos: Positions of the whole scene, shape (n, nq).
         qvel: Velocities, shape (n, nv).
         time: Simulation time, seconds, shape (n,).
-        goal: Values that `Task.reset` put into `Start.goal`, each with a leading axis.
+        goal: Values that `Task.reset` put into `Start.goal`, each with a leading axis. An environment without an
+            episode so far repeats another's.
         index: Indices of the environments, shape (n,).
         last_action: Actions that led to the states, shape (n, n_actions), before delays; zeros after a reset. Those of
             all articulations are concatenated.
@@ -224,7 +225,7 @@ class States:
         qpos: Floats,
         qvel: Floats,
         time: Floats,
-        goals: Sequence[Mapping[str, Floats]],
+        goal: Mapping[str, Floats],
         *,
         index: NDArray[np.intp] | None = None,
         last_action: Floats | None = None,
@@ -237,11 +238,7 @@ class States:
         self.qvel = qvel
         self.time = time
         self.measured = measured
-        # An environment without an episode so far has no goal: its row repeats another environment's.
-        known = next(filter(None, goals), dict[str, Floats]())
-        self.goal: dict[str, NDArray[np.float64]] = {
-            name: np.array([(goal or known)[name] for goal in goals]) for name in known
-        }
+        self.goal = goal
         self.index: NDArray[np.intp] = np.arange(len(qpos)) if index is None else index
         shape = len(qpos), scene.mapping.n_actions
         self.last_action: Floats = np.zeros(shape) if last_action is None else last_action
@@ -390,7 +387,8 @@ class Memory:
     def __init__(self, task: Task, scene: TaskScene, n: int) -> None:
         self._task = task
         self._scene = scene
-        self._goals: list[dict[str, Floats]] = [{} for _ in range(n)]
+        self._n = n
+        self._goals: dict[str, NDArray[Any]] = {}
         self._kept = {name: np.zeros((n, *shape)) for name, shape in task.memory.items()}
         self._actions = np.zeros((2, n, scene.mapping.n_actions))
 
@@ -400,11 +398,32 @@ class Memory:
             values[i] = 0.0
         start = Start(self._scene, qpos, qvel, i, {name: values[i, ...] for name, values in self._kept.items()})
         self._task.reset(rng, start)
-        self._goals[i] = start.goal
+        qpos[:], qvel[:] = start.qpos, start.qvel  # other arrays may be there now
+        for name, values in (("qpos", qpos), ("qvel", qvel)):
+            if not np.isfinite(values).all():
+                raise ValueError(f"{_of(self._task, 'reset')} left NaN or infinity in start.{name} of environment {i}")
+        self._keep("reset", i, start.memory)
+        self._note_goal(i, start.goal)
 
-    def goal(self, i: int) -> Mapping[str, Floats]:
+    def _note_goal(self, i: int, goal: Mapping[str, Any]) -> None:
+        given = {name: np.asarray(value) for name, value in goal.items()}
+        for name, value in given.items():
+            if value.dtype.kind not in "biuf" or not np.isfinite(value).all():
+                raise ValueError(f"{_of(self._task, 'reset')} set the goal {name!r} to {goal[name]!r:.80}")
+        if not self._goals:
+            self._goals = {name: np.repeat(value[None], self._n, axis=0) for name, value in given.items()}
+        shapes, known = ({name: values.shape for name, values in of.items()} for of in (given, self.goal(i)))
+        if shapes != known:
+            raise ValueError(
+                f"{_of(self._task, 'reset')} set goals of shapes {shapes} for environment {i}, and {known} before"
+            )
+        for name, value in given.items():
+            self._goals[name] = self._goals[name].astype(np.result_type(self._goals[name], value), copy=False)
+            self._goals[name][i] = value
+
+    def goal(self, i: int) -> dict[str, NDArray[Any]]:
         """Return the goal of an environment's episode, by name."""
-        return self._goals[i]
+        return {name: np.array(values[i]) for name, values in self._goals.items()}
 
     def updated(self, rows: NDArray[np.intp], actions: Floats, now: Now) -> States:
         """Note actions, shape (n, n_actions), let the task update what it keeps, and return the states they led to."""
@@ -412,41 +431,55 @@ class Memory:
         previous[rows] = last[rows]
         last[rows] = actions
         states = self.states(rows, now)
-        if self._kept:
-            _set_writeable(states.memory, True)
-            self._task.update(states)
-            for name, values in self._kept.items():
-                values[rows] = states.memory[name]
-            _set_writeable(states.memory, False)
+        states.memory = dict(zip(self._kept, taken(rows, *self._kept.values()), strict=True))
+        self._task.update(states)
+        self._keep("update", rows, states.memory)
+        states.memory = self._shown(rows)
         return states
 
     def states(self, rows: NDArray[np.intp], now: Now) -> States:
         """Return the states of some environments, in the form that is passed to the task."""
         last, previous = taken(rows, *self._actions)
-        memory = dict(zip(self._kept, taken(rows, *self._kept.values()), strict=True))
-        _set_writeable(memory, False)  # a write would be lost, except in `update`
+        goal = dict(zip(self._goals, taken(rows, *self._goals.values()), strict=True))
         return States(
             self._scene,
             now.qpos,
             now.qvel,
             now.time,
-            [self._goals[int(i)] for i in rows],
+            goal,
             index=rows,
             last_action=last,
             previous_action=previous,
-            memory=memory,
+            memory=self._shown(rows),
             measured=now.measured,
         )
+
+    def _keep(self, hook: str, rows: NDArray[np.intp] | int, given: Mapping[str, Any]) -> None:
+        """Keep what a hook left in the memory of some environments, in place or as other arrays."""
+        if unknown := given.keys() - self._kept.keys():
+            raise ValueError(
+                f"{_of(self._task, hook)} keeps {', '.join(sorted(unknown))}, which `memory` does not declare; it "
+                f"declares {', '.join(self._kept) or 'nothing'}"
+            )
+        for name, values in self._kept.items():
+            found, shape = np.shape(given[name]), (*np.shape(rows), *values.shape[1:])
+            if found != shape:
+                raise ValueError(
+                    f"{_of(self._task, hook)} set the memory {name!r} to shape {found}; it must have shape {shape}"
+                )
+            values[rows] = given[name]
+
+    def _shown(self, rows: NDArray[np.intp]) -> Mapping[str, Floats]:
+        """Return what the task keeps of some environments, read-only: a write would be lost, except in `update`."""
+        found = dict(zip(self._kept, taken(rows, *self._kept.values()), strict=True))
+        for values in found.values():
+            values.flags.writeable = False
+        return MappingProxyType(found)
 
 
 def taken(rows: NDArray[np.intp], *arrays: Floats) -> list[Floats]:
     """Return copies of different rows of arrays; copying all of them takes a third of the time that indexing takes."""
     return [values.copy() if len(rows) == len(values) else values[rows] for values in arrays]
-
-
-def _set_writeable(arrays: Mapping[str, Floats], writeable: bool) -> None:
-    for values in arrays.values():
-        values.flags.writeable = writeable
 
 
 @dataclass(frozen=True, slots=True)
@@ -472,40 +505,46 @@ class EpisodeEnd:
 
 def judged(task: Task, states: States, actions: Any) -> tuple[Floats, Bools]:
     """Return the rewards and the terminations; refuse wrong shapes, NaN and infinity."""
-    rewards = _answer(task, "reward", task.reward(states, actions), len(states)).astype(np.float64)
-    if not np.isfinite(rewards).all():
-        first = int(np.flatnonzero(~np.isfinite(rewards))[0])
-        raise ValueError(
-            f"{type(task).__name__}.reward() returned {rewards[first]} for environment {states.index[first]}"
-        )
-    return rewards, _answer(task, "terminated", task.terminated(states), len(states)).astype(bool)
+    rewards = _numbers(task, "reward", task.reward(states, actions), states, (len(states),)).astype(np.float64)
+    return rewards, _answers(task, "terminated", task.terminated(states), states)
 
 
 def succeeded(task: Task, states: States) -> Bools | None:
     """Return which states are a success, shape (n,), or None if the task defines none."""
     success = task.success(states)
-    return None if success is None else _answer(task, "success", success, len(states)).astype(bool)
+    return None if success is None else _answers(task, "success", success, states)
 
 
 def observed(task: Task, states: States) -> Floats:
     """Return what a task observes, shape (n, n_observed)."""
-    found = np.asarray(task.observe(states))
-    if found.shape[-1:] != (task.n_observed,):
-        raise ValueError(
-            f"{type(task).__name__}.observe() returned {found.shape[-1] if found.ndim else 0} numbers; "
-            f"n_observed is {task.n_observed}"
-        )
-    return found
+    return _numbers(task, "observe", task.observe(states), states, (len(states), task.n_observed))
 
 
-def _answer(task: Task, hook: str, answer: Any, n: int) -> NDArray[Any]:
+def _numbers(task: Task, hook: str, answer: Any, states: States, shape: tuple[int, ...]) -> Floats:
     found = np.asarray(answer)
-    if found.shape != (n,):
+    if found.shape != shape:
         raise ValueError(
-            f"{type(task).__name__}.{hook}() returned shape {found.shape} for {n} environments; it must return one "
-            f"value for each, shape ({n},)"
+            f"{_of(task, hook)} returned shape {found.shape} for {len(states)} environments; it must return shape "
+            f"{shape}: {'(n,)' if len(shape) == 1 else '(n, n_observed)'}"
         )
+    if found.dtype.kind not in "biuf":
+        raise ValueError(f"{_of(task, hook)} returned {found.dtype}; it must return numbers")
+    if not np.isfinite(found).all():
+        row = int(np.argwhere(~np.isfinite(found))[0, 0])
+        raise ValueError(f"{_of(task, hook)} returned {found[row]} for environment {states.index[row]}")
     return found
+
+
+def _answers(task: Task, hook: str, answer: Any, states: States) -> Bools:
+    found = _numbers(task, hook, answer, states, (len(states),))
+    answers = found.astype(bool)
+    if found.dtype != bool and (found != answers).any():
+        raise ValueError(f"{_of(task, hook)} returned {found}; it must return true or false for each environment")
+    return answers
+
+
+def _of(task: Task, hook: str) -> str:
+    return f"{type(task).__name__}.{hook}()"
 
 
 def check_spelling(task: Task) -> None:
@@ -598,7 +637,7 @@ class Task:
         """
 
     def update(self, states: States) -> None:
-        """Advance the arrays in `states.memory`, in place.
+        """Advance the arrays in `states.memory`, in place or by setting others of the same shape.
 
         Called once after each action, before the methods below; not in teleoperation, which has no actions.
         """

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import gymnasium
@@ -12,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from urlab_client.aio.arguments import integer
 from urlab_client.errors import refused_for_good
 from urlab_client.integrations._feed.messages import Transition
 from urlab_client.integrations.gym.disturbances import Disturbances
@@ -152,12 +154,15 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | NDArray[np.integer] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode in all environments, or in some.
 
         Args:
-            seed: Seed of environment 0; environment i gets `seed + i`. A list gives one seed per environment. None
+            seed: Seed of environment 0; environment i gets `seed + i`. A sequence gives one seed per environment. None
                 continues with the current generators.
             options: `keyframe`: name of the keyframe to start from, also for later autoresets; `reset_mask`: boolean
                 array of the environments to reset.
@@ -172,15 +177,20 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(f"reset_mask needs {self.num_envs} booleans, at least one of them true")
         keyframe = keyframe_option(options)
-        seeds = (
-            [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
-        )
+        if isinstance(seed, (Sequence, np.ndarray)):
+            seeds = [None if each is None else integer("seed", each) for each in seed]
+        else:
+            first = None if seed is None else integer("seed", seed)
+            seeds = [None if first is None else first + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
         super().reset(seed=None)
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
                 self.rngs[i] = np.random.default_rng(seeds[i])
+        if self.task is not None and self.max_episode_steps in (None, sys.maxsize):
+            # What truncates such episodes, as `gymnasium.make` does, does not say so: it only resets.
+            self._tell_ends(self.task, mask & ~self._ended & (self.elapsed > 0), np.zeros(self.num_envs, dtype=bool))
         errors = self._move(np.flatnonzero(mask), keyframe)
         self._started = True
         refusal = next(filter(refused_for_good, errors.values()), None)
@@ -223,7 +233,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._note(acting, errors, flat, rewards, terminated, truncated)
         over = ended.any()
         if over and self.task is not None:
-            self._tell_ends(self.task, ended & ~self._ended, terminated, infos)  # those that failed are marked already
+            self._tell_ends(self.task, ended & ~self._ended, terminated)  # those that failed are marked already
         # Without autoreset, an environment may be stepped after the end of its episode.
         self._ended = ended | self._ended if self.autoreset_mode is AutoresetMode.DISABLED else ended
         if over and self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -238,9 +248,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _transition(self, i: int, actions: Floats | None = None, *judged: NDArray[Any]) -> Transition:
         """Return the start of an environment's episode, or its action with reward, termination and truncation."""
-        goal: Mapping[str, Floats] = {} if self._memory is None else self._memory.goal(i)
         told: dict[str, Any] = {} if self._success is None else {"success": bool(self._success[i])}
-        told["goal"] = {name: np.ravel(values).astype(np.float64).tolist() for name, values in goal.items()}
+        told["goal"] = {name: np.ravel(values).astype(np.float64).tolist() for name, values in self._goal(i).items()}
         if actions is None:
             return Transition(actions=0, **told)
         if self.randomise is not None and self.randomise.delays_actions:
@@ -345,12 +354,14 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Call a function for rewards or terminations of all environments; the last of `trees` are the infos."""
         return function(*trees)
 
-    def _tell_ends(self, task: Task, ended: Bools, terminated: Bools, infos: dict[str, Any]) -> None:
-        states = self._states(self._all)
-        success = infos.get("success", np.zeros(self.num_envs, dtype=bool)).tolist()
+    def _tell_ends(self, task: Task, ended: Bools, terminated: Bools) -> None:
         for i in np.flatnonzero(ended).tolist():
-            steps, total = int(self.elapsed[i]), float(self._totals[i])
-            task.ended(EpisodeEnd(i, success[i], bool(terminated[i]), steps, total, states.goal_of(i)))
+            success = self._success is not None and bool(self._success[i])
+            steps, total, goal = int(self.elapsed[i]), float(self._totals[i]), self._goal(i)
+            task.ended(EpisodeEnd(i, success, bool(terminated[i]), steps, total, goal))
+
+    def _goal(self, i: int) -> Mapping[str, Floats]:
+        return {} if self._memory is None else self._memory.goal(i)
 
     def _same_step_reset(self, errors: Mapping[int, Exception], infos: dict[str, Any]) -> dict[str, Any]:
         ended = self._ended.copy()
