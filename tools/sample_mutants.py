@@ -193,10 +193,10 @@ def covering(mutant: Mutant, known: Record) -> set[str]:
     found = naming(names, known)
     for node in named[-1:]:
         found |= known.running(mutant.file, range(node.lineno, (node.end_lineno or 0) + 1))
-    # Of a field or a constant first of all those that use it, if any, of which there are fewer.
+    # Of a field or a constant first of all those that use it, if any, of which there are fewer, or speak of its class.
     targets = getattr(around[-1], "targets", [getattr(around[-1], "target", None)])
     using = naming({node.id for node in targets if isinstance(node, ast.Name)}, known)
-    found = found & using or using or found
+    found = (found & using or using or found) | {test for test in found if names & said_by(known.root, test)}
     return found or known.running(mutant.file, range(1, mutant.old.count("\n") + 1))
 
 
@@ -235,13 +235,16 @@ def within(tests: Sequence[str], seconds: Mapping[str, float], limit: float) -> 
 def speaking(root: Path, tests: Iterable[str], words: set[str], seconds: Mapping[str, float]) -> list[str]:
     """Return the tests whose own text has any of some words, those with the rarest first; the quickest case of each."""
     quickest = {test.partition("[")[0]: test for test in sorted(tests, key=lambda test: (-seconds[test], test))}
-    said: dict[str, set[str]] = {}
-    for name in quickest:
-        path, *_, function = name.split("::")
-        said[name] = words & _vocabularies(root / path).get(function, set())
+    said = {name: words & said_by(root, name) for name in quickest}
     common = Counter(word for found in said.values() for word in found)
     weight = {name: sum(1 / common[word] for word in found) for name, found in said.items()}
     return [quickest[name] for name in sorted(weight, key=lambda name: (-weight[name], name)) if weight[name]]
+
+
+def said_by(root: Path, test: str) -> set[str]:
+    """Return the words of a test's own text."""
+    path, *_, function = test.partition("[")[0].split("::")
+    return _vocabularies(root / path).get(function, set())
 
 
 @functools.cache

@@ -213,7 +213,7 @@ def _denied(scope: Scope, refusal: _Refusal) -> Response:
     headers = {"www-authenticate": 'Bearer realm="URLab"'} if status == 401 else None
     if "text/html" in Headers(scope=scope).get("accept", ""):
         return HTMLResponse(_PAGE.format(title="Access denied", text=html.escape(text)), status, headers)
-    return JSONResponse({"error": {"code": code, "message": text}}, status, headers)
+    return JSONResponse({"error": {"code": code, "message": text, "hint": ""}}, status, headers)
 
 
 async def _close(receive: Receive, send: Send) -> None:

@@ -1,0 +1,27 @@
+"""Each refusal that any test of the console meets is one that a person or a program can use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+
+@pytest.fixture(autouse=True)
+def _refusals_explain_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    send = TestClient.send
+
+    def checked(self: TestClient, *args: Any, **kwargs: Any) -> Any:
+        answer = send(self, *args, **kwargs)
+        if answer.status_code >= 400 and answer.headers.get("content-type", "").startswith("application/json"):
+            error = answer.json().get("error", {})
+            assert isinstance(error.get("code"), str), answer.text
+            assert error["code"].isidentifier(), answer.text
+            assert isinstance(error.get("message"), str), answer.text
+            assert error["message"], answer.text
+            assert isinstance(error.get("hint"), str), answer.text
+            assert error["hint"] == "" or " " in error["hint"], answer.text
+        return answer
+
+    monkeypatch.setattr(TestClient, "send", checked)
