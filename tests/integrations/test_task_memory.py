@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import TimeLimit
 
 from urlab_client.errors import ModeLocked, UnknownKeyframe
 from urlab_client.integrations.gym import (
@@ -203,6 +205,10 @@ def _misspelt(**names: Any) -> Task:
     return made
 
 
+def _starting(change: Callable[[Start], object]) -> Task:
+    return _misspelt(reset=lambda self, rng, start: change(start))
+
+
 @pytest.mark.parametrize(
     ("task", "problem"),
     [
@@ -226,6 +232,22 @@ def test_misspelt_hooks_and_attributes_are_refused_at_construction(levers: list[
         (_misspelt(terminated=lambda *_: False), r"Mine\.terminated\(\) returned shape \(\)"),
         (_misspelt(success=lambda *_: np.zeros((2, 1))), r"Mine\.success\(\) returned shape \(2, 1\)"),
         (_misspelt(reward=lambda _, states, actions: states.memory["up"].fill(0)), "read-only"),
+        (_misspelt(reward=lambda *_: np.array(["a", "b"])), r"Mine\.reward\(\) returned <U1; it must return numbers"),
+        (_misspelt(terminated=lambda *_: np.array([0.0, 0.5])), r"Mine\.terminated\(\) .* true or false"),
+        (
+            _misspelt(terminated=lambda *_: np.array([0, np.nan])),
+            r"Mine\.terminated\(\) returned nan for environment 1",
+        ),
+        (_misspelt(observe=lambda *_: np.zeros(5)), r"Mine\.observe\(\) returned shape \(5,\) .* shape \(2, 5\)"),
+        (_misspelt(observe=lambda *_: np.zeros((1, 5))), r"Mine\.observe\(\) returned shape \(1, 5\)"),
+        (_misspelt(observe=lambda *_: np.full((2, 5), np.nan)), r"Mine\.observe\(\) returned .* for environment 0"),
+        (_starting(lambda start: start.memory.update(upp=1.0)), r"Mine\.reset\(\) keeps upp, .* declares up, recent"),
+        (_starting(lambda start: start.memory.update(up=np.ones(2))), r"Mine\.reset\(\) set the memory 'up' to shape"),
+        (_misspelt(update=lambda _, states: states.memory.update(recent=np.ones(2))), r"Mine\.update\(\) set the mem"),
+        (_starting(lambda start: start.joint("lever/hinge", np.nan)), r"start\.qpos of environment 0"),
+        (_starting(lambda start: start.goal.update(to=np.nan)), r"Mine\.reset\(\) set the goal 'to' to nan"),
+        (_starting(lambda start: start.goal.update(to="up")), r"Mine\.reset\(\) set the goal 'to' to 'up'"),
+        (_starting(lambda start: start.goal.update(to=np.zeros(start.index))), r"goals of shapes .* environment 1"),
     ],
 )
 def test_wrong_answers_of_a_task_are_refused_by_name(
@@ -240,6 +262,92 @@ def test_wrong_answers_of_a_task_are_refused_by_name(
 
     with pytest.raises(ValueError, match=problem):
         an_action()
+
+
+class Rebinding(Hold):
+    """Sets other arrays, where it could write in place, and needs no memory to be told of actions."""
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        start.qpos = start.qpos + 0.1
+        start.memory["up"] = 3
+        start.goal = {"to": start.index + 0.5 if start.index else 0}
+
+    def update(self, states: States) -> None:
+        states.memory["up"] = states.memory["up"] + 1
+
+
+def test_a_task_may_set_other_arrays_instead_of_writing_in_place(levers: list[str], made: list[Any]) -> None:
+    env = URLabBatchEnv(levers[0], 2, task=Rebinding())
+    made.append(env)
+    observations, _ = env.reset()
+    assert observations[:, 0].tolist() == [0.6, 0.6]
+    assert observations[:, -4].tolist() == [3.0, 3.0]
+    assert env.step(env.action_space.sample())[0][:, -4].tolist() == [4.0, 4.0]
+
+
+def test_actions_are_told_to_a_task_that_keeps_nothing(levers: list[str], made: list[Any]) -> None:
+    told: list[int] = []
+
+    class Counts(Hold):
+        n_observed: ClassVar[int] = 0
+        memory: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+        observe, reset = Task.observe, Task.reset
+
+        def update(self, states: States) -> None:
+            told.append(len(states))
+
+        def reward(self, states: States, actions: Any) -> Any:
+            return np.zeros(len(states))
+
+    env = URLabBatchEnv(levers[0], 2, task=Counts())
+    made.append(env)
+    env.reset()
+    env.step(env.action_space.sample())
+    assert told == [2]
+
+
+def test_a_task_whose_set_up_failed_may_serve_again(levers: list[str], made: list[Any]) -> None:
+    class Looks(Hold):
+        name = "lever/rodd"
+
+        def setup(self, scene: Any) -> None:
+            super().setup(scene)
+            scene.id("geom", self.name)
+
+    task = Looks()
+    with pytest.raises(KeyError, match="rodd") as failure:
+        URLabBatchEnv(levers[0], 1, task=task)
+    task.name = "lever/rod"
+    made.append(URLabBatchEnv(levers[0], 1, task=task))
+    assert failure.value  # as an interpreter keeps its last error, and with it what failed
+
+
+def test_a_seed_for_each_environment_comes_in_any_sequence(levers: list[str], made: list[Any]) -> None:
+    env = URLabBatchEnv(levers[0], 2, task=Hold())
+    made.append(env)
+    expected = env.reset(seed=[3, 8])[0].tolist()
+    assert env.reset(seed=(3, 8))[0].tolist() == expected
+    assert env.reset(seed=np.array([3, 8]))[0].tolist() == expected
+    with pytest.raises(TypeError, match="seed takes an integer"):
+        env.reset(seed=1.5)  # type: ignore[arg-type]
+
+
+def test_an_end_that_gymnasium_decides_is_told_at_the_next_reset(levers: list[str], made: list[Any]) -> None:
+    ends: list[EpisodeEnd] = []
+
+    class Told(Hold):
+        def ended(self, episode: EpisodeEnd) -> None:
+            ends.append(episode)
+
+    inner = URLabEnv.connect(levers[0], task=Told(), max_episode_steps=sys.maxsize)  # as a registered task is made
+    env = TimeLimit(inner, 3)
+    made.append(env)
+    env.reset(seed=1)
+    rewards = [env.step(np.ones(1, dtype=np.float32))[1] for _ in range(3)]
+    assert not ends
+    env.reset()
+    env.reset()
+    assert [(end.steps, end.terminated, end.total) for end in ends] == [(3, False, sum(rewards))]
 
 
 def test_a_task_serves_one_environment_until_it_is_closed(levers: list[str], made: list[Any]) -> None:
