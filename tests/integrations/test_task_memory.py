@@ -245,8 +245,14 @@ def test_misspelt_hooks_and_attributes_are_refused_at_construction(levers: list[
         (_starting(lambda start: start.memory.update(up=np.ones(2))), r"Mine\.reset\(\) set the memory 'up' to shape"),
         (_misspelt(update=lambda _, states: states.memory.update(recent=np.ones(2))), r"Mine\.update\(\) set the mem"),
         (_starting(lambda start: start.joint("lever/hinge", np.nan)), r"start\.qpos of environment 0"),
-        (_starting(lambda start: start.goal.update(to=np.nan)), r"Mine\.reset\(\) set the goal 'to' to nan"),
-        (_starting(lambda start: start.goal.update(to="up")), r"Mine\.reset\(\) set the goal 'to' to 'up'"),
+        (
+            _starting(lambda start: start.goal.update(to=np.array(np.nan))),
+            r"Mine\.reset\(\) set the goal 'to' to array\(nan\)",
+        ),
+        (
+            _starting(lambda start: start.goal.update(to=np.array("up"))),
+            r"Mine\.reset\(\) set the goal 'to' to array\('up'",
+        ),
         (_starting(lambda start: start.goal.update(to=np.zeros(start.index))), r"goals of shapes .* environment 1"),
     ],
 )
@@ -270,10 +276,10 @@ class Rebinding(Hold):
     def reset(self, rng: np.random.Generator, start: Start) -> None:
         start.qpos = start.qpos + 0.1
         start.memory["up"] = 3
-        start.goal = {"to": start.index + 0.5 if start.index else 0}
+        start.goal = {"to": np.array(start.index + 0.5 if start.index else 0)}
 
     def update(self, states: States) -> None:
-        states.memory["up"] = states.memory["up"] + 1
+        states.memory = {**states.memory, "up": states.memory["up"] + 1}
 
 
 def test_a_task_may_set_other_arrays_instead_of_writing_in_place(levers: list[str], made: list[Any]) -> None:
@@ -343,10 +349,12 @@ def test_an_end_that_gymnasium_decides_is_told_at_the_next_reset(levers: list[st
     env = TimeLimit(inner, 3)
     made.append(env)
     env.reset(seed=1)
-    rewards = [env.step(np.ones(1, dtype=np.float32))[1] for _ in range(3)]
+    rewards = [float(env.step(np.ones(1, dtype=np.float32))[1]) for _ in range(3)]
     assert not ends
     env.reset()
     env.reset()
+    env.step(np.ones(1, dtype=np.float32))
+    env.reset(seed=1)
     assert [(end.steps, end.terminated, end.total) for end in ends] == [(3, False, sum(rewards))]
 
 

@@ -251,3 +251,24 @@ def test_the_looks_of_materials_vary_and_colours_begin_with_theirs() -> None:
     looks = [fields[f"mat_{name}"].tolist() for name in ("specular", "shininess", "reflectance")]
     np.testing.assert_allclose(looks, [[0.25], [1], [0.3]])
     assert set(variation.visible_fields) == set(variation.fields)
+
+
+def test_a_declaration_in_python_equals_the_file_it_becomes() -> None:
+    numbers = Vary(what="friction", scale=[np.float64(0.5), 1])  # type: ignore[arg-type]
+    declared = Randomisation(vary=[numbers], delay=Delay(action=np.int64(2), observation=[0, 1]))  # type: ignore[arg-type]
+    assert Randomisation.from_json(declared.to_json()) == declared
+
+
+@pytest.mark.parametrize(
+    ("declare", "problem"),
+    [
+        (lambda: Vary(what="fricton", scale=(0.5, 1)), "vary: what: .*'fricton'"),  # type: ignore[arg-type]
+        (lambda: Vary(what="mass", scale=(1, 2), distribution="gauss"), "vary: distribution"),  # type: ignore[arg-type]
+        (lambda: Delay(action=1.5), "delay: action: Expected `int"),  # type: ignore[arg-type]
+        (lambda: Delay(action=(1, 2, 3)), "delay: action: .* length 2, got 3"),  # type: ignore[arg-type]
+        (lambda: Randomisation(vary=Delay()), "randomisation: vary: Expected `array`"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_declaration_in_python_is_checked_as_one_in_a_file(declare: Any, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        declare()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import fnmatch
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, cast
 
 import msgspec
 from msgspec import Struct
@@ -84,6 +84,13 @@ def steps_range(steps: Steps) -> tuple[int, int]:
     return (steps, steps) if isinstance(steps, int) else steps
 
 
+def _plain(value: Any) -> Any:
+    """Return numbers and arrays of NumPy as those of Python."""
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in cast("Sequence[Any]", value)]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
 def _check_range(what: str, given: Range) -> None:
     lows, highs = (bound if isinstance(bound, tuple) else (bound,) for bound in given)
     if len(lows) != len(highs) or not all(
@@ -117,7 +124,15 @@ class UnsupportedRandomisation(URLabError):
 
 
 class _Declared(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Base class of all parts of a declaration."""
+    """Base class of all parts of a declaration, which are checked and converted as if they were read from a file."""
+
+    def __post_init__(self) -> None:
+        for field in msgspec.structs.fields(self):
+            try:
+                plain = msgspec.to_builtins(_plain(getattr(self, field.name)))
+                msgspec.structs.force_setattr(self, field.name, msgspec.convert(plain, field.type))
+            except (msgspec.ValidationError, TypeError) as error:
+                raise ValueError(f"{type(self).__name__.lower()}: {field.name}: {error}") from None
 
 
 class Vary(_Declared, frozen=True, kw_only=True):
@@ -142,6 +157,7 @@ class Vary(_Declared, frozen=True, kw_only=True):
     together: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = [name for name in ("scale", "add", "set") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"{self.what} needs one of scale, add and set, not {' and '.join(given) or 'none'}")
@@ -201,6 +217,7 @@ class Push(_Declared, frozen=True, kw_only=True):
     lasts: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_range("push: force", self.force)
         if not 0 <= self.every[0] <= self.every[1]:
             raise ValueError(f"push: every takes two numbers of actions, lowest first, not {list(self.every)}")
@@ -226,6 +243,7 @@ class Noise(_Declared, frozen=True, kw_only=True):
     bias: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("std", "uniform", "bias"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"noise on {self.field}: {name} must be 0 or more, not {getattr(self, name)}")
@@ -247,6 +265,7 @@ class Delay(_Declared, frozen=True, kw_only=True):
     drop: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("observation", "action", "action_substeps"):
             low, high = steps_range(getattr(self, name))
             if not 0 <= low <= high:
@@ -270,6 +289,7 @@ class CameraLatency(_Declared, frozen=True, kw_only=True):
     jitter_s: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("delay_s", "jitter_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"camera: {name} must be 0 or more seconds, not {getattr(self, name)}")

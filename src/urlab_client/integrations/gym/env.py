@@ -187,7 +187,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         super().reset(seed=seed)
         self._alone.rngs = [self.np_random]
-        observations, infos = self._alone.reset(options=options)
+        observations, infos = self._alone.reset(seed=seed, options=options)
+        self._np_random = self._alone.rngs[0]
         return of_one(observations), info_of(infos)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

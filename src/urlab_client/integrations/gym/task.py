@@ -248,10 +248,6 @@ class States:
     def __len__(self) -> int:
         return len(self.qpos)
 
-    def goal_of(self, row: int) -> dict[str, Floats]:
-        """Return the goal of one of the environments, by name."""
-        return {name: values[row] for name, values in self.goal.items()}
-
     def positions(self, key: str) -> Floats:
         """Return the positions of an articulation, shape (n, its nq), in the order of `qpos_array`."""
         return self.qpos[:, self.scene.mapping.layout(key).qpos_adr]
@@ -659,7 +655,11 @@ class Task:
         return None
 
     def ended(self, episode: EpisodeEnd) -> None:
-        """Handle the end of an episode. A curriculum can use it to adapt what `reset` draws."""
+        """Handle the end of an episode. A curriculum can use it to adapt what `reset` draws.
+
+        If something outside of the environment truncates episodes, as `gymnasium.make` does, this is called at the next
+        reset without a seed.
+        """
 
 
 _HOOKS: Final = ("setup", "reset", "update", "observe", "reward", "terminated", "success", "ended")

@@ -188,8 +188,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         for i in np.flatnonzero(mask):
             if seeds[i] is not None:
                 self.rngs[i] = np.random.default_rng(seeds[i])
-        if self.task is not None and self.max_episode_steps in (None, sys.maxsize):
-            # What truncates such episodes, as `gymnasium.make` does, does not say so: it only resets.
+        if self.task is not None and seed is None and self.max_episode_steps in (None, sys.maxsize):
+            # What truncates such episodes, as `gymnasium.make` does, does not say so: it only resets. A seed begins
+            # anew, and the same each time, so it must not advance a curriculum.
             self._tell_ends(self.task, mask & ~self._ended & (self.elapsed > 0), np.zeros(self.num_envs, dtype=bool))
         errors = self._move(np.flatnonzero(mask), keyframe)
         self._started = True
