@@ -114,7 +114,7 @@ def uses(path: Path, folder: Path) -> Iterator[Callable[[Run], Any]]:
 
 def replayed(path: Path) -> None:
     """What the console does with a recording."""
-    run, (start, end), names, cameras = _opened(path)
+    run, (start, end), names, _, cameras = _opened(path)
     robots = {key: _Robot(key, len(own)) for key, own in names.items()}
     for time in np.linspace(start, end, 5).tolist():
         found = run.state_at(time)
