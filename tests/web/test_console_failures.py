@@ -19,6 +19,7 @@ from urlab_client.aio import URLabClient, background
 from urlab_client.console.controls import Controls
 from urlab_client.console.hand_driving import HandDriving
 from urlab_client.console.lease import Viewer
+from urlab_client.console.messages import Hand
 from urlab_client.console.pictures import Feed
 from urlab_client.console.replay import Replay
 from urlab_client.console.session import ConsoleSession
@@ -115,6 +116,18 @@ async def test_a_number_that_the_program_wrote_stops_the_steps_and_nothing_else(
         stopped = client.step_count
         await console.controls.run(ME, running=True)
         await until(lambda: client.step_count > stopped)
+
+
+async def test_a_viewer_who_has_lost_the_controls_moves_no_hand(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (client, console):
+        await until(lambda: console.view.snapshot is not None)
+        console.hands.command(ME, Hand("arm", linear=(0.0, 0.0, -1.0), gripper=1.0))
+        console.lease.release(ME)
+        console.lease.use(Viewer("other", "Ann"))
+        before = client.articulations["arm"].ctrl_array.copy()
+        await until(lambda: any((entry.kind, entry.what) == ("error", "hand") for entry in console.view.entries))
+        assert "Ann has the controls" in console.view.entries[-1].text
+        assert (client.articulations["arm"].ctrl_array == before).all()
 
 
 async def test_a_number_that_the_program_wrote_is_not_sent_in_live_mode(tmp_path: Path) -> None:

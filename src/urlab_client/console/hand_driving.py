@@ -77,6 +77,7 @@ class HandDriving:
                     self._view.note("error", viewer.name, "hand", str(error))
 
     def _drive(self, viewer: Viewer, order: Hand, seconds: float) -> None:
+        self._lease.use(viewer)  # before anything is written, as another viewer may drive by now
         key = order.articulation
         hand = self._hand(viewer, key, order.site)
         if key not in self._moving and self._elsewhere(hand):
