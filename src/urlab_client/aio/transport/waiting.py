@@ -77,7 +77,7 @@ class Watch:
         self._loop = loop
         self._on_news = on_news
         self.fastest_s = fastest_s
-        self._expected = (lambda: False) if fd is None else expected
+        self._expected: Callable[[], bool] = (lambda: False) if fd is None else expected
         self._since = 0.0
         self._armed = False
         self._closed = False
