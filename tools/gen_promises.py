@@ -26,7 +26,7 @@ HEADER = f"""{START}
 # Promises and their tests
 
 These pages list the promises of the documentation, word for word, and the tests that fail when a promise is broken.
-`tools/sample_mutants.py` changes the sources at random and shows the changes that no test notices.
+`tools/sample_mutants.py` changes the sources at random and shows which changes nothing notices.
 
 | Promises of | how many |
 |---|---|

@@ -1,4 +1,4 @@
-"""Draw mutants of the sources at random, and show those that the tests do not notice.
+"""Draw mutants of the sources at random, and show those that neither the tests nor the type checker notice.
 
     python tools/sample_mutants.py --record       # now and then: run all tests, and keep which of them run which lines
     python tools/sample_mutants.py --n 100 --seed 7
@@ -8,7 +8,8 @@ mutmut's operators make the mutants (`pip install -e '.[mutants]'`). Lines are d
 its size; strings, which are mostly prose, annotations and generated files are left alone. The tests that run a mutant's
 line run in a copy of the tree until one fails: for half of `--seconds` of processor time those whose own text shares
 words with the line, the rarest first; then quick ones, and one case of each function before the others. A failure
-counts if that test passes without the mutant; hanging counts, too. equivalent_mutants.toml has those that make no
+counts if that test passes without the mutant; hanging counts, too. Of what passes, pyright, where it is installed, is
+asked as in CI; what it reports is counted in a column of its own. equivalent_mutants.toml has those that make no
 difference, with the reason. They are not counted.
 The record lies in `.mutants/`, with the sources of its time, by which it serves later commits.
 """
@@ -37,6 +38,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -274,7 +276,7 @@ class Mutant:
     new: str
     tests: list[str] = field(default_factory=list)  # that may notice, in the order in which to run them
     covering: int = 0  # how many those would be without a limit
-    outcome: str = ""  # caught, hangs, survives, no test or equivalent
+    outcome: str = ""  # caught, hangs, types, survives, no test or equivalent
 
     @property
     def package(self) -> str:
@@ -433,12 +435,41 @@ class Copies:
         os.utime(file, (moment, moment))  # or bytecode of the same second would pass for its own
 
 
+def judge_types(root: Path, tree: Path, mutants: Sequence[Mutant]) -> None:
+    """Note which mutants pyright reports: each is a module beside its own, whose reports do not count."""
+    if not mutants or find_spec("pyright") is None:
+        return
+    for name in ("src", "typings"):
+        if (root / name).is_dir():
+            shutil.copytree(root / name, tree / name)
+    files: dict[Path, Path] = {}  # the one with the mutant, and the one without
+    for number, mutant in enumerate(mutants):
+        path = tree / mutant.file
+        sound, changed = path.with_stem(f"{path.stem}__sound"), path.with_stem(f"{path.stem}__{number}")
+        sound.write_text(mutant.old, encoding="utf-8")
+        changed.write_text(mutant.new, encoding="utf-8")
+        files[changed] = sound
+    settings = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["tool"]["pyright"]
+    settings["include"] = sorted({str(file.relative_to(tree)) for pair in files.items() for file in pair})
+    (tree / "pyrightconfig.json").write_text(json.dumps(settings), encoding="utf-8")
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(tree)]
+    said = subprocess.run(command, cwd=tree, capture_output=True, check=False).stdout  # noqa: S603
+    reported: dict[Path, Counter[tuple[str, str]]] = defaultdict(Counter)
+    for one in json.loads(said)["generalDiagnostics"]:
+        if one["severity"] == "error":
+            reported[Path(one["file"])][one.get("rule", ""), re.sub(r"__(sound|\d+)", "", one["message"])] += 1
+    for mutant, (changed, sound) in zip(mutants, files.items(), strict=True):
+        if reported[changed] - reported[sound]:
+            mutant.outcome = "types"
+
+
 def shares(mutants: Sequence[Mutant]) -> Iterator[str]:
-    """Yield a row for each package, and one for all."""
+    """Yield a row for each package, and one for all: caught by tests, by the type checker, of how many."""
     for name in [*sorted({mutant.package for mutant in mutants}), "all"]:
         outcomes = Counter(mutant.outcome for mutant in mutants if name in {mutant.package, "all"})
-        caught, judged = outcomes["caught"] + outcomes["hangs"], outcomes.total() - outcomes["equivalent"]
-        yield f"{name:14} {caught:4} of {judged:4}  {caught / judged if judged else 1:4.0%}"
+        tests, types = outcomes["caught"] + outcomes["hangs"], outcomes["types"]
+        judged = outcomes.total() - outcomes["equivalent"]
+        yield f"{name:14} {tests:4} + {types:3} of {judged:4}  {(tests + types) / judged if judged else 1:4.0%}"
 
 
 def main(argv: Sequence[str] | None = None, *, root: Path = ROOT, table: Path = EQUIVALENT) -> int:
@@ -472,6 +503,7 @@ def main(argv: Sequence[str] | None = None, *, root: Path = ROOT, table: Path = 
         copies = Copies(root, Path(folder), arguments.jobs)
         for mutant in pool.map(copies.judge, drawn):
             print(f"{mutant.outcome:10} {mutant.file}:{mutant.line}", flush=True)
+        judge_types(root, Path(folder) / "types", [one for one in drawn if one.outcome in {"survives", "no test"}])
     for mutant in drawn:
         if mutant.outcome in {"survives", "no test"}:
             ran = f"{len(mutant.tests)} of the {mutant.covering} tests that run it passed"

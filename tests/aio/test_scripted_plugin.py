@@ -672,6 +672,7 @@ def test_a_client_does_not_pickle_but_its_description_does(connect: Any) -> None
     client = connect(rcv_timeout_ms=1234)
     with pytest.raises(TypeError, match=r"client\.config"):
         pickle.dumps(client)
+    assert URLabClient().step_mode is StepMode.LIVE, "until a server says otherwise"
     with pytest.raises(TypeError, match="cannot be pickled"):
         pickle.dumps(urlab_client.URLabClient())
     config = pickle.loads(pickle.dumps(client.config))
@@ -679,6 +680,7 @@ def test_a_client_does_not_pickle_but_its_description_does(connect: Any) -> None
     assert msgspec.json.decode(msgspec.json.encode(config), type=urlab_client.ClientConfig) == config
     twin = URLabClient(**config.options())
     assert twin.config == client.config
+    assert urlab_client.ClientConfig(address="tcp://localhost") == URLabClient("tcp://localhost").config, "defaults"
 
 
 def test_the_handshake_struct_needs_no_extras() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import sys
 import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -297,6 +298,25 @@ async def test_a_shared_frame_says_when_it_was_overwritten(
         assert frame.valid()
         camera_region.publish(picture(6))
         assert not frame.valid(), "the server may be writing into it by now"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads what this process has mapped")
+async def test_the_last_stream_that_is_closed_lets_its_region_go(
+    publishers: Publishers, state_region: WrittenRegion
+) -> None:
+    def mapped() -> int:
+        return Path("/proc/self/maps").read_text().count(str(state_region.path))
+
+    state_region.publish(snapshot(1.0))
+    ours = mapped()
+    async with states(publishers) as first:
+        await first.receive()
+        async with states(publishers) as second:
+            await second.receive()
+        assert mapped() > ours
+        state_region.publish(snapshot(2.0))
+        assert (await first.receive()).time == 2.0
+    assert mapped() == ours
 
 
 async def test_closing_ends_streams_and_threads(publishers: Publishers, state_region: WrittenRegion) -> None:

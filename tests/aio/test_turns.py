@@ -218,6 +218,7 @@ async def test_a_handshake_that_ran_into_its_deadline_is_not_somebody_else(clien
         await client.discover("full", timeout=0.05)
     assert late.applied
     await until(lambda: client.transport_stats.late)
+    assert client.transport_stats.late == 1
     assert client.step_count == 0
     reply = await client.step(3)
     assert (reply.step, client.step_count) == (3, 3)

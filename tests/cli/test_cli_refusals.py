@@ -68,6 +68,12 @@ def test_what_cannot_be_done_together(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", [["ping", "--timeout", "0.1"], ["ping", "--no-session", "--timeout", "0.1"]])
+def test_nobody_there_is_said_without_the_names_of_ops(refused: Refused, command: list[str]) -> None:
+    address = f"tcp://127.0.0.1:{free_port()}"
+    assert refused(*command, address).startswith(f"urlab ping: no connection to {address} within ")
+
+
 def test_a_recording_that_exists_is_not_replaced(refused: Refused, tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     file.write_bytes(b"mine")

@@ -15,7 +15,7 @@ from relay import Relay
 from waiting import eventually, until
 
 from urlab_client.aio import URLabClient
-from urlab_client.cli import _watching
+from urlab_client.cli import _watching, main
 from urlab_client.cli._common import CommandError
 from urlab_client.cli._watching import run_session
 from urlab_client.integrations.record import read_run
@@ -125,6 +125,17 @@ async def test_live_mode_ends_when_no_state_arrives(server: SimulatedServer, mon
         await client.discover()
         with pytest.raises(CommandError, match=r"no state arrived within 0\.2 s; .* pass --state-port"):
             await run_session(client, 1.0, over=lambda: False)
+
+
+def test_a_recording_without_states_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(_watching, "_FIRST_STATE_S", 0.2)
+    with SimulatedServer("ball", play=True) as server:
+        ports = ["--step-port", server.step_port, "--state-port", free_port()]
+        assert main(["record", server.address, str(tmp_path / "run.mcap"), *map(str, ports)]) == 2
+    assert "no state arrived" in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("mode", ["direct", "live"])

@@ -196,6 +196,8 @@ async def test_set_points_are_partial_and_misspelled_names_are_told(connect: Any
         assert arm.resolve_joint(f"{arm.prefix}_{next(iter(arm.joints))}") == next(iter(arm.joints))
         await client.step()
         assert arm.last_applied_ctrl[0] == applied(0.1)
+        assert type(arm.ctrl_array + 1) is np.ndarray
+        assert isinstance(arm.ctrl_array.sum(), float)
 
 
 async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any) -> None:

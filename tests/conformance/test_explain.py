@@ -146,6 +146,10 @@ async def test_the_generation_is_named(connect: Any, serve: Any, dialect: str) -
         await client.discover()
         (versions,) = (finding for finding in (await client.explain()).findings if finding.subject == "versions")
         assert f", generation {dialect}, with MuJoCo" in versions.text
+        other = connect(server, local_model=False)
+        await other.discover()
+        (versions,) = (finding for finding in (await other.explain()).findings if finding.subject == "versions")
+        assert versions.text.endswith("; there is no local model.")
 
 
 async def test_who_controls_a_robot(connect: Any, serve: Any, dialect: str) -> None:

@@ -234,6 +234,11 @@ FALSIFIED: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"reply": in_reply("hello_ok", each("session_id", str.upper)), "request": each("session_id", str.lower)},
     ),
     "the version's number": ("beta", "Session 9.1", {"reply": in_reply("hello_ok", put("mujoco_version_int", 1.0))}),
+    "an op that is gone": (
+        "beta",
+        "Beta 1",
+        {"reply": in_reply("meta_ok", lambda r: r["ops"].append({**r["ops"][0], "name": "destroy_actor"}))},
+    ),
     "an op that is not listed": (ANY, "Session 9.2", {"reply": in_reply("meta_ok", lambda r: r["ops"].pop() and None)}),
     "a required field that is not listed": (
         "beta",

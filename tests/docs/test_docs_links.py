@@ -36,14 +36,14 @@ def test_source_files_named_in_text_exist(page: Path) -> None:
             assert (ROOT / name).exists() or (PACKAGE / name).exists(), f"{shown(page)}: {name} does not exist"
 
 
-def test_every_thread_is_in_the_architecture_page() -> None:
+def test_every_thread_is_in_the_page_about_threads() -> None:
     sources = [
         path.read_text(encoding="utf-8")
         for part in ("aio", "sync", "server")
         for path in PACKAGE.rglob(f"{part}/**/*.py")
     ]
     threads = {name for source in sources for name in re.findall(r'[tT]hread\(\s*"(urlab-[a-z]+)"', source)}
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "architecture-threads.md").read_text(encoding="utf-8")
     assert threads >= {"urlab-io", "urlab-rpc", "urlab-physics"}
     assert sorted(threads - set(re.findall(r"`(urlab-[a-z]+)`", page))) == []
 

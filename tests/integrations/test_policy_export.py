@@ -234,6 +234,37 @@ def test_earlier_observations_are_part_of_the_input(tmp_path: Path, capsys: pyte
     assert len(json.loads(capsys.readouterr().out)["outcomes"]) == 2
 
 
+class Late(Task):
+    """Starts in a keyframe whose time is not 0."""
+
+    keyframe = "late"
+
+    def reward(self, states: States, actions: Any) -> Any:
+        return states.time
+
+
+LATE = """
+<mujoco>
+  <worldbody><body name="rod"><joint name="hinge"/><geom size="0.1"/></body></worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
+  <keyframe><key name="late" time="5"/></keyframe>
+</mujoco>
+"""
+
+
+def test_the_seconds_of_an_episode_count_from_its_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot, path = tmp_path / "robot.xml", tmp_path / "late.onnx"
+    robot.write_text(LATE)
+    monkeypatch.setattr(Late, "scene_address", f"sim://{robot}", raising=False)
+    export_policy(Model(2, Box(-1.0, 1.0, (1,))), Late, path)
+    assert urlab(["run-policy", str(path), "--task", f"{__name__}:Late", "--json", "--seconds=0.2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["actions"], found["sim_time"]) == (10, pytest.approx(0.2))
+    assert found["return"] > 50
+
+
 def layer(kind: str, act: Callable[[Any], Any], **fields: Any) -> Any:
     """A stand-in for one of PyTorch's layers."""
     return type(kind, (), {"__call__": lambda _, x: act(x), **fields})()

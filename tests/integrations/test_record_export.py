@@ -516,6 +516,14 @@ def test_rounding_noise_is_drawn_as_one_straight_line(tmp_path: Path) -> None:
     assert not [text for text in said if "14" in text], "no axis is scaled to the noise"
 
 
+def test_the_axis_of_what_hardly_varies_has_plain_numbers(tmp_path: Path) -> None:
+    time = np.linspace(0, 1, 50)
+    plot_curves("run.mcap", time, [Curves("q", ["a"], 0.3 + 1e-8 * np.sin(time)[:, None])], tmp_path / "plot.svg")
+    said = re.findall("<!-- (.*) -->", (tmp_path / "plot.svg").read_text(encoding="utf-8"))
+    assert {"0.30", "0.32"} <= {*said}, "not an offset and a power of ten"
+    assert {"run.mcap", "q", "a", "simulation time (s)"} <= {*said}
+
+
 def test_record_says_that_no_picture_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

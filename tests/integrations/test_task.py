@@ -17,6 +17,7 @@ from urlab_client.integrations.gym import (
     Push,
     PushPictures,
     Reach,
+    Run,
     SpaceMapping,
     Start,
     States,
@@ -117,6 +118,17 @@ def test_all_three_environments_agree_bit_for_bit(
         assert np.array_equal(observation, ours[0])
         assert (reward, terminated, truncated, info["success"], info["sim_time"]) == tuple(ours[1:])
     assert truncated
+
+
+@pytest.mark.parametrize("kind", [FixedReach, Run])
+def test_fixed_goals_start_within_a_twentieth_of_a_radian(kind: type[Task], made: list[Any]) -> None:
+    env = URLabBatchEnv(kind.scene_address, 8, task=kind())
+    made.append(env)
+    observations, _ = env.reset(seed=0)
+    (key,) = env.mapping.keys
+    free = 7 if kind is Run else 0
+    away = abs(env.mapping.field(observations, key, "qpos") - env.model.qpos0)[:, free:]
+    assert 0.04 < away.max() <= 0.05
 
 
 def test_goals_starts_and_commands_vary_with_the_seed_alone(walkers: list[str], made: list[Any]) -> None:

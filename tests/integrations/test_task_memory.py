@@ -25,7 +25,7 @@ from urlab_client.integrations.gym import (
     URLabVectorEnv,
     Walk,
 )
-from urlab_client.randomise.declaration import Delay, Randomisation, Vary
+from urlab_client.randomise.declaration import Delay, Push, Randomisation, Vary
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 LEVER = """
@@ -196,8 +196,14 @@ def test_a_declaration_of_actions_that_does_not_fit_is_refused(levers: list[str]
         URLabBatchEnv(levers[0], 1, actions=Actions(offset="lowered"))
     with pytest.raises(ValueError, match="clip must be"):
         Actions(clip=(1.0, 1.0))
-    with pytest.raises(ValueError, match="scale contains NaN"):
+    with pytest.raises(ValueError, match="clip takes 2 numbers, got 3"):
+        Actions(clip=(-1.0, 0.0, 1.0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="scale takes finite numbers, got nan"):
         Actions(scale=float("nan"))
+    with pytest.raises(TypeError, match="scale takes numbers, got"):
+        Actions(scale=None)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"actions takes Actions, or a dictionary .*, got 0\.5"):
+        URLabBatchEnv(levers[0], 1, actions=0.5)  # type: ignore[arg-type]
 
 
 def _misspelt(**names: Any) -> Task:
@@ -217,11 +223,24 @@ def _starting(change: Callable[[Start], object]) -> Task:
         (_misspelt(max_episodes_steps=5), r"Mine\.max_episodes_steps .* 'max_episode_steps'"),
         (_misspelt(ended=lambda self, success, steps: None), r"Mine\.ended\(\) must take \(episode\)"),
         (_misspelt(reward=lambda self, states: 0), r"Mine\.reward\(\) must take \(states, actions\)"),
+        (_misspelt(n_observed=-1), r"Mine\.n_observed must be at least 0, not -1"),
+        (_misspelt(n_observed="5"), r"Mine\.n_observed takes an integer, got '5'"),
+        (_misspelt(memory=["up"]), r"Mine\.memory takes a dictionary of names to shapes, got \['up'\]"),
+        (_misspelt(memory={"up": 3}), r"Mine\.memory\['up'\] takes a collection, such as a tuple, got 3"),
+        (_misspelt(memory={"up": (-3,)}), r"Mine\.memory\['up'\] must be at least 0"),
+        (_misspelt(articulations="lever"), r"articulations takes a collection, such as \('lever',\)"),
     ],
 )
-def test_misspelt_hooks_and_attributes_are_refused_at_construction(levers: list[str], task: Task, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
+def test_wrong_declarations_of_a_task_are_refused_at_construction(levers: list[str], task: Task, problem: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=problem):
         URLabBatchEnv(levers[0], 1, task=task)
+
+
+def test_an_environment_that_cannot_be_made_leaves_its_task_free(levers: list[str], made: list[Any]) -> None:
+    task, pushed = Hold(), Randomisation(push=(Push(body="lid", force=(1.0, 2.0), every=(1, 2)),))
+    with pytest.raises(KeyError, match="lid"):  # the traceback keeps what has been made so far
+        URLabBatchEnv(levers[0], 1, task=task, randomise=pushed)
+    made.append(URLabBatchEnv(levers[0], 1, task=task))
 
 
 @pytest.mark.parametrize(

@@ -283,6 +283,17 @@ def test_many_servers_come_up(made: list[Any], n: int) -> None:
     assert infos["step_count"].tolist() == [1] * n
 
 
+def test_physics_steps_are_counted_in_a_batch_as_by_servers(made: list[Any]) -> None:
+    counts: list[list[int]] = []
+    for kind in (URLabVectorEnv, URLabBatchEnv):
+        env = kind("sim://quadruped", 1, n_substeps=3)
+        made.append(env)
+        env.reset(seed=0)
+        still = np.zeros(env.action_space.shape, dtype=np.float32)  # type: ignore[arg-type]
+        counts += [[int(env.step(still)[4]["step_count"][0]) for _ in range(3)]]
+    assert counts == [[3, 6, 9]] * 2
+
+
 def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:
     with pytest.raises(urlab_client.URLabError, match="Environment 1 at sim://no-such-robot"):
         URLabVectorEnv([servers[0], "sim://no-such-robot"])
@@ -297,6 +308,7 @@ def test_environments_with_other_spaces_are_refused(servers: list[str], serving:
     ("arguments", "options", "reason"),
     [
         (("sim://arm",), {}, "needs num_envs"),
+        (("sim://arm", "2"), {}, "num_envs takes an integer, got '2'"),
         (("tcp://127.0.0.1", 2), {}, "list one address per environment"),
         ((["sim://arm"], 2), {}, "1 addresses"),
         (([],), {}, "0 addresses"),
@@ -305,7 +317,7 @@ def test_environments_with_other_spaces_are_refused(servers: list[str], serving:
     ],
 )
 def test_wrong_arguments_start_nothing(arguments: Any, options: Any, reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
+    with pytest.raises((ValueError, TypeError), match=reason):
         URLabVectorEnv(*arguments, **options)
 
 

@@ -8,6 +8,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import time
 from collections.abc import AsyncGenerator, Iterator
 from pathlib import Path
@@ -92,7 +93,10 @@ async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
     for tool in tools.values():
         assert tool.description
         assert tool.input_schema["type"] == "object"
-        Draft202012Validator.check_schema(tool.input_schema)
+        for schema in filter(None, (tool.input_schema, tool.output_schema)):
+            Draft202012Validator.check_schema(schema)
+            named = set(re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(schema)))
+            assert named == set(schema.get("$defs", ())), "nothing is missing, and nothing in vain"
     listed = json.dumps([tool.model_dump(mode="json", by_alias=True, exclude_none=True) for tool in tools.values()])
     assert len(listed.encode()) <= 15_000, "an agent pays for this list with each of its conversations"
     hints = {name: tool.annotations for name, tool in tools.items()}
@@ -370,6 +374,7 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             # What is there already is moved.
             again = await one.call("apply_scene", objects=[{"id": "b2", "position": [2, 2, 2]}], remove=["b1"])
             assert again["objects"] == ["b2"]
+            assert again["done"].startswith("Placed: b2. Removed: b1.")
             assert (await one.call("state", robot="b2"))["pose"]["position"] == [2, 2, 2]
             assert (await one.call("remove", actor="b2"))["objects"] == []
             await one.call("play", action="stop")

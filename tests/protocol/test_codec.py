@@ -354,6 +354,12 @@ def test_an_integer_beyond_any_float_is_a_protocol_error() -> None:
         decode_reply(OPS["step"], StepOk, frame)
 
 
+def test_an_array_of_more_dimensions_says_so() -> None:
+    frame = b'{"op":"step_ok","time":0,"step":1,"per_articulation":{"bot":{"qpos":[[1,2],[3,4]],"qvel":[]}}}'
+    with pytest.raises(ProtocolError, match="expected a flat array of numbers, got 2 dimensions"):
+        decode_reply(OPS["step"], StepOk, frame)
+
+
 @pytest.mark.parametrize(
     ("op", "fields", "named"),
     [

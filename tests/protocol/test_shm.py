@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from urlab_client._platform.processors import no_fence
@@ -50,6 +50,7 @@ def store_by_store(buffer: bytearray, n_buffers: int) -> Iterator[None]:
 
 class TestPublishAndRead:
     @given(st.lists(st.binary(min_size=1, max_size=STRIDE - 4), min_size=1, max_size=12), st.integers(2, 64))
+    @example([b"x"], 64)
     def test_the_newest_is_read(self, payloads: list[bytes], n_buffers: int) -> None:
         buffer, region = new_region(n_buffers)
         for payload in payloads:

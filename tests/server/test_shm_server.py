@@ -96,13 +96,15 @@ def test_the_files_are_laid_out_as_the_plugins(server: SimulatedServer, rpc: Rpc
     for name in ("req.shm", "rep.shm"):
         assert (directory / name).stat().st_size == 2_097_216
         assert HEADER.unpack_from((directory / name).read_bytes())[:4] == (0x424C5255, 1, 1_048_576, 2)
-        if os.name == "posix":
-            assert stat.S_IMODE((directory / name).stat().st_mode) == 0o600
     state = directory / "state.shm"
     eventually(lambda: state.is_file() and state.stat().st_size == 32_832)
     for camera in ("overview", "wrist"):
         stride = 32 * 24 * 4 + 4
         assert (directory / f"cam_arm_{camera}.shm").stat().st_size == 64 + 2 * stride
+    if os.name == "posix":
+        modes = {file.name: oct(stat.S_IMODE(file.stat().st_mode)) for file in directory.iterdir()}
+        assert modes == dict.fromkeys(modes, "0o600"), "nobody else may look or ring"
+        assert {"req.shm", "state.shm", "cam_arm_wrist.shm", "doorbell.sock"} <= modes.keys()
 
 
 def test_play_that_ends_takes_its_regions_along(server: SimulatedServer, rpc: Rpc, session: str) -> None:

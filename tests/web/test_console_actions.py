@@ -174,6 +174,9 @@ def test_a_robot_with_torque_motors_holds_its_home_pose_until_somebody_commands_
     said = [entry["what"] for entry in http.get("/api/log").json() if entry["kind"] == "call"]
     assert said[-2:] == ["hold pose", "let go"]
     assert "'quadruped'" in refusal(http.post("/api/hold", json={"nobody": True}))
+    assert http.post("/api/hold", json={"quadruped": True}).status_code == 200
+    http.post("/api/ops/set_mode", json={"mode": "live"})
+    assert http.get("/api/status").json()["holding"] == [], "in live mode its law would come too late"
 
 
 ARM = """<mujoco><worldbody><body name="upper"><joint name="turn" axis="0 1 0"/><geom size="0.1" fromto="0 0 0 1 0 0"/>

@@ -45,6 +45,14 @@ def integer(what: str, value: int) -> int:
         raise TypeError(f"{what} takes an integer, got {value!r:.80}.") from None
 
 
+def at_least(what: str, value: int, least: int) -> int:
+    """Return an integer that is not below a bound."""
+    found = integer(what, value)
+    if found < least:
+        raise ValueError(f"{what} must be at least {least}, not {found}")
+    return found
+
+
 def numbers(what: str, values: Iterable[float], count: int) -> list[float]:
     """Return exactly `count` numbers as a list."""
     try:

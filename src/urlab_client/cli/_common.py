@@ -31,7 +31,8 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         # Leave out the error number, which does not help users.
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return joined(text) or type(error).__name__
+    # Which op a command opens a connection with says nothing to its user.
+    return joined(text.removeprefix("hello: ").removeprefix("meta: ")) or type(error).__name__
 
 
 def in_background() -> bool:

@@ -224,7 +224,7 @@ class Trot:
         self._robot.ctrl_array[self._ctrl] = self.KP * error - self.KD * self._robot.qvel_array[self._qvel]
 
     @classmethod
-    def angles(cls, time: float, strides: Floats, lift: float = 1.0) -> Floats:
+    def angles(cls, time: float, strides: Floats, lift: float) -> Floats:
         """Return the joint angles, shape (12,), from each leg's stride in metres and the share of the full lift."""
         phase = (time * cls.STRIDES_PER_S + cls.PHASES) % 1
         grounded = phase < cls.ON_GROUND

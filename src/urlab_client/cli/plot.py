@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 _PER_PANEL = 6  # more lines in one panel cannot be told apart
 _DPI = 150
 _COVERS = 0.003  # of the axis: less than the width of a line
-_LEAST = 1e-6  # range of an axis, in the unit of its values, or as a part of large ones
+_NOISE = 1e-6  # range of an axis that shows rounding noise, in the unit of its values, or as a part of large ones
+_CONSTANT = 0.1  # range of the axis instead, likewise
 _PERIOD = 18.0  # of a dashed line, in line widths
 _FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
@@ -136,9 +137,8 @@ def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves],
         axis.grid(visible=True, alpha=0.3)
         axis.margins(x=0.01)
         low, high = axis.get_ylim()
-        least = _least_range(panel.values)
-        if high - low < least:
-            axis.set_ylim((low + high - least) / 2, (low + high + least) / 2)
+        if high - low < _NOISE * (size := _size(panel.values)):
+            axis.set_ylim((low + high - _CONSTANT * size) / 2, (low + high + _CONSTANT * size) / 2)
         legend = axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
         for handle in legend.legend_handles:
             handle.set_linestyle("-")  # it is shorter than the gap of a dashed one
@@ -150,7 +150,7 @@ def plot_curves(title: str, time: NDArray[np.float64], curves: Sequence[Curves],
 
 def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     """Return, per column, the first column that it covers, its place among those that do, and their number."""
-    near = _COVERS * max(np.ptp(np.nan_to_num(values)), _least_range(values)) if values.size else 0.0
+    near = _COVERS * max(np.ptp(np.nan_to_num(values)), _NOISE * _size(values)) if values.size else 0.0
     firsts = [
         next(
             other
@@ -162,9 +162,9 @@ def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     return [(first, firsts[:index].count(first), firsts.count(first)) for index, first in enumerate(firsts)]
 
 
-def _least_range(values: NDArray[np.float64]) -> float:
-    """Return the least range of an axis, below which rounding noise would look like vibration."""
-    return _LEAST * max(1.0, float(np.abs(np.nan_to_num(values)).max(initial=0.0)))
+def _size(values: NDArray[np.float64]) -> float:
+    """Return the largest value without its sign, but at least one."""
+    return max(1.0, float(np.abs(np.nan_to_num(values)).max(initial=0.0)))
 
 
 def _style(place: int, count: int) -> dict[str, Any]:

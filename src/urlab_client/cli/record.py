@@ -29,6 +29,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, check_recording, counted, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, recording_options, run_session, task_environment
 from urlab_client.enums import StepMode
+from urlab_client.errors import URLabError
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder, Recorder
@@ -127,9 +128,14 @@ async def _record(arguments: Namespace) -> AsyncRecorder:
         with interruptible() as stop:
             if arguments.step_mode == StepMode.DIRECT:
                 await client.reset(arguments.keyframe)
-            async with recorder:
-                with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
-                    await run_session(
-                        client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
-                    )
+            try:
+                async with recorder:
+                    with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
+                        await run_session(
+                            client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
+                        )
+            except (CommandError, URLabError):
+                if not recorder.stats.states:
+                    arguments.output.unlink(missing_ok=True)
+                raise
     return recorder

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import batch_class, spans
+from urlab_client.aio.arguments import at_least
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.enums import ControllerKind
 from urlab_client.integrations.gym.engines import ThreadedBatch, WarpBatch
@@ -84,8 +85,7 @@ class URLabBatchEnv(Vectorized):
             ValueError: An option is out of range, `warp` is combined with a varying model, or the scene has no camera
                 to render.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        num_envs = at_least("num_envs", num_envs, 1)
         if engine not in ("mujoco", "warp"):
             raise ValueError(f"engine must be 'mujoco' or 'warp', not {engine!r}")
         if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
@@ -104,7 +104,6 @@ class URLabBatchEnv(Vectorized):
             }
             self._target_type = np.float64 if client.server.features.exact_controls else np.float32
         declared = first.randomise if randomise is None else Randomisation.of(randomise)
-        super().__init__(first, num_envs, autoreset_mode, declared)
         self.model: mujoco.MjModel = model
         self._pictures = BatchPictures(
             self._scene, settings.cameras, {} if declared is None else declared.latencies(settings.cameras)
@@ -116,11 +115,6 @@ class URLabBatchEnv(Vectorized):
         )
         # Bound before the first call: the batch computes a derived field only if it is bound.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
-        if first.measures:
-            self._measured = {name: self._arrays[name] for name in MEASURED}
-        self._visible = [self._batch.bind(name) for name in VISIBLE]
-        sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
-        self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}
         self._varied = None
         if declared is not None and declared.vary:
             self._varied = _CopyVariation(
@@ -128,6 +122,12 @@ class URLabBatchEnv(Vectorized):
             )
         for push in () if declared is None else declared.push:
             mapping.id("body", push.body)
+        super().__init__(first, num_envs, autoreset_mode, declared)  # last: until `close` it holds the task
+        if first.measures:
+            self._measured = {name: self._arrays[name] for name in MEASURED}
+        self._visible = [self._batch.bind(name) for name in VISIBLE]
+        sensors = {key: [*mapping.layout(key).sensors.values()] for key in mapping.keys}
+        self._sensors = {key: spans(model.sensor_adr[ids], model.sensor_dim[ids]) for key, ids in sensors.items()}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of the current state of each copy, shape (H, W, 3), RGB; None without a render mode.

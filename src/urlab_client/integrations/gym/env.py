@@ -82,7 +82,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         termination_fn: The termination function. If None, episodes never terminate.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50.0}  # noqa: RUF012 - Gymnasium's
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,

@@ -9,10 +9,10 @@ from weakref import WeakValueDictionary
 
 import mujoco
 
-from urlab_client.aio.arguments import collection, integer, require, text
+from urlab_client.aio.arguments import at_least, collection, require, text
 from urlab_client.aio.launch import SCHEME, SHARED_MEMORY, with_model_options, with_option
 from urlab_client.integrations.gym.spaces import Actions, Field, Observation, SpaceMapping, SpaceMode, fields_of
-from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_spelling
+from urlab_client.integrations.gym.task import Memory, ResetNoise, Task, TaskScene, check_declared
 from urlab_client.randomise.declaration import Randomisation
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
@@ -88,7 +88,7 @@ class EpisodeSettings:
                     f"{', '.join(given)} cannot be given together with a task: override the task's method instead"
                 )
             require("task", task, Task, "a Task")
-            check_spelling(task)
+            check_declared(task)
             if id(task) in _SERVING:
                 raise ValueError(
                     f"this {type(task).__name__} already serves another environment: make one for each environment, "
@@ -105,15 +105,18 @@ class EpisodeSettings:
         self.reward_fn: RewardFn | None = get("reward_fn")
         self.termination_fn: TerminationFn | None = get("termination_fn")
         self.fields: tuple[Field, ...] = fields_of(chosen("observations"))
-        self.actions: Actions | Mapping[str, Actions] | None = chosen("actions")
-        self.n_substeps: int = _at_least_1("n_substeps", chosen("n_substeps"))
+        self.actions: Actions | Mapping[str, Actions] | None = _actions(chosen("actions"))
+        self.n_substeps: int = at_least("n_substeps", chosen("n_substeps"), 1)
         most = chosen("max_episode_steps")
-        self.max_episode_steps: int | None = None if most is None else _at_least_1("max_episode_steps", most)
+        self.max_episode_steps: int | None = None if most is None else at_least("max_episode_steps", most, 1)
         self.keyframe: str | None = None if keyframe is None else text("keyframe", keyframe)
         self.reset_noise: ResetNoise = noise if isinstance(noise, ResetNoise) else ResetNoise(hinge=noise)
         self.space_mode: SpaceMode = chosen("space_mode")
         self.cameras: tuple[str, ...] = tuple(collection("cameras", chosen("cameras")))
-        self.articulations: Sequence[str] | None = defaults.articulations
+        observed = defaults.articulations
+        self.articulations: Sequence[str] | None = (
+            None if observed is None else tuple(collection("articulations", observed))
+        )
         self.render_mode: str | None = get("render_mode")
         self.render_camera: str | None = get("render_camera")
         if self.render_mode not in (None, "rgb_array"):
@@ -138,11 +141,10 @@ class EpisodeSettings:
             del _SERVING[id(self.task)]
 
 
-def _at_least_1(name: str, value: Any) -> int:
-    found = integer(name, value)
-    if found < 1:
-        raise ValueError(f"{name} must be at least 1, not {found}")
-    return found
+def _actions(given: Any) -> Actions | Mapping[str, Actions] | None:
+    for each in given.values() if isinstance(given, Mapping) else () if given is None else [given]:
+        require("actions", each, Actions, "Actions, or a dictionary of Actions by articulation")
+    return given
 
 
 class _NoTask(Task):

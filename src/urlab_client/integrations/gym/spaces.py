@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import control_counts
-from urlab_client.aio.arguments import collection
+from urlab_client.aio.arguments import collection, finite_array, numbers
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts, compiled_ids, driven_joint
 from urlab_client.enums import CameraMode
 from urlab_client.errors import UnknownKeyframe
@@ -54,11 +54,12 @@ class Actions:
     clip: tuple[float, float] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not self.clip[0] < self.clip[1]:
+        low, high = numbers("actions: clip", self.clip, 2)
+        if not low < high:
             raise ValueError(f"actions: clip must be (low, high) with low < high, not {self.clip}")
         for name, value in (("scale", self.scale), ("offset", self.offset)):
-            if not isinstance(value, str) and not np.isfinite(value).all():
-                raise ValueError(f"actions: {name} contains NaN or infinity")
+            if not isinstance(value, str) or name == "scale":
+                finite_array(f"actions: {name}", np.ravel(value))
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:

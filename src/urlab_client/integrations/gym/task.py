@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from urlab_client.aio.arguments import require
+from urlab_client.aio.arguments import at_least, collection, mapping, require
 from urlab_client.integrations.gym.spaces import Actions, Space, SpaceMapping, SpaceMode, dict_space, unbounded
 from urlab_client.protocol.base import Floats
 
@@ -543,9 +543,13 @@ def _of(task: Task, hook: str) -> str:
     return f"{type(task).__name__}.{hook}()"
 
 
-def check_spelling(task: Task) -> None:
-    """Refuse a name that is nearly that of a hook or attribute of `Task`, and a hook that takes other arguments."""
+def check_declared(task: Task) -> None:
+    """Refuse a name that is nearly that of a hook or attribute of `Task`, other arguments of a hook, wrong shapes."""
     kind = type(task)
+    at_least(f"{kind.__name__}.n_observed", task.n_observed, 0)
+    for name, shape in mapping(f"{kind.__name__}.memory", task.memory, "names to shapes").items():
+        for length in collection(f"{kind.__name__}.memory[{name!r}]", shape):
+            at_least(f"{kind.__name__}.memory[{name!r}]", length, 0)
     own = {name for one in kind.__mro__ if issubclass(one, Task) and one is not Task for name in vars(one)}
     for name in sorted(own | vars(task).keys()):
         if name in _HOOKS:

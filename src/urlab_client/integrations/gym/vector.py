@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client._platform.processors import processor_count
+from urlab_client.aio.arguments import at_least
 from urlab_client.aio.background import background_task
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_option
@@ -189,7 +190,7 @@ class URLabVectorEnv(OverWire):
                 raise ValueError(
                     "a single address needs num_envs and the scheme sim://; otherwise list one address per environment"
                 )
-            addresses = [addresses] * num_envs
+            addresses = [addresses] * at_least("num_envs", num_envs, 1)
         if num_envs not in (None, len(addresses)) or not addresses:
             raise ValueError(f"num_envs is {num_envs}, but there are {len(addresses)} addresses")
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):

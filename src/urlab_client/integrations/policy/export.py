@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -138,6 +138,7 @@ def export_policy(
     from urlab_client.integrations.gym import URLabEnv, task_named
 
     path, own = Path(path), (task_named(task) if isinstance(task, str) else task)()
+    trained = _read(model, env)  # before a server is started
     goals = _noted_goals(own)
     vars(own)["measured"] = True  # sensors are there, too: terms may refer to them
     with closing(URLabEnv.connect(own.scene_address, task=own)) as served, tempfile.TemporaryDirectory() as folder:
@@ -149,7 +150,7 @@ def export_policy(
             )
         seen_space: Any = served.observation_space
         size, robot = int(seen_space.shape[0]), served.articulations[driven[0]]
-        layers, act, history = _trained(model, env, size, served.action_space)
+        layers, act, history = _fitted(model, trained, size, served.action_space)
         written = Path(folder) / path.name
         written.write_bytes(onnx_network(layers, size * history))
         network = OnnxNetwork(written)
@@ -284,21 +285,33 @@ def _rehearsed(env: URLabEnv, goals: list[Floats], policy: Policy, act: _Act, to
     return seen
 
 
-def _trained(model: Any, env: Any, size: int, space: Any) -> tuple[list[Layer], _Act, int]:
+class _Trained(NamedTuple):
+    """What a model consists of: the wrappers of its environments, the layers of its network, and its own actions."""
+
+    wrappers: list[Any]
+    layers: list[Layer]
+    act: _Act
+
+
+def _read(model: Any, env: Any) -> _Trained:
+    """Return what a model consists of; refuse what cannot be exported."""
+    of_library = hasattr(model, "policy") and hasattr(model, "predict")
+    given = model.get_env() if of_library else getattr(model, "env", None)
+    wrappers = [*_wrappers(given if env is None else env)]
+    if of_library:
+        return _Trained(wrappers, *_stable_baselines(model))
+    module = model.alg.get_policy().as_jit() if hasattr(model, "alg") else model  # a runner of RSL-RL, or a module
+    return _Trained(wrappers, [*_layers([module])], _inferred(module))
+
+
+def _fitted(model: Any, trained: _Trained, size: int, space: Any) -> tuple[list[Layer], _Act, int]:
     """Return a model for a task with observations of this size and this action space.
 
     Returns:
         The layers of its network, from observations of the task to actions of the task; the model's own actions, shape
         (n, n_actions), for inputs, shape (n, n_inputs); and the number of observations in an input.
     """
-    of_library = hasattr(model, "policy") and hasattr(model, "predict")
-    given = model.get_env() if of_library else getattr(model, "env", None)
-    wrappers = [*_wrappers(given if env is None else env)]
-    if of_library:
-        layers, answer = _stable_baselines(model)
-    else:  # a runner of RSL-RL, or a module
-        module = model.alg.get_policy().as_jit() if hasattr(model, "alg") else model
-        layers, answer = [*_layers([module])], _inferred(module)
+    wrappers, layers, answer = trained
     clipped = [each.env for each in wrappers if type(each).__name__ == "ClipAction"]
     spaces = [_action_space(each) for each in (clipped or [model, *wrappers])]
     ours, theirs = _bounds(space), _bounds(next((each for each in spaces if each is not None), space))

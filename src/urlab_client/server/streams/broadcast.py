@@ -241,18 +241,14 @@ class Broadcast:
                 if topic is not None:
                     yield topic
 
-    def obey(self, commands: deque[StreamedCommand]) -> bool:
-        """Apply and remove commands; outside live mode they have no effect.
-
-        Returns:
-            False if physics is busy and the commands are still queued.
-        """
+    def obey(self, commands: deque[StreamedCommand]) -> None:
+        """Apply and remove commands; outside live mode they have no effect. They stay queued while physics is busy."""
         engine = self._engine
         if engine.mode not in _LIVE:  # physics may then legitimately hold the lock for hours
             commands.clear()
-            return True
+            return
         if not engine.lock.inner.acquire(timeout=LOCK_S):
-            return False
+            return
         try:
             while commands:
                 command = commands.popleft()
@@ -264,7 +260,6 @@ class Broadcast:
                     self._set_gains(*command)
         finally:
             engine.lock.inner.release()
-        return True
 
     def _owned(self, control: ArticulationControl) -> bool:
         return self._dialect.claims and self.running.claims.owner(control.index.key) != UNCLAIMED

@@ -202,7 +202,7 @@ function banner() {
   }
   document.body.classList.toggle("stale", !now.socket || (link && !["connected", "taken_over"].includes(link.state)));
   box.hidden = said === null;
-  // Over the page, which must not move when it goes; but without play there is nothing below to cover.
+  // Over the lower edge of the page, which must not move when it goes. Without play, the page is empty, and it stays.
   box.classList.toggle("floating", since !== "");
   if ((box.dataset.said ?? "") !== (said ?? "")) {
     announce(said ?? (box.dataset.said ? "Connected." : ""));

@@ -64,7 +64,7 @@ export class Chart {
       },
     }, h("i", { class: `swatch s${i % COLORS.length}${i >= COLORS.length ? " dashed" : ""}` }), h("span", {}, name), this.values[i])));
     this.element = h("div", { class: "curve", "data-sensor": source.key },
-      h("div", { class: "line" }, h("b", {}, source.title), h("span", { class: "tag" }, source.unit || source.kind), h("span", { class: "space" }),
+      h("div", { class: "line" }, h("b", {}, source.title), h("span", { class: "tag" }, source.unit), h("span", { class: "space" }),
         h("button", { class: "tiny", title: `Remove ${source.title}`, "aria-label": `Remove ${source.title}`, onclick: close }, "×")),
       this.canvas, legend);
     new IntersectionObserver(([entry]) => { this.seen = entry.isIntersecting; this.stale = true; }).observe(this.canvas);
