@@ -370,7 +370,7 @@ def lerobot(python: str) -> str:
 
 
 def envhub(python: str) -> str:
-    """LeRobot loads the example's `env.py` as one from its hub, and its evaluation rolls a policy out in it."""
+    """LeRobot loads the example's `env.py` as one from its hub; its evaluation rolls policies out, one with success."""
     file = Path(__file__).parents[1] / "examples/envhub/env.py"
     done = subprocess.run([python, "-c", ROLL_OUT, str(file)], capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode:
@@ -380,12 +380,14 @@ def envhub(python: str) -> str:
 
 ROLL_OUT = """
 import sys
+import mujoco
 import numpy as np
 import torch
 from lerobot import __version__
 from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import rollout
+from urlab_client.integrations.gym.envhub import vector_env
 
 class Still(PreTrainedPolicy):
     config_class, name = object, "still"
@@ -395,6 +397,23 @@ class Still(PreTrainedPolicy):
     get_optim_params = forward = predict_action_chunk = None
 
 Still.__abstractmethods__ = frozenset()
+
+class Reaching(Still):
+    \"\"\"Moves the set-points by the Jacobian of the hand, until that is at the target.\"\"\"
+    def __init__(self, envs): super().__init__(); self.envs = envs
+    def reset(self): self.set_points = None
+    def select_action(self, batch):
+        if self.set_points is None: self.set_points = batch["observation.state"].numpy()[:, :7].astype(float)
+        for own, env, seen in zip(self.set_points, self.envs, batch["observation.environment_state"].numpy()):
+            task, client = env.unwrapped.task, env.unwrapped.client
+            jacobian = np.zeros((3, client.model.nv))
+            site = task.scene.mapping.id("site", "arm/grip")
+            mujoco.mj_jacSite(client.model, client.data, jacobian, None, site)
+            jacobian = jacobian[:, :6]
+            damped = jacobian @ jacobian.T + 1e-3 * np.eye(3)
+            own[:6] += 0.2 * jacobian.T @ np.linalg.solve(damped, seen[3:])
+        return torch.tensor(self.set_points, dtype=torch.float32)
+
 if __name__ == "__main__":
     module = _import_hub_module(sys.argv[1], "urlab/push")
     same = lambda x: x
@@ -411,7 +430,12 @@ if __name__ == "__main__":
         assert policy.seen["task"] == ["push the block to the mark"] * 2
         returns.append(found["reward"].sum(1))
     assert torch.equal(*returns), returns
-    print(f"two episodes of 150 actions, twice, the same with processes, with LeRobot {__version__}")
+    envs = vector_env("urlab/Reach-v0", 2, description="hold the hand at the mark", observations=["qpos"])
+    found = rollout(envs, Reaching(envs.envs), same, same, same, same, seeds=[1, 2])
+    envs.close()
+    assert not found["success"][:, 0].any()
+    assert found["success"][:, -1].all()
+    print(f"two episodes of 150 actions, twice, the same with processes, and two successes, with LeRobot {__version__}")
 """
 
 READ_BACK = """
