@@ -65,7 +65,7 @@ async def test_a_hand_arrives_with_its_orientation_and_gripper(server: Simulated
         # Without an orientation the hand keeps its own; without a position it stays.
         moved = await one.call("move_hand", robot="arm", position=[0.5, 0.0, 0.3])
         assert abs(sum(a * b for a, b in zip(moved["pose"]["quaternion"], turned, strict=True))) > math.cos(0.02)
-        moved = await one.call("move_hand", robot="arm", quaternion=DOWN)
+        moved = await one.call("move_hand", robot="arm", quaternion=DOWN, gripper=0.04)  # as far as it opens
         assert math.dist(moved["pose"]["position"], [0.5, 0.0, 0.3]) < 0.005
         world = await one.call("look")
         assert world["hands"] == [moved["pose"]]

@@ -219,6 +219,7 @@ def test_editor_15_grids(editor: Wire, models: Path) -> None:
         assert editor.refused("spawn_grid", **grid, count_x=x, count_y=y) == code
     for unusable in ("many", None, [1], -1):
         assert editor.refused("spawn_grid", **grid, count_x=unusable, count_y=1) == "invalid_count"
+        assert editor.refused("spawn_grid", **grid, count_x=1, count_y=unusable) == "invalid_count"
     assert editor.refused("spawn_grid", **grid, count_x=1) == "missing_field"
 
 
