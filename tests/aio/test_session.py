@@ -355,6 +355,18 @@ async def test_closing_fails_what_waits_and_everything_after(client: Any, script
         await client.discover()
 
 
+async def test_closing_fails_what_waits_for_a_server() -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        client = URLabClient("tcp://127.0.0.1", step_port=nobody.getsockname()[1], rcv_timeout_ms=600_000)
+        pending = asyncio.create_task(client.meta())
+        await until(lambda: client._transport._waiting)  # type: ignore[attr-defined]
+        await client.close()
+        async with asyncio.timeout(DEADLINE_S):
+            with pytest.raises(ClientClosed):
+                await pending
+
+
 async def test_many_clients_share_a_loop(scripted: Any) -> None:
     scripted.on("current_level", LEVEL)
     clients = [URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) for _ in range(8)]

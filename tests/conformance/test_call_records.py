@@ -74,6 +74,9 @@ async def test_what_was_lost_timed_out_or_never_sent_is_told_too(connect: Any, s
         assert (late.op, late.outcome) == ("set_paused", CallOutcome.OK)
         assert late.queued_s > 0
         assert late.round_trip_s > 0
+        for one in (waited, late):
+            ended_ns = one.started_ns + 1e9 * (one.queued_s + one.round_trip_s)
+            assert ended_ns < time.time_ns() + 1e8, "it starts where its caller asks"
     nowhere = connect(address="tcp://127.0.0.1", step_port=free_port(), rcv_timeout_ms=50, observe=records.append)
     with pytest.raises(ServerUnreachable):
         await nowhere.discover()
