@@ -141,9 +141,10 @@ class EpisodeSettings:
             del _SERVING[id(self.task)]
 
 
-def _actions(given: Any) -> Actions | Mapping[str, Actions] | None:
-    for each in given.values() if isinstance(given, Mapping) else () if given is None else [given]:
-        require("actions", each, Actions, "Actions, or a dictionary of Actions by articulation")
+def _actions(given: Actions | Mapping[str, Actions] | None) -> Actions | Mapping[str, Actions] | None:
+    if given is not None:
+        for each in given.values() if isinstance(given, Mapping) else [given]:
+            require("actions", each, Actions, "Actions, or a dictionary of Actions by articulation")
     return given
 
 
