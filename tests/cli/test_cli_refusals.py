@@ -47,6 +47,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
             ["record", "x.mcap", "--keyframe", "home", "--task", "urlab/Reach-v0"],
             "--keyframe cannot be combined with --task, which determines the start",
         ),
+        (["snapshot", "run.mcap"], "run.mcap is a recording; urlab plot, view and console show it"),
         (["record", "x.csv"], "x.csv: write a file that ends in .mcap, for example x.mcap"),
         (
             ["console", "run.mcap", "--mjcf-options"],
@@ -66,6 +67,23 @@ def test_what_cannot_be_done_together(
     monkeypatch.chdir(tmp_path)
     assert f"urlab {arguments[0]}: {said}" in refused(*arguments)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["record", "sim://arm"], "argument OUTPUT: 'sim://arm' is an address, not a file"),
+        (["record", "run.mcap", "sim://arm"], "'run.mcap' is a recording, not the address of a server"),
+        (["ping", "run.mcap"], "'run.mcap' is a recording, not the address of a server"),
+        (["console", "pictures/run.png"], "'pictures/run.png' is a file, not the address of a server"),
+    ],
+)
+def test_files_and_addresses_are_told_apart(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [["ping", "--timeout", "0.1"], ["ping", "--no-session", "--timeout", "0.1"]])

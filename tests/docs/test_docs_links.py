@@ -61,6 +61,21 @@ def test_every_page_can_be_reached() -> None:
     assert reachable == set(pages())
 
 
+def test_the_list_of_all_pages_has_them() -> None:
+    """Those below `NAME.md`, `NAME-….md`, are in the navigation."""
+    docs = ROOT / "docs"
+    page = docs / "contents.md"
+    listed = {(docs / target).resolve() for target in re.findall(r"\]\(([^)\s#]+\.md)", prose(page))}
+    tops = {file.stem for file in docs.glob("*.md") if "-" not in file.stem}
+    missing = [
+        shown(file)
+        for folder in ("", "howto", "tutorials")
+        for file in sorted((docs / folder).glob("*.md"))
+        if file not in {*listed, page} and ("-" not in file.stem or file.stem.partition("-")[0] not in tops)
+    ]
+    assert missing == []
+
+
 def test_the_tree_in_a_page_has_no_tabs_or_trailing_blanks() -> None:
     for page in pages():
         for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):

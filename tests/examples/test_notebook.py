@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -45,7 +46,7 @@ def model(tmp_path: Path) -> str:
 def html_of(value: Any) -> str:
     shown: str = value._repr_html_()
     assert "\n" not in repr(value), "a terminal shows one line"
-    return re.sub(r"<[^>]*>", " ", shown)
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", " ", shown))).strip()
 
 
 @pytest.mark.long
@@ -71,10 +72,16 @@ def test_the_notebook_shows_values(tmp_path: Path) -> None:
 
 
 def test_blocking_objects_show_tables(model: str) -> None:
-    with SimulatedServer(model, play=True) as server, URLabClient(**server.client_options()) as client:
-        assert "connected" in html_of(client)
+    with (
+        SimulatedServer(model, play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        assert "step mode direct, requested" in html_of(client)
         client.discover()
-        assert "robots pendulum" in re.sub(r" +", " ", html_of(client))
+        said = html_of(client)
+        assert "robots pendulum" in said
+        assert "play ready, waiting for step()" in said
+        assert html_of(client.articulations["pendulum"]).startswith("URLabArticulation 'pendulum'")
         assert "swing" in html_of(client.articulations["pendulum"])
         assert "pendulum" in html_of(client.articulations)
         assert "pendulum" in html_of(client.step())
@@ -82,6 +89,7 @@ def test_blocking_objects_show_tables(model: str) -> None:
         assert "play" in html_of(diagnosis)
         assert "#2e7d32" in str(diagnosis._repr_html_()), "what is in order is green"
     assert "closed" in html_of(client)
+    assert "step mode" not in html_of(client)
 
 
 async def test_async_objects_show_tables(model: str) -> None:
@@ -96,14 +104,22 @@ async def test_async_objects_show_tables(model: str) -> None:
 
 def test_a_recording_shows_its_curves(model: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with SimulatedServer(model, play=True) as server, URLabClient(**server.client_options()) as client:
+    with (
+        SimulatedServer(model, play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
         client.discover()
-        with record(client, path):
+        recorder = record(client, path)
+        assert repr(recorder) == f"<Recorder {str(path)!r} not begun, 0 states, 0 pictures>"
+        with recorder:
             client.articulations["pendulum"].set_ctrl({"swing": 1.0})
             for _ in range(5):
                 client.step()
     run = read_run(path)
     assert "pendulum/swing" in html_of(run)
+    table = run.table()
+    assert repr(table) == "<Table states: 5, 0.002 to 0.010 s, columns: 5>"
+    assert "pendulum/qpos 1 swing" in html_of(table)
     assert "<polyline" in run._repr_html_()
     path.unlink()
     assert "problem" in html_of(run)

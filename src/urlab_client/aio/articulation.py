@@ -23,6 +23,7 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.runtime import ClaimControl
 from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.values.descriptions import ArticulationDescription, ControllerDescription, EntityDescription, Pose
+from urlab_client.values.html import fields
 from urlab_client.values.names import Local, NameMap
 from urlab_client.values.rotation import rotate
 
@@ -158,7 +159,7 @@ class URLabEntity(Local):
         return f"<{type(self).__name__} {self.name!r}>"
 
     def _repr_html_(self) -> str | None:
-        return self.describe()._repr_html_()  # pyright: ignore[reportPrivateUsage]
+        return fields(repr(self)[1:-1], self.describe()._shown())  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
 
 class LocalArticulation(URLabEntity):

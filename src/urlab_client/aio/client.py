@@ -730,12 +730,18 @@ class URLabClient(ClientState):
         return f"<URLabClient {self.address} {state}>"
 
     def _repr_html_(self) -> str:
-        playing = "running" if self.manager_present else "not running, as far as this client knows"
+        play = step_mode = passed = ""
+        if self._state.hello is None:
+            step_mode = f"{self._config.step_mode}, requested"
+        elif not self._closed:
+            ready = "ready" if self._state.mode.live else "ready, waiting for step()"
+            play = ready if self.manager_present else "not running, as far as this client knows"
+            step_mode, passed = str(self.step_mode), f"{self.sim_time:.3f} s"
         found = {
             "server": self.urlab_version and f"URLab {self.urlab_version}, MuJoCo {self.mujoco_version}",
-            "play": playing,
-            "step mode": str(self.step_mode),
-            "simulation time": f"{self.sim_time:.3f} s",
+            "play": play,
+            "step mode": step_mode,
+            "simulation time": passed,
             "robots": ", ".join(self.articulations),
             "other bodies": ", ".join(name for name in self.entities if name not in self.articulations),
         }

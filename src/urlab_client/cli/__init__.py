@@ -144,7 +144,8 @@ def _parser(command: str | None = None) -> Parser:
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
-        epilog="Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
+        epilog="urlab help COMMAND says what a command does and takes. "
+        "Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
         "failure explained on standard error, 130 Ctrl-C, 141 the output's reader has gone.",
     )
     add_usage(parser, _USAGE)

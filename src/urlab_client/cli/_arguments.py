@@ -314,12 +314,23 @@ def address(text: str) -> str:
 
     if text in bundled_models() or text.endswith((".xml", ".json")):
         raise argparse.ArgumentTypeError(f"{text!r} is a model, not an address; write sim://{text} to start a server")
+    if text.endswith(".mcap"):
+        raise argparse.ArgumentTypeError(f"{text!r} is a recording, not the address of a server")
+    if "/" in text or Path(text).is_file():
+        raise argparse.ArgumentTypeError(f"{text!r} is a file, not the address of a server")
     return f"tcp://{text}"
 
 
 def address_or_recording(text: str) -> str | Path:
     """Parse the address of a server, or the path of a recording."""
     return Path(text) if text.endswith(".mcap") and "://" not in text else address(text)
+
+
+def _file(text: str) -> Path:
+    """Parse the path of a file."""
+    if "://" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} is an address, not a file")
+    return Path(text)
 
 
 def image_size(text: str) -> tuple[int, int]:
@@ -377,6 +388,6 @@ _KINDS: Final[Kinds] = {
     **dict.fromkeys(("S", "SECONDS"), _positive("give a number of seconds above 0")),
     **dict.fromkeys(("HZ", "M/S", "RAD/S"), _positive("give a number per second, above 0")),
     **dict.fromkeys(("NUMBER", "P", "VX"), float),
-    **dict.fromkeys(("FILE", "PATH", "DIR", "FOLDER", "OUTPUT", "POLICY", "RECORDING"), Path),
+    **dict.fromkeys(("FILE", "PATH", "DIR", "FOLDER", "OUTPUT", "POLICY", "RECORDING"), _file),
 }
 """How a value is read, by its name; others are text."""

@@ -126,10 +126,10 @@ async def _record(arguments: Namespace) -> AsyncRecorder:
             await client.discover()
         recorder = record(client, arguments.output, **recording_options(arguments))
         with interruptible() as stop:
-            if arguments.step_mode == StepMode.DIRECT:
-                await client.reset(arguments.keyframe)
             try:
                 async with recorder:
+                    if arguments.step_mode == StepMode.DIRECT:
+                        await client.reset(arguments.keyframe)
                     with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
                         await run_session(
                             client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress

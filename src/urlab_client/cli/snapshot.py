@@ -59,6 +59,8 @@ def run(arguments: Namespace) -> int:
         raise CommandError(f"{arguments.output}: no such folder")
     check_ending(arguments.output, *_FORMATS)
     _check_mode(arguments)
+    if recordings := [source for source in arguments.sources if source.endswith(".mcap")]:
+        raise CommandError(f"{recordings[0]} is a recording; urlab plot, view and console show it")
     import_mujoco()
     if any("://" in source for source in arguments.sources):
         image = _of_running_server(arguments)

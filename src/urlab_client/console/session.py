@@ -240,7 +240,8 @@ class ConsoleSession:
 
     def _set_link(self, state: str, reason: str = "") -> None:
         if self.link.state != state or self.link.reason != reason:
-            self.link = Link(state, reason, time.time())
+            away = "connected" not in {state, self.link.state}  # still: since the first moment without contact
+            self.link = Link(state, reason, self.link.since if away else time.time())
             self.view.notify()
 
     def _begin_anew(self) -> None:

@@ -20,6 +20,7 @@ from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.values.html import table
 from urlab_client.values.pictures import Pixels, shown_png, without_alpha
 
 CHOSEN: Final = "chosen"
@@ -126,6 +127,14 @@ class Table:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        passed = f", {self.time[0]:.3f} to {self.time[-1]:.3f} s" if len(self) else ""
+        return f"<Table states: {len(self)}{passed}, columns: {len(self.columns)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(key, column.values.shape[1], ", ".join(column.labels)) for key, column in self.columns.items()]
+        return table(rows, heads=("column", "values", "names"), caption=repr(self)[1:-1])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all arrays by name: `time`, …, then `ARTICULATION/FIELD`, shape (n, values)."""

@@ -57,6 +57,14 @@ class Recording(Block):
         self._writer: WriterThread | None = None
         self._used = self._ended = False
 
+    def __repr__(self) -> str:
+        begun = "failed" if self.failed else "ended" if self._ended else "recording"
+        stats = self.stats
+        return (
+            f"<{type(self).__name__} {str(self._path)!r} {begun if self._used else 'not begun'}, "
+            f"{stats.states} states, {stats.frames} pictures>"
+        )
+
     @property
     def path(self) -> Path:
         """The file."""

@@ -124,6 +124,7 @@ export function stillness(art, state, status) {
   if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so nothing drives it. Raise them under “Gains”.";
   const forces = art.actuators.filter((actuator) => actuator.takes === "force");
   if (forces.length === art.actuators.length && forces.every((actuator) => !state.ctrl?.[actuator.index])) {
+    if (limp(art, state) && status?.moving) return "Nothing drives it, so it falls. “Hold pose” makes it stand.";
     return limp(art, state) ? "Nothing drives it yet. Play makes it hold its pose."
       : "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
   }

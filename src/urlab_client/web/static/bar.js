@@ -153,9 +153,9 @@ function show(status) {
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
   if (status.replay?.alone) text(ui.link, "Recording"); // there is no server to be connected with
   text(ui.address, status.replay?.alone ? "" : status.address);
-  text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "paused");
-  text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
   const unreachable = ["lost", "connecting"].includes(link) && !status.replay;
+  text(ui.rate, unreachable ? "–" : status.moving ? `${status.rate.toFixed(2)}×` : "paused");
+  if (!unreachable) text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
   ui.play.disabled = unreachable || (!status.playing && !status.replay);
   ui.stop.disabled = unreachable;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
@@ -171,7 +171,7 @@ function show(status) {
     : `${status.driver} drives · ${Math.ceil(status.lease_left)} s${others}`);
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
   text(ui.drive, status.mine ? "Release" : "Take the controls");
-  ui.drive.disabled = !status.mine && status.driver !== null;
+  ui.drive.disabled = unreachable || (!status.mine && status.driver !== null);
   if (!ui.restart.classList.contains("danger")) text(ui.restart, status.playing ? "Restart play" : "Begin play");
 }
 

@@ -65,8 +65,9 @@ export function makeReplay() {
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
     document.body.classList.toggle("serverless", replay?.alone ?? false);
-    // Controls of the simulation would act unseen.
-    for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = replay !== null;
+    // Controls of the simulation would act unseen, or not at all.
+    const useless = replay !== null || ["lost", "connecting"].includes(status.link.state);
+    for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = useless;
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));
     text(play, replay.playing ? "❚❚" : "▶");

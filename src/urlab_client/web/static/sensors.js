@@ -138,7 +138,7 @@ export function makeSensors() {
     }));
     const rest = all.filter((source) => !(chosen.get(source.key) ?? source.shown));
     add.replaceChildren(h("option", { value: "" }, "Add a curve …"),
-      ...rest.map((source) => h("option", { value: source.key }, `${source.art}: ${source.title}`)));
+      ...rest.map((source) => h("option", { value: source.key }, `${source.art}: ${source.title}${source.unit && ` (${source.unit})`}`)));
     add.hidden = !rest.length;
     $("sensors").classList.toggle("empty", all.length === 0);
   }

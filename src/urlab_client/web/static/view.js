@@ -9,8 +9,9 @@ import { on } from "./link.js";
 const OPEN = "urlab-view";
 const TOUCH = window.matchMedia("(pointer: coarse)");
 const UPRIGHT = window.matchMedia("(orientation: portrait)");
-const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it; press Push, or hold Ctrl, and drag to push it. With the view in focus, the arrow keys rotate, with Shift they pan, + and − zoom.";
-const WITH_FINGERS = "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it; press Push and drag to push it.";
+const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it. With the view in focus, the arrow keys rotate, with Shift they pan, + and − zoom.";
+const WITH_FINGERS = "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it.";
+const PUSHED = " Press Push, or hold Ctrl, and drag a body to push it.";
 
 /** The reason why this browser cannot show the view, or an empty string. */
 function lacking() {
@@ -36,7 +37,7 @@ export function makeView() {
   function waiting() {
     if (unable) return unable;
     if (!here.socket) return "Waiting for the console.";
-    if (here.link === "connecting") return "Waiting for the server.";
+    if (["connecting", "lost"].includes(here.link)) return "Waiting for the server.";
     return here.missing;
   }
 
@@ -70,13 +71,13 @@ export function makeView() {
     }
     bodies.hear(data);
   });
-  const explain = () => text(hint, TOUCH.matches ? WITH_FINGERS : WITH_MOUSE);
+  const explain = () => text(hint, (TOUCH.matches ? WITH_FINGERS : WITH_MOUSE) + (here.alone ? "" : PUSHED));
   TOUCH.addEventListener("change", explain);
   explain();
   UPRIGHT.addEventListener("change", () => requestAnimationFrame(bodies.fit)); // a phone was turned
   on("open", () => { here.socket = true; show(); });
   on("closed", () => { here.socket = false; show(); });
-  on("status", (status) => { here.link = status.link.state; show(); });
+  on("status", (status) => { here.link = status.link.state; here.alone = status.replay?.alone; show(); explain(); });
   on("world", ({ world }) => { here.missing = world.no_view; show(); });
   show();
 }
