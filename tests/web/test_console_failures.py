@@ -101,6 +101,17 @@ def test_an_error_names_its_op_once(caplog: pytest.LogCaptureFixture) -> None:
     ]
 
 
+async def test_a_loss_counts_from_its_first_moment_whatever_is_learnt_of_it(tmp_path: Path) -> None:
+    async with mounted(tmp_path) as (_, console):
+        await until(lambda: console.link.state == "connected")
+        connected = console.link.since
+        found: list[float] = []
+        for state, reason in (("silent", ""), ("lost", "no reply"), ("lost", "refused"), ("connected", "")):
+            console._set_link(state, reason)
+            found.append(console.link.since)
+        assert connected < found[0] == found[1] == found[2] < found[3]
+
+
 async def test_a_number_that_the_program_wrote_stops_the_steps_and_nothing_else(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

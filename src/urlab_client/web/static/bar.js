@@ -194,7 +194,8 @@ function banner() {
       said = "Another program took the session over.";
       button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
     } else if (link.state === "silent") said = "The server does not answer. Waiting.";
-    else said = now.state ? "The server is unreachable. Retrying." : "Connecting to the server.";
+    else if (!now.state) said = "Connecting to the server.";
+    else said = now.status.address.startsWith("sim://") ? "The simulated server is gone. Starting another." : "The server is unreachable. Retrying.";
     title = link.reason;
   } else if (now.status && !now.status.playing) {
     said = "No play session is running.";
