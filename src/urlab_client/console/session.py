@@ -138,7 +138,7 @@ class ConsoleSession:
         await kept_running(f"urlab-web-{name}", job, lambda error: self._note_error(name, error))
 
     def _note_error(self, what: str, error: Exception) -> None:
-        self.view.note("error", "console", what, str(error))
+        self.view.note("error", "console", what, str(error).removeprefix("hello: "))  # nobody asked for that op
 
     async def _pulse(self) -> None:
         while True:
