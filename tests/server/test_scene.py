@@ -161,6 +161,7 @@ def test_ignored_options_are_named_in_one_warning(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.mujoco("3.16")
 def test_what_mujoco_warns_of_at_the_first_step_is_told(scene_of: SceneOf) -> None:
     wild = '<body name="b"><joint stiffness="1e15" springref="1e15"/><geom size="0.1"/></body>'
     (warning,) = scene_of(("bot", mjcf(wild))).warnings

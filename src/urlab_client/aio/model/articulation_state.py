@@ -144,7 +144,8 @@ class SetPoints(np.ndarray[Any, np.dtype[np.float64]]):
             self._on_write()
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False, /) -> Any:
-        return array[()] if return_scalar else array
+        plain = np.asarray(array)  # NumPy 1 passes a view of this class, and does not say that it wants a scalar
+        return plain[()] if return_scalar or not plain.ndim else plain
 
 
 class MirroredArticulation(MirroredEntity):
