@@ -17,6 +17,7 @@ from waiting import until as wait_until
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import connection_monitor
 from urlab_client.aio.transport import connection
+from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
 from urlab_client.events import (
     ClientEvent,
@@ -253,3 +254,17 @@ with SimulatedServer("arm", play=True) as server:
     command = [sys.executable, "-W", "ignore::ResourceWarning", "-c", script]  # which development mode shows
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
+
+
+async def test_a_socket_whose_making_was_interrupted_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    made, nobody = Subscriptions(), Subscription("tcp://127.0.0.1:1", (b"",), lambda _: True)
+    handler: Any = None
+    monkeypatch.setattr(connection.Connection, "watch", interrupted)
+    with pytest.raises(KeyboardInterrupt) as kept:  # and with it the socket
+        made.attach(handler, lambda: nobody)
+    async with asyncio.timeout(DEADLINE_S):
+        await asyncio.to_thread(made.close)
+    assert kept.value

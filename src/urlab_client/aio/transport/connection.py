@@ -291,7 +291,7 @@ class _SharedContext:
                 return
             self._context = None
         with uninterrupted():
-            context.term()
+            context.destroy(linger=0)  # `term` would wait for sockets whose making failed or was interrupted
 
 
 shared_context: Final = _SharedContext()

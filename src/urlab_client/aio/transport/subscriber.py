@@ -334,7 +334,7 @@ class Subscriptions:
         self._subscribers.clear()
         if self._context is not None:
             with uninterrupted():
-                self._context.term()
+                self._context.destroy(linger=0)  # `term` would wait for sockets whose making failed or was interrupted
             _contexts.discard(self._context)
         for handler in handlers:
             handler.on_end(client_closed)
