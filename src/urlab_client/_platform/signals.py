@@ -29,8 +29,8 @@ notebook sends to the process group of its parent. Ctrl-C is for the parent, whi
 def uninterrupted() -> Generator[None]:
     """Block signals in this thread; other threads receive them, or this thread after the block.
 
-    `zmq.Context.term` needs it: if a signal interrupts that call, PyZMQ considers the context closed, and its threads
-    and descriptors are never released.
+    Calls need it that PyZMQ does not repeat if a signal interrupts them: it then considers a context closed whose
+    threads and descriptors `term` never released, and leaves sockets behind whose `monitor` or `disconnect` failed.
     """
     if sys.platform == "win32":
         yield

@@ -174,7 +174,8 @@ class Connection:
         socket.immediate = True
         if keys is not None:
             keys.protect(socket)
-        self._monitor = socket.get_monitor_socket(_MONITORED)
+        with uninterrupted():
+            self._monitor = socket.get_monitor_socket(_MONITORED)
         try:
             socket.connect(endpoint)
         except zmq.ZMQError as error:
@@ -212,7 +213,7 @@ class Connection:
         """Connect again."""
         if self._closed:
             return
-        with contextlib.suppress(zmq.ZMQError):  # ZeroMQ has already dropped the endpoint
+        with contextlib.suppress(zmq.ZMQError), uninterrupted():  # ZeroMQ has already dropped the endpoint
             self.socket.disconnect(self.endpoint)
         self.socket.connect(self.endpoint)
 
@@ -223,7 +224,8 @@ class Connection:
         self._closed = True
         for watch in self._watches:
             watch.close()
-        self.socket.disable_monitor()
+        with uninterrupted():
+            self.socket.disable_monitor()
         self._monitor.close(linger=0)
         self.socket.close(linger=0)
 
