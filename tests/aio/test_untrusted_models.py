@@ -12,6 +12,7 @@ from hello import hello_ok
 from msgspec.structs import replace
 
 from urlab_client._sandbox import process, references
+from urlab_client._sandbox.process import ProcessLimits
 from urlab_client.aio import URLabClient
 from urlab_client.aio import client as client_module
 from urlab_client.aio.model import compilation
@@ -140,6 +141,13 @@ def test_what_its_names_hide_from_the_client_cannot_be_opened(
 def test_it_may_not_hide_names_in_entities() -> None:
     with pytest.raises(ValueError, match="document type"):
         references.refuse_local_files('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>', {})
+
+
+@pytest.mark.parametrize("limits", [compilation.LIMITS, compilation.UPLOAD_LIMITS], ids=["served", "uploaded"])
+def test_the_limits_are_those_that_the_page_names(limits: ProcessLimits) -> None:
+    page = " ".join((Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8").split())
+    memory, processor = f"{limits.memory_bytes / 2**30:g} GiB of memory", f"{limits.cpu_s:g} s of processor time"
+    assert f"may use {memory} (Linux), {processor} (Linux, macOS) and {limits.wall_s:g} s in total" in page
 
 
 @pytest.mark.parametrize("xml", [HUGE, ENDLESS], ids=["huge", "endless"])
