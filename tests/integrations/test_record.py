@@ -298,6 +298,26 @@ def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client
         next(run.frames("arm/nose"))
 
 
+@pytest.mark.parametrize("steps", [0, 1])
+def test_a_block_that_fails_leaves_a_file_only_of_what_was_recorded(
+    steps: int, server: SimulatedServer, tmp_path: Path
+) -> None:
+    file = tmp_path / "run.mcap"
+
+    def recorded(client: urlab_client.URLabClient) -> None:
+        with record(client, file):
+            for _ in range(steps):
+                client.step()
+            raise ZeroDivisionError
+
+    with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client:
+        client.discover()
+        with pytest.raises(ZeroDivisionError):
+            recorded(client)
+    assert file.exists() == bool(steps)
+    assert not steps or len(read_run(file).table()) == steps
+
+
 # Live mode
 
 

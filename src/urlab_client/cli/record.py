@@ -29,7 +29,6 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._common import CommandError, check_recording, counted, import_mujoco, progress_bar, refusing
 from urlab_client.cli._watching import announced_wait, interruptible, recording_options, run_session, task_environment
 from urlab_client.enums import StepMode
-from urlab_client.errors import URLabError
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import AsyncRecorder, Recorder
@@ -126,16 +125,11 @@ async def _record(arguments: Namespace) -> AsyncRecorder:
             await client.discover()
         recorder = record(client, arguments.output, **recording_options(arguments))
         with interruptible() as stop:
-            try:
-                async with recorder:
-                    if arguments.step_mode == StepMode.DIRECT:
-                        await client.reset(arguments.keyframe)
-                    with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
-                        await run_session(
-                            client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
-                        )
-            except (CommandError, URLabError):
-                if not recorder.stats.states:
-                    arguments.output.unlink(missing_ok=True)
-                raise
+            async with recorder:
+                if arguments.step_mode == StepMode.DIRECT:
+                    await client.reset(arguments.keyframe)
+                with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
+                    await run_session(
+                        client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
+                    )
     return recorder

@@ -58,12 +58,10 @@ class Recording(Block):
         self._used = self._ended = False
 
     def __repr__(self) -> str:
-        begun = "failed" if self.failed else "ended" if self._ended else "recording"
-        stats = self.stats
-        return (
-            f"<{type(self).__name__} {str(self._path)!r} {begun if self._used else 'not begun'}, "
-            f"{stats.states} states, {stats.frames} pictures>"
-        )
+        running = "failed" if self.failed else "ended" if self._ended else "recording"
+        stats, state = self.stats, running if self._used else "not begun"
+        held = f"{stats.states} states, {stats.frames} pictures"
+        return f"<{type(self).__name__} {str(self._path)!r} {state}, {held}>"
 
     @property
     def path(self) -> Path:
@@ -125,6 +123,9 @@ class Recording(Block):
                 raise  # otherwise it was logged, and the exception that ends the block takes precedence
             return
         stats = writer.stats
+        if error is not None and not (stats.states or stats.frames):
+            self._path.unlink(missing_ok=True)  # nothing was recorded
+            return
         if missing := self.without_pictures:
             log.warning(
                 "%s: no picture of %s came. Physics was paused, or the server has no OpenGL, as its log says.",
@@ -211,8 +212,8 @@ def record(
         ValueError: An option is out of range.
 
     Entering the block raises `FileExistsError` or another `OSError` if the file cannot be created, `KeyError` for an
-    unknown camera, and `URLabError` before `discover()`. Leaving it raises `RecordingError` if writing failed, for
-    example because the disk is full.
+    unknown camera, and `URLabError` before `discover()`. If an exception ends the block before anything was recorded,
+    the file is removed. Leaving it raises `RecordingError` if writing failed, for example because the disk is full.
     """
     _check(camera_hz=camera_hz, pose_hz=pose_hz, jpeg_quality=jpeg_quality, buffer_mib=buffer_mib)
     if image_format not in ("jpeg", "png"):
