@@ -28,8 +28,8 @@ def main() -> int:
     options = parser.parse_args()
     os.environ[DIALECT] = options.dialect
     rows = _chosen(options.row, options.only)
-    if options.brief:  # by the name up to a number
-        rows = [*{re.sub(r"-?\d.*", "", row.name.removeprefix("warm-")): row for row in reversed(rows)}.values()][::-1]
+    if options.brief:
+        rows = _one_of_each_kind(rows)
     if not rows:
         parser.error(f"no row is named like {' or '.join(options.only or [options.row])}")
     if options.list:
@@ -80,10 +80,20 @@ def _chosen(name: str | None, parts: Sequence[str] | None) -> list[Row]:
     return [row for row in all_rows() if not parts or any(part in row.name for part in parts)]
 
 
+def _one_of_each_kind(rows: Sequence[Row]) -> list[Row]:
+    """Return the first of the rows whose names are the same up to a number, asleep or awake."""
+    kinds: dict[str, Row] = {}
+    for row in rows:
+        kinds.setdefault(re.sub(r"-?\d.*", "", row.name.removeprefix("warm-")), row)
+    return [*kinds.values()]
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="under a minute; noisier")
-    parser.add_argument("--brief", action="store_true", help="one row of those that differ by a number, or by sleep")
+    parser.add_argument(
+        "--brief", action="store_true", help="only one of the rows that differ by a number, or by sleep"
+    )
     parser.add_argument("--only", action="append", metavar="NAME", help="rows whose name contains NAME; repeatable")
     parser.add_argument("--row", metavar="NAME", help="the one row of that name")
     parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
