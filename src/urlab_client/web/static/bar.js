@@ -171,7 +171,7 @@ function show(status) {
     : `${status.driver} drives · ${Math.ceil(status.lease_left)} s${others}`);
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
   text(ui.drive, status.mine ? "Release" : "Take the controls");
-  ui.drive.disabled = unreachable || (!status.mine && status.driver !== null);
+  ui.drive.disabled = !status.mine && (unreachable || status.driver !== null);
   if (!ui.restart.classList.contains("danger")) text(ui.restart, status.playing ? "Restart play" : "Begin play");
 }
 

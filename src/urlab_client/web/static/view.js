@@ -9,9 +9,14 @@ import { on } from "./link.js";
 const OPEN = "urlab-view";
 const TOUCH = window.matchMedia("(pointer: coarse)");
 const UPRIGHT = window.matchMedia("(orientation: portrait)");
-const WITH_MOUSE = "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it. With the view in focus, the arrow keys rotate, with Shift they pan, + and − zoom.";
-const WITH_FINGERS = "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it.";
-const PUSHED = " Press Push, or hold Ctrl, and drag a body to push it.";
+const WITH_MOUSE = {
+  look: "Drag to rotate, drag with the right button or Shift to pan, scroll to zoom. Click a body to select it. With the view in focus, the arrow keys rotate, with Shift they pan, + and − zoom.",
+  push: " Press Push, or hold Ctrl, and drag a body to push it.",
+};
+const WITH_FINGERS = {
+  look: "Drag to rotate; use two fingers to pan and zoom. Tap a body to select it.",
+  push: " Press Push and drag a body to push it.",
+};
 
 /** The reason why this browser cannot show the view, or an empty string. */
 function lacking() {
@@ -71,7 +76,10 @@ export function makeView() {
     }
     bodies.hear(data);
   });
-  const explain = () => text(hint, (TOUCH.matches ? WITH_FINGERS : WITH_MOUSE) + (here.alone ? "" : PUSHED));
+  const explain = () => {
+    const { look, push } = TOUCH.matches ? WITH_FINGERS : WITH_MOUSE;
+    text(hint, here.alone ? look : look + push);
+  };
   TOUCH.addEventListener("change", explain);
   explain();
   UPRIGHT.addEventListener("change", () => requestAnimationFrame(bodies.fit)); // a phone was turned
