@@ -9,9 +9,8 @@ environments. `lowest-extras` has all that the extras bring at the lowest versio
 Then a client there drives a server of this interpreter's, which so needs the package, too, and the other way round.
 Exit code 1 says that something failed.
 
-With --quick, for CI, which runs the whole suite with the newest MuJoCo: of `lowest`, whose MuJoCo is the oldest, the
-server, the protocol and the async client, of it and the release between what steps simulations and environments, and
-`lowest-extras` without the extras that take gigabytes. The hosted workflow runs all of each.
+With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, of the
+release between what steps simulations and environments, and `lowest-extras` without the extras that take gigabytes.
 
 Asyncio's debug mode is on here, as nowhere else: it costs time, and nothing in it depends on a version.
 """
@@ -71,10 +70,14 @@ LOWEST = re.compile(r">=([\d.]+)[^;]*")
 
 GIGABYTES = {"ray", "rsl-rl", "sb3", "warp"}
 LIGHT = SMOKE.keys() - GIGABYTES
-DRIVING = ("tests/test_mujoco_releases.py", "tests/conformance/test_driving.py", "tests/integrations/test_gym.py")
 QUICK = {
-    "lowest": (*DRIVING, "tests/server", "tests/protocol", "tests/aio"),
-    "mujoco-3.11": DRIVING,
+    "lowest": CORE,
+    "mujoco-3.11": (
+        "tests/test_mujoco_releases.py",
+        "tests/conformance/test_driving.py",
+        "tests/integrations/test_gym.py",
+        "tests/integrations/test_vector_env.py",
+    ),
     "lowest-light-extras": tuple(sorted({SMOKE[extra] for extra in LIGHT})),
 }
 TESTS = {

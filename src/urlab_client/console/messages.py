@@ -18,7 +18,10 @@ Numbers: TypeAlias = list[float | None]
 
 
 class Link(Struct):
-    """The connection to the server: `connecting`, `connected`, `lost`, `silent` or `taken_over`, and why."""
+    """The connection to the server: `connecting`, `connected`, `lost`, `silent` or `taken_over`, and why.
+
+    `since` is when this began, Unix time in seconds: without contact, when the server was last in contact.
+    """
 
     state: str
     reason: str = ""
