@@ -8,7 +8,7 @@ import pytest
 from forked import program
 
 PROGRAM = """
-import collections, contextlib, gc, logging, os, random, signal, sys, threading, time, warnings
+import asyncio, collections, contextlib, gc, logging, os, random, signal, sys, threading, time, warnings
 from urlab_client import SessionTakenOver, URLabClient
 from urlab_client.server import SimulatedServer
 from urlab_client.sync import _loop
@@ -69,13 +69,16 @@ def left(before):
     deadline = time.monotonic() + 20
     while (now := held()) != before and time.monotonic() < deadline:
         threading.Event().wait(0.05)
-    return [new - old for new, old in zip(now, before)]
+    if now == before:
+        return "nothing"
+    loops = [one for one in gc.get_objects() if isinstance(one, _loop.CallerDrivenLoop) and not one._loop.is_closed()]
+    return before, now, [(vars(one), one._owner(), asyncio.all_tasks(one._loop)) for one in loops]
 
 with SimulatedServer("ball", play=True) as server:
     options = {**server.client_options(), "step_mode": "direct", "local_model": False}
     make_use_and_close()
     before = held()
-    print("made and closed:", interrupted_often(make_use_and_close), left(before), flush=True)
+    print("made and closed:", interrupted_often(make_use_and_close), "left:", left(before), flush=True)
 
     with URLabClient(**options) as client:
         client.discover()
@@ -92,7 +95,7 @@ print("problems:", collections.Counter(problems))
 """
 
 EXPECTED = """\
-made and closed: True [0, 0]
+made and closed: True left: nothing
 read: True
 usable: True
 problems: Counter()

@@ -494,6 +494,23 @@ class TestGarbageCollection:
         thread.join(DEADLINE_S)
         assert not thread.is_alive()
 
+    def test_ends_without_its_finalizer(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Which Python does not call again after a signal handler has raised in it."""
+        monkeypatch.setattr(_loop, "_OWNER_CHECK_S", 0.01)
+        said: list[str] = []
+
+        async def say_goodbye() -> None:
+            said.append("goodbye")
+
+        portal = Portal(say_goodbye)
+        thread = io_thread(portal)
+        assert portal._finalizer is not None
+        portal._finalizer.detach()
+        del portal
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive()
+        assert said == ["goodbye"]
+
     def test_a_background_task_does_not_keep_the_portal_alive(self) -> None:
         tasks: list[asyncio.Task[object]] = []
 

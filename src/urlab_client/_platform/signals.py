@@ -5,9 +5,16 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
-from typing import Final, TypedDict
+from importlib import import_module
+from typing import Any, Final, TypedDict
+
+SIGNALS: Final = sorted(int(number) for number in signal.valid_signals())
+"""The numbers of all signals that a handler can be installed for."""
+
+raw: Final[Any] = import_module("_signal")
+"""The module behind `signal`, whose own functions convert all values to enumerations and take ten times as long."""
 
 
 class _Options(TypedDict):
@@ -25,6 +32,12 @@ APART: Final[_Options] = {"start_new_session": True, "creationflags": _FLAGS}  #
 notebook sends to the process group of its parent. Ctrl-C is for the parent, which may continue to use the child."""
 
 
+def _set_mask(how: int, numbers: Iterable[int]) -> set[int]:
+    """Do as `signal.pthread_sigmask`."""
+    before: set[int] = raw.pthread_sigmask(how, numbers)
+    return before
+
+
 @contextmanager
 def uninterrupted() -> Generator[None]:
     """Block signals in this thread; other threads receive them, or this thread after the block.
@@ -35,9 +48,9 @@ def uninterrupted() -> Generator[None]:
     if sys.platform == "win32":
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    before = _set_mask(signal.SIG_BLOCK, ())
     try:
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        _set_mask(signal.SIG_BLOCK, SIGNALS)
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _set_mask(signal.SIG_SETMASK, before)

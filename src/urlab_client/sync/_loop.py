@@ -29,6 +29,7 @@ import selectors
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Coroutine
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
@@ -55,6 +56,10 @@ _IDLE = 0.005
 # Longest time between two checks whether calls still follow each other. A thread that wakes up requests the interpreter
 # lock. Until it gets the lock, up to five milliseconds later, every release of it costs the caller a system call.
 _LONGEST_PAUSE = 0.08
+
+# Seconds between two checks whether the owner is gone. Its finalizer stops the loop, but Python does not call it again
+# if a signal handler raises in it.
+_OWNER_CHECK_S = 2.0
 
 # Rounds of callbacks between two looks at the sockets.
 _ROUNDS = 3
@@ -128,15 +133,17 @@ class CallerDrivenLoop:
 
     Args:
         at_stop: Returns the coroutine that releases the resources on the loop; None if there are none.
+        owner: Weak reference to the object without which the loop ends.
     """
 
-    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
+    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None, owner: weakref.ref[Any]) -> None:
         # Not new_event_loop(): the user's loop policy is for the user's loop, and pyzmq needs a selector on Windows.
         self._loop = asyncio.SelectorEventLoop(_Selector())
         self._thread = background_thread("urlab-io", self._run)
         self._failure: BaseException | None = None
         self._pid = os.getpid()
         self._at_stop = at_stop
+        self._owner = owner
         self._stop_requested = asyncio.Event()
         # A plain lock, which any thread may release: the turn passes from a caller to the thread and back.
         self._turn = threading.Lock()
@@ -418,7 +425,9 @@ class CallerDrivenLoop:
         self._loop.stop()
 
     async def _main(self) -> None:
-        await self._stop_requested.wait()
+        while self._owner() is not None and not self._stop_requested.is_set():
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._stop_requested.wait(), _OWNER_CHECK_S)
         if self._at_stop is not None:
             await _in_bounded_time(asyncio.ensure_future(self._at_stop()))
 

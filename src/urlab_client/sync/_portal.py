@@ -149,7 +149,7 @@ class Portal:
                 if self._closed:
                     raise client_closed()
                 if self._io is None:
-                    io = CallerDrivenLoop(self._at_stop)
+                    io = CallerDrivenLoop(self._at_stop, weakref.ref(self))
                     io.start()
                     self._finalizer = weakref.finalize(self, io.stop)
                     self._io = io

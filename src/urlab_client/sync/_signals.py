@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import importlib
-import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from itertools import repeat, starmap
 from operator import itemgetter
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
-_SIGNALS = sorted(int(number) for number in signal.valid_signals())
-# The module behind `signal`, whose own functions convert all values to enumerations and take ten times as long.
-_signal: Any = importlib.import_module("_signal")
-_get_handler: Callable[[int], Any] = _signal.getsignal
-_set_handler: Callable[[int, Any], Any] = _signal.signal
+from urlab_client._platform.signals import SIGNALS, raw
+
+_get_handler: Callable[[int], Any] = raw.getsignal
+_set_handler: Callable[[int, Any], Any] = raw.signal
 _raise_soon: Callable[[int], None] = importlib.import_module("_thread").interrupt_main
 # Where the handlers of event loops are defined. They only note the signal, so there is nothing to defer; and to put one
 # back would make its signal interrupt system calls, which its loop has forbidden (`siginterrupt`).
 _OF_LOOPS = frozenset({"asyncio.unix_events", "uvloop.loop"})
 # Exhausts an iterator of C calls in one C call, so that no signal handler runs in between.
 _consume: Callable[[Iterable[object]], None] = deque[object](maxlen=0).extend
+
+
+def _is_deferred(handler: Any) -> bool:
+    return callable(handler) and getattr(handler, "__module__", "") not in _OF_LOOPS
 
 
 class DeferredSignals:
@@ -38,6 +40,8 @@ class DeferredSignals:
 
     __slots__ = ("_handlers", "_holding", "_numbers", "arrived", "on_arrival")
 
+    _known: ClassVar[tuple[list[Any], list[int]]] = [], []  # what was installed at the last call, and which to defer
+
     def __init__(self) -> None:
         self.on_arrival: Callable[[], object] | None = None
         self._holding = False
@@ -49,10 +53,12 @@ class DeferredSignals:
         if threading.get_ident() == threading.main_thread().ident:
             # All of some sixty signals are looked at in each call: a handler may have been installed since the last
             # one, and nothing tells. For the same reason none stays replaced between two calls.
-            handled = [number for number in _SIGNALS if callable(_get_handler(number))]
-            self._numbers = numbers = [
-                number for number in handled if getattr(_get_handler(number), "__module__", "") not in _OF_LOOPS
-            ]
+            installed = [*map(_get_handler, SIGNALS)]
+            known, numbers = DeferredSignals._known
+            if installed != known:
+                numbers = [number for number, handler in zip(SIGNALS, installed, strict=True) if _is_deferred(handler)]
+                DeferredSignals._known = installed, numbers
+            self._numbers = numbers
             try:
                 # One C call replaces all of them, and after an exception the list contains exactly those that were
                 # replaced. In a Python loop, a handler still in place could raise between replacing one and noting it.
